@@ -1,0 +1,32 @@
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: breathing test test-slow lint benchmark clean
+
+# The stamp is written last: an interrupted installation is taken up again.
+.venv/installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
+	touch $@
+
+breathing: .venv/installed
+	$(BIN)/python -m experiments.run +exp=breathing
+
+lint: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/python -m pytest -q -m "not slow"
+
+test-slow: lint
+	$(BIN)/python -m pytest -q
+
+benchmark: .venv/installed
+	$(BIN)/python -m benchmarks.search
+	$(BIN)/python -m benchmarks.simulator
+
+clean:
+	rm -rf .venv .cache .mypy_cache .ruff_cache .pytest_cache

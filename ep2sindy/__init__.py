@@ -1,0 +1,1 @@
+"""EP2-SINDy: governing equations of plasma-thruster oscillations, found in data."""

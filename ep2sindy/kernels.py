@@ -1,0 +1,292 @@
+"""Compiled kernels that work on Gram matrices alone: lasso paths, thresholding, subsets, fits.
+
+In every kernel xx: (terms, terms) is a Gram matrix of columns in comparable units and
+xy: (terms,) their products with one target; a mask: (terms,) of bool is a support.
+"""
+
+import numpy as np
+from numba import njit
+
+# A column counts as dependent on others when what they leave of its square falls below this.
+DEPENDENT = 1e-11
+
+
+@njit(cache=True)
+def _solve(xx, rhs, active, n_active, out):
+    """Solve xx[active][:, active] out = rhs[active] by Cholesky; False if columns depend."""
+    lower = np.empty((n_active, n_active))
+    for i in range(n_active):
+        for j in range(i + 1):
+            total = xx[active[i], active[j]]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i > j:
+                lower[i, j] = total / lower[j, j]
+            elif total <= DEPENDENT * xx[active[i], active[i]]:
+                return False
+            else:
+                lower[i, i] = np.sqrt(total)
+    for i in range(n_active):
+        total = rhs[active[i]]
+        for k in range(i):
+            total -= lower[i, k] * out[k]
+        out[i] = total / lower[i, i]
+    for i in range(n_active - 1, -1, -1):
+        total = out[i]
+        for k in range(i + 1, n_active):
+            total -= lower[k, i] * out[k]
+        out[i] = total / lower[i, i]
+    return True
+
+
+@njit(cache=True)
+def independent_terms(xx):
+    """Mask of a maximal independent set, earlier terms first."""
+    n_terms = len(xx)
+    mask = np.zeros(n_terms, dtype=np.bool_)
+    lower = np.zeros((n_terms, n_terms))
+    rows = np.empty(n_terms, dtype=np.int64)
+    n_kept = 0
+    for j in range(n_terms):
+        rest = xx[j, j]
+        for i in range(n_kept):
+            total = xx[j, rows[i]]
+            for k in range(i):
+                total -= lower[n_kept, k] * lower[i, k]
+            lower[n_kept, i] = total / lower[i, i]
+            rest -= lower[n_kept, i] ** 2
+        if rest > DEPENDENT * xx[j, j]:
+            lower[n_kept, n_kept] = np.sqrt(rest)
+            rows[n_kept] = j
+            n_kept += 1
+            mask[j] = True
+    return mask
+
+
+@njit(cache=True)
+def fit_masks(xx, xy, masks):
+    """Least squares on every support: coef (masks, terms), and whether it was solvable."""
+    n_masks, n_terms = masks.shape
+    coef = np.zeros((n_masks, n_terms))
+    solvable = np.ones(n_masks, dtype=np.bool_)
+    solution = np.empty(n_terms)
+    for m in range(n_masks):
+        active = np.flatnonzero(masks[m])
+        solvable[m] = _solve(xx, xy, active, len(active), solution)
+        if solvable[m]:
+            for i in range(len(active)):
+                coef[m, active[i]] = solution[i]
+    return coef, solvable
+
+
+@njit(cache=True)
+def least_squares(xx, xy):
+    """Least squares on all terms; a term that depends on earlier ones gets zero."""
+    masks = independent_terms(xx).reshape(1, -1)
+    return fit_masks(xx, xy, masks)[0][0]
+
+
+@njit(cache=True)
+def _next_event(coef, slope, correlation, drift, level, active, n_active, barred):
+    """First knot as the lasso's penalty falls from `level`: step, term, joins or leaves."""
+    step, term, joins = level, -1, False
+    is_active = np.zeros(len(coef), dtype=np.bool_)
+    for i in range(n_active):
+        j = active[i]
+        is_active[j] = True
+        if coef[j] * slope[i] < 0.0 and -coef[j] / slope[i] < step:
+            step, term, joins = -coef[j] / slope[i], j, False
+    for j in range(len(coef)):
+        if is_active[j] or barred[j]:
+            continue
+        for sign in (1.0, -1.0):
+            closing = 1.0 - sign * drift[j]
+            if closing > 1e-12:
+                distance = max((level - sign * correlation[j]) / closing, 0.0)
+                if distance < step:
+                    step, term, joins = distance, j, True
+    return step, term, joins
+
+
+@njit(cache=True)
+def lasso_supports(xx, xy, max_terms):
+    """Every support on the exact lasso path, from the empty one to `max_terms` or all terms.
+
+    Homotopy in the penalty with terms joining and leaving (Osborne, Presnell & Turlach 2000,
+    doi:10.1093/imanum/20.3.389; Efron et al. 2004, doi:10.1214/009053604000000067).
+    """
+    n_terms = len(xy)
+    limit = 8 * n_terms + 8
+    masks = np.zeros((limit, n_terms), dtype=np.bool_)
+    coef, correlation = np.zeros(n_terms), xy.copy()
+    slope, signs = np.empty(n_terms), np.zeros(n_terms)
+    active = np.empty(n_terms, dtype=np.int64)
+    barred = np.zeros(n_terms, dtype=np.bool_)
+    n_active, n_masks, left = 0, 1, -1
+    level = np.abs(xy).max() if n_terms else 0.0
+    floor = 1e-13 * level
+    while level > floor and n_masks < limit:
+        drift = np.zeros(n_terms)
+        for i in range(n_active):
+            for j in range(n_terms):
+                drift[j] += xx[j, active[i]] * slope[i]
+        if left >= 0:
+            barred[left] = True  # at this very knot it would come straight back
+        step, term, joins = _next_event(
+            coef, slope, correlation, drift, level, active, n_active, barred
+        )
+        if left >= 0:
+            barred[left] = False
+            left = -1
+        for i in range(n_active):
+            coef[active[i]] += step * slope[i]
+        correlation -= step * drift
+        level -= step
+        if term < 0:
+            break
+        if joins:
+            active[n_active] = term
+            n_active += 1
+        else:
+            n_active = _leave(active, n_active, term)
+            coef[term] = 0.0
+            left = term
+        for i in range(n_active):
+            signs[active[i]] = np.sign(correlation[active[i]])
+        if not _solve(xx, signs, active, n_active, slope):
+            barred[term] = True  # it repeats what is active: the path goes on without it
+            n_active = _leave(active, n_active, term)
+            _solve(xx, signs, active, n_active, slope)
+            continue
+        if n_active > max_terms:
+            break
+        masks[n_masks] = False
+        for i in range(n_active):
+            masks[n_masks, active[i]] = True
+        n_masks += 1
+    return masks[:n_masks]
+
+
+@njit(cache=True)
+def _leave(active, n_active, term):
+    kept = 0
+    for i in range(n_active):
+        if active[i] != term:
+            active[kept] = active[i]
+            kept += 1
+    return kept
+
+
+@njit(cache=True)
+def thresholded_supports(xx, xy, thresholds):
+    """Sequentially thresholded least squares, iterated to its end, for every threshold."""
+    n_terms = len(xy)
+    masks = np.zeros((len(thresholds), n_terms), dtype=np.bool_)
+    start = independent_terms(xx)
+    solution = np.empty(n_terms)
+    for m in range(len(thresholds)):
+        masks[m] = start
+        while True:
+            active = np.flatnonzero(masks[m])
+            _solve(xx, xy, active, len(active), solution)
+            n_dropped = 0
+            for i in range(len(active)):
+                if abs(solution[i]) <= thresholds[m]:
+                    masks[m, active[i]] = False
+                    n_dropped += 1
+            if n_dropped == 0:
+                break
+    return masks
+
+
+@njit(cache=True)
+def _sweep(source, target, j, size):
+    """Remove from rows and columns after j what column j explains of them."""
+    for a in range(j + 1, size):
+        ratio = source[a, j] / source[j, j]
+        for b in range(a, size):
+            target[a, b] = source[a, b] - ratio * source[b, j]
+            target[b, a] = target[a, b]
+
+
+@njit(cache=True)
+def _least_residual(matrix, first, size, diagonal, scratch):
+    """Residual left when every column from `first` on is used: a bound for a whole subtree."""
+    scratch[first:size, first:size] = matrix[first:size, first:size]
+    for j in range(first, size - 1):
+        if scratch[j, j] > DEPENDENT * diagonal[j]:
+            _sweep(scratch, scratch, j, size)
+    return scratch[size - 1, size - 1]
+
+
+@njit(cache=True)
+def _offer(residual, chosen, n_chosen, best, best_masks):
+    """Keep a subset among the best of its size, sorted by residual."""
+    rank = best.shape[1]
+    while rank > 0 and residual < best[n_chosen, rank - 1]:
+        rank -= 1
+    if rank == best.shape[1]:
+        return
+    for r in range(best.shape[1] - 1, rank, -1):
+        best[n_chosen, r] = best[n_chosen, r - 1]
+        best_masks[n_chosen, r] = best_masks[n_chosen, r - 1]
+    best[n_chosen, rank] = residual
+    best_masks[n_chosen, rank] = False
+    for i in range(n_chosen):
+        best_masks[n_chosen, rank, chosen[i]] = True
+
+
+@njit(cache=True)
+def best_subsets(xx, xy, yy, max_terms, n_best):
+    """The `n_best` supports of least residual of every size up to max_terms, proven best.
+
+    Depth first over subsets with the residual Gram matrix carried along, so a leaf costs one
+    division; a branch is cut when even all of its columns together leave more than the best
+    known (Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231).
+    xx: (terms, terms), columns ordered with the most telling first for early cuts.
+    Returns (supports, terms) of bool, the empty support first.
+    """
+    n_terms = len(xy)
+    size = n_terms + 1
+    depth = min(max_terms, n_terms)
+    levels = np.zeros((depth + 1, size, size))
+    levels[0, :n_terms, :n_terms] = xx
+    levels[0, :n_terms, n_terms] = xy
+    levels[0, n_terms, :n_terms] = xy
+    levels[0, n_terms, n_terms] = yy
+    diagonal = np.diag(xx).copy()
+    scratch = np.empty((size, size))
+    best = np.full((depth + 1, n_best), np.inf)
+    best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
+    best[0, 0] = yy
+    chosen = np.zeros(depth + 1, dtype=np.int64)
+    following = np.zeros(depth + 1, dtype=np.int64)
+    level = 0
+    while level >= 0:
+        j = following[level]
+        if j >= n_terms or level == depth:
+            level -= 1
+            continue
+        following[level] = j + 1
+        here = levels[level]
+        if here[j, j] <= DEPENDENT * diagonal[j]:
+            continue
+        chosen[level] = j
+        _offer(
+            here[n_terms, n_terms] - here[j, n_terms] ** 2 / here[j, j],
+            chosen,
+            level + 1,
+            best,
+            best_masks,
+        )
+        if level + 1 == depth or j + 1 == n_terms:
+            continue
+        _sweep(here, levels[level + 1], j, size)
+        worth_bounding = n_terms - j > 6 and depth - level > 2
+        if worth_bounding and best[level + 2, n_best - 1] <= _least_residual(
+            levels[level + 1], j + 1, size, diagonal, scratch
+        ):
+            continue
+        following[level + 1] = j + 1
+        level += 1
+    return best_masks.reshape(-1, n_terms)[np.isfinite(best.ravel())]

@@ -1,0 +1,240 @@
+"""The regression problem target = theta coef: its rows, their split, and its Gram matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ep2sindy.library import Library
+from ep2sindy.smoothing import SavitzkyGolay, Smoother
+from ep2sindy.trajectory import Trajectory, read_only
+
+
+@dataclass(frozen=True, eq=False)
+class Gram:
+    """Weighted sums of products of scaled columns: all that least squares needs of the rows.
+
+    xx: (terms, terms), xy: (terms, equations), yy and y_sum: (equations,), weight: sum of the
+    row weights.
+    """
+
+    xx: Float[np.ndarray, "terms terms"]
+    xy: Float[np.ndarray, "terms equations"]
+    yy: Float[np.ndarray, " equations"]
+    y_sum: Float[np.ndarray, " equations"]
+    weight: float
+
+    @property
+    def total(self) -> Float[np.ndarray, " equations"]:
+        """Sum of squares of each target about its mean."""
+        return self.yy - self.y_sum**2 / self.weight
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Rows of library terms and targets, in SI units, ready for a search.
+
+    theta: (rows, terms). target: (rows, equations).
+    groups: (rows,), rows that share samples share a number, and stay together in a split or a
+    bootstrap. test: (rows,), true for held-out rows.
+    Raises ValueError for values that are not finite or fewer training rows than terms.
+    """
+
+    theta: Float[np.ndarray, "rows terms"]
+    target: Float[np.ndarray, "rows equations"]
+    library: Library
+    equations: Sequence[str]
+    groups: Int[np.ndarray, " rows"]
+    test: Bool[np.ndarray, " rows"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", read_only(self.theta))
+        object.__setattr__(self, "target", read_only(self.target))
+        object.__setattr__(self, "equations", tuple(self.equations))
+        columns = [*self.library.names, *(f"d({e})/dt" for e in self.equations)]
+        finite = np.isfinite(np.concatenate([self.theta, self.target], axis=1))
+        if not finite.all():
+            row, column = np.argwhere(~finite)[0]
+            raise ValueError(
+                f"every term must be finite on every row: {columns[column]!r} is not on row {row}; "
+                "lower the degree or rescale the variables"
+            )
+        n_train = int((~self.test).sum())
+        if n_train < len(self.library):
+            raise ValueError(
+                f"a library of {len(self.library)} terms needs at least as many training rows: "
+                f"{n_train} of {len(self.theta)} rows are for training; use a smaller library "
+                "or more data"
+            )
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        return self.library.names
+
+    @cached_property
+    def theta_scale(self) -> Float[np.ndarray, " terms"]:
+        """L2 norm of each column over the training rows; 1 for a column of zeros."""
+        return _column_norms(self.theta[~self.test])
+
+    @cached_property
+    def target_scale(self) -> Float[np.ndarray, " equations"]:
+        return _column_norms(self.target[~self.test])
+
+    @cached_property
+    def train_rows(self) -> Float[np.ndarray, "train columns"]:
+        """Scaled terms, then scaled targets, of the training rows."""
+        return self._scaled(~self.test)
+
+    @cached_property
+    def test_rows(self) -> Float[np.ndarray, "test columns"]:
+        return self._scaled(self.test)
+
+    @cached_property
+    def train_gram(self) -> Gram:
+        return self._gram_of(self.train_rows, None)
+
+    @cached_property
+    def test_gram(self) -> Gram:
+        return self._gram_of(self.test_rows, None)
+
+    def resampled_gram(self, weights: Float[np.ndarray, " train"]) -> Gram:
+        """Gram matrix of the training rows, each counted `weights` times."""
+        used = weights > 0
+        return self._gram_of(self.train_rows[used], weights[used])
+
+    def _scaled(self, rows: np.ndarray) -> np.ndarray:
+        return np.concatenate(
+            [self.theta[rows] / self.theta_scale, self.target[rows] / self.target_scale], axis=1
+        )
+
+    def _gram_of(self, rows: np.ndarray, weights: np.ndarray | None) -> Gram:
+        n = len(self.library)
+        weighted = rows if weights is None else rows * weights[:, None]
+        products = weighted.T @ rows
+        return Gram(
+            xx=np.ascontiguousarray(products[:n, :n]),
+            xy=products[:n, n:],
+            yy=np.diag(products)[n:],
+            y_sum=weighted[:, n:].sum(axis=0),
+            weight=float(len(rows) if weights is None else weights.sum()),
+        )
+
+
+def _column_norms(values: np.ndarray) -> np.ndarray:
+    """L2 norms without overflow at densities to high powers."""
+    largest = np.abs(values).max(axis=0)
+    largest[largest == 0.0] = 1.0
+    norms = largest * np.sqrt(np.square(values / largest).sum(axis=0))
+    norms[norms == 0.0] = 1.0
+    return norms
+
+
+@runtime_checkable
+class Split(Protocol):
+    """Chooses the held-out groups of one trajectory; groups are numbered along time."""
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]: ...
+
+
+@dataclass(frozen=True)
+class RandomSplit:
+    """Hold out a random share of the groups of each trajectory, as in the thesis."""
+
+    test_fraction: float = 0.25
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+        _check_fraction(self.test_fraction)
+        chosen = rng.permutation(n_groups)[: round(self.test_fraction * n_groups)]
+        return np.isin(np.arange(n_groups), chosen)
+
+
+@dataclass(frozen=True)
+class BlockSplit:
+    """Hold out contiguous blocks of each trajectory: neighbours of a time series are alike, so
+    random rows would let the model see the answers."""
+
+    test_fraction: float = 0.25
+    n_blocks: int = 20
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+        _check_fraction(self.test_fraction)
+        n_blocks = min(self.n_blocks, n_groups)
+        chosen = rng.permutation(n_blocks)[: round(self.test_fraction * n_blocks)]
+        return np.isin(np.arange(n_groups) * n_blocks // max(n_groups, 1), chosen)
+
+
+def _check_fraction(fraction: float) -> None:
+    if not 0.0 <= fraction < 1.0:
+        raise ValueError(f"test_fraction must lie in [0, 1): {fraction} came")
+
+
+@dataclass(frozen=True)
+class Differential:
+    """Regress the derivative at every sample on the library at that sample.
+
+    smooth_library: evaluate the terms on smoothed samples (the default: with noise in them a
+    wrong support can score best) or on raw ones (the thesis).
+    """
+
+    smoother: Smoother = field(default_factory=SavitzkyGolay)
+    smooth_library: bool = True
+    split: Split = field(default_factory=RandomSplit)
+
+    def assemble(
+        self,
+        trajectories: Sequence[Trajectory],
+        library: Library,
+        *,
+        rng: np.random.Generator,
+    ) -> Regression:
+        """Rows of all trajectories below one another; every row uses one trajectory alone.
+
+        Raises ValueError for no trajectory, trajectories with other states, or a variable of
+        the library that a trajectory lacks.
+        """
+        _check_agreement(trajectories, library.variables)
+        parts = [self._rows(run, library) for run in trajectories]
+        test = [self.split.held_out(run.n_samples, rng) for run in trajectories]
+        n_rows = sum(run.n_samples for run in trajectories)
+        return Regression(
+            theta=np.concatenate([theta for theta, _ in parts]),
+            target=np.concatenate([target for _, target in parts]),
+            library=library,
+            equations=trajectories[0].state_names,
+            groups=np.arange(n_rows),
+            test=np.concatenate(test),
+        )
+
+    def _rows(self, run: Trajectory, library: Library) -> tuple[np.ndarray, np.ndarray]:
+        values = run.columns(library.variables)
+        if self.smooth_library:
+            values = self.smoother.smooth(run.t, values)
+        with np.errstate(over="ignore"):  # Regression names a term that is not finite
+            return library.evaluate(values), self.smoother.derivative(run.t, run.states)
+
+
+def _check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
+    """One regression has one meaning per column: the same states, and units, everywhere."""
+    if not trajectories:
+        raise ValueError("a regression needs at least one trajectory: none came")
+    first = trajectories[0]
+    names = [*first.state_names, *(v for v in variables if v not in first.state_names)]
+    for k, run in enumerate(trajectories):
+        missing = [name for name in names if name not in run.names]
+        if missing or run.state_names != first.state_names:
+            raise ValueError(
+                f"every trajectory needs the states {list(first.state_names)} and the variables "
+                f"{list(variables)}: trajectory {k} has states {list(run.state_names)} and inputs "
+                f"{list(run.input_names)}"
+            )
+        for name in names:
+            if run.units[name] != first.units[name]:
+                raise ValueError(
+                    f"units must agree: {name!r} is in {first.units[name]} in trajectory 0 and "
+                    f"in {run.units[name]} in trajectory {k}; convert one of them first"
+                )

@@ -1,0 +1,261 @@
+"""Search: which supports are worth a fit. Works on Gram matrices, bootstrap by bootstrap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.ambiguity import usable_terms
+from ep2sindy.kernels import (
+    best_subsets,
+    lasso_supports,
+    least_squares,
+    thresholded_supports,
+)
+from ep2sindy.regression import Gram, Regression
+
+
+@runtime_checkable
+class Search(Protocol):
+    """Turns one equation's Gram matrix into candidate supports.
+
+    xx: (terms, terms) and xy: (terms,) of columns with unit norm, yy the target's square.
+    """
+
+    def supports(
+        self,
+        xx: Float[np.ndarray, "terms terms"],
+        xy: Float[np.ndarray, " terms"],
+        yy: float,
+    ) -> Bool[np.ndarray, "supports terms"]: ...
+
+
+@dataclass(frozen=True)
+class AdaptiveLasso:
+    """All supports on the exact path of the adaptive lasso.
+
+    Each coefficient is penalised by |b_ols|^-gamma; scaling its column by |b_ols|^gamma makes
+    that a plain lasso, whose path is piecewise linear and needs the Gram matrix alone. The
+    result does not depend on the units of the columns.
+    max_terms: stop the path there, or None for all terms.
+    Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8.
+    """
+
+    gamma: float = 1.0
+    max_terms: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.gamma <= 0.0:
+            raise ValueError(f"gamma must be positive: {self.gamma} came")
+        _check_max_terms(self.max_terms)
+
+    def supports(
+        self,
+        xx: Float[np.ndarray, "terms terms"],
+        xy: Float[np.ndarray, " terms"],
+        yy: float,
+    ) -> Bool[np.ndarray, "supports terms"]:
+        scale = np.abs(least_squares(xx, xy)) ** self.gamma
+        scaled_xx = xx * scale[:, None] * scale
+        return lasso_supports(scaled_xx, xy * scale, self.max_terms or len(xy))
+
+
+@dataclass(frozen=True)
+class STLSQ:
+    """Sequentially thresholded least squares, over a sweep of thresholds.
+
+    Thresholds are shares of the norm of the target, on columns of unit norm, spaced evenly in
+    their logarithm; each is iterated until no term falls below it.
+    Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113.
+    """
+
+    lowest: float = 1e-4
+    highest: float = 10.0
+    n_thresholds: int = 100
+    max_terms: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.lowest < self.highest or self.n_thresholds < 2:
+            raise ValueError(
+                "a threshold sweep needs 0 < lowest < highest and two thresholds or more: "
+                f"lowest={self.lowest}, highest={self.highest}, n_thresholds={self.n_thresholds}"
+            )
+        _check_max_terms(self.max_terms)
+
+    def supports(
+        self,
+        xx: Float[np.ndarray, "terms terms"],
+        xy: Float[np.ndarray, " terms"],
+        yy: float,
+    ) -> Bool[np.ndarray, "supports terms"]:
+        thresholds = np.sqrt(yy) * np.geomspace(self.lowest, self.highest, self.n_thresholds)
+        masks = thresholded_supports(xx, xy, thresholds)
+        return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
+
+
+@dataclass(frozen=True)
+class BestSubset:
+    """The supports of least residual of every size, proven best by branch and bound.
+
+    The work grows with the number of subsets of up to max_terms terms: a library of 10 takes
+    a tenth of a millisecond, 20 terms with all sizes a tenth of a second.
+    n_best: how many of each size.
+    """
+
+    max_terms: int = 6
+    n_best: int = 1
+
+    def __post_init__(self) -> None:
+        _check_max_terms(self.max_terms)
+        if self.n_best < 1:
+            raise ValueError(f"n_best must be at least 1: {self.n_best} came")
+
+    def supports(
+        self,
+        xx: Float[np.ndarray, "terms terms"],
+        xy: Float[np.ndarray, " terms"],
+        yy: float,
+    ) -> Bool[np.ndarray, "supports terms"]:
+        # Branches are cut sooner when the columns closest to the target come first.
+        order = np.argsort(-np.abs(xy), kind="stable")
+        found = best_subsets(
+            np.ascontiguousarray(xx[np.ix_(order, order)]),
+            xy[order],
+            yy,
+            self.max_terms,
+            self.n_best,
+        )
+        masks = np.zeros_like(found)
+        masks[:, order] = found
+        return masks
+
+
+def _check_max_terms(max_terms: int | None) -> None:
+    if max_terms is not None and max_terms < 1:
+        raise ValueError(f"max_terms must be at least 1: {max_terms} came")
+
+
+@dataclass(frozen=True)
+class Bootstraps:
+    """Resampled rows and a reduced library, over and over, so that no support hangs on a few.
+
+    Each of the `n` draws takes, with replacement, a random share of the training groups
+    between `smallest` and `largest`, and leaves out `n_culled` random terms.
+    n = 0: one search on all training rows and terms. Source: the thesis, II-C and II-H.
+    """
+
+    n: int = 32
+    n_culled: int = 1
+    smallest: float = 0.2
+    largest: float = 0.8
+
+    def __post_init__(self) -> None:
+        if self.n < 0 or self.n_culled < 0:
+            raise ValueError(
+                f"counts must not be negative: n={self.n}, n_culled={self.n_culled} came"
+            )
+        if not 0.0 < self.smallest <= self.largest:
+            raise ValueError(
+                "shares must satisfy 0 < smallest <= largest: "
+                f"smallest={self.smallest}, largest={self.largest} came"
+            )
+
+    def draw(
+        self, problem: Regression, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
+    ) -> list[tuple[Gram, Bool[np.ndarray, " terms"]]]:
+        """Gram matrix and kept terms of every bootstrap, out of the terms that may be used."""
+        if self.n == 0:
+            return [(problem.train_gram, terms)]
+        usable = np.flatnonzero(terms)
+        if self.n_culled >= len(usable):
+            raise ValueError(
+                f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go"
+            )
+        _, group = np.unique(problem.groups[~problem.test], return_inverse=True)
+        n_groups = int(group.max()) + 1
+        draws = []
+        for _ in range(self.n):
+            size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
+            counts = np.bincount(rng.integers(n_groups, size=size), minlength=n_groups)
+            kept = terms.copy()
+            kept[rng.choice(usable, self.n_culled, replace=False)] = False
+            draws.append((problem.resampled_gram(counts[group].astype(np.float64)), kept))
+        return draws
+
+
+@dataclass(frozen=True, eq=False)
+class Supports:
+    """What the bootstraps found for one equation, pooled.
+
+    masks: (supports, terms), each once. share: (supports,), share of bootstraps that found it.
+    inclusion: (terms + 1, terms), row k: of the bootstraps that had a term at hand, the share
+    in which it stood in a support of k terms.
+    """
+
+    equation: str
+    masks: Bool[np.ndarray, "supports terms"]
+    share: Float[np.ndarray, " supports"]
+    inclusion: Float[np.ndarray, "sizes terms"]
+
+
+def pooled_supports(
+    problem: Regression,
+    search: Search,
+    bootstraps: Bootstraps,
+    *,
+    rng: np.random.Generator,
+) -> tuple[Supports, ...]:
+    """Search every bootstrap of the training rows; one `Supports` per equation.
+
+    Terms that are zero, or repeat an earlier term, are left out (see `ambiguities`).
+    The same resamples serve all equations, so their Gram matrices are computed once.
+    """
+    draws = bootstraps.draw(problem, usable_terms(problem), rng)
+    return tuple(
+        _pool(name, [_search_one(search, gram, kept, k) for gram, kept in draws], draws)
+        for k, name in enumerate(problem.equations)
+    )
+
+
+def _search_one(search: Search, gram: Gram, kept: np.ndarray, equation: int) -> np.ndarray:
+    """Supports of one equation in one bootstrap, as masks over the whole library."""
+    columns = np.flatnonzero(kept)
+    # A resample changes the norms: unit columns again, so that no unit or draw leaks in.
+    diagonal = np.diag(gram.xx)[columns]
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    xx = gram.xx[np.ix_(columns, columns)] * scale[:, None] * scale
+    xy = gram.xy[columns, equation] * scale
+    found = search.supports(xx, xy, float(gram.yy[equation]))
+    masks = np.zeros((len(found), len(kept)), dtype=np.bool_)
+    masks[:, columns] = found
+    return masks
+
+
+def _pool(
+    equation: str,
+    found: Sequence[np.ndarray],
+    draws: Sequence[tuple[Gram, np.ndarray]],
+) -> Supports:
+    n_terms = found[0].shape[1]
+    counts: dict[bytes, int] = {}
+    included = np.zeros((n_terms + 1, n_terms))
+    for masks in found:
+        for key in {mask.tobytes() for mask in masks}:
+            counts[key] = counts.get(key, 0) + 1
+        of_size = np.zeros((n_terms + 1, n_terms), dtype=np.bool_)
+        np.logical_or.at(of_size, masks.sum(axis=1), masks)
+        included += of_size
+    masks = np.frombuffer(b"".join(counts), dtype=np.bool_).reshape(-1, n_terms)
+    at_hand = np.sum([kept for _, kept in draws], axis=0)
+    # Sorted, so that the result does not depend on the order of the bootstraps.
+    order = np.lexsort((*masks.T[::-1], masks.sum(axis=1)))
+    return Supports(
+        equation=equation,
+        masks=masks[order],
+        share=np.array(list(counts.values()), dtype=np.float64)[order] / len(found),
+        inclusion=included / np.maximum(at_hand, 1),
+    )

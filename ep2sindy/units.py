@@ -1,0 +1,36 @@
+"""Units as short strings: "m^-3", "m^3/s", "1". Only names are handled; values stay SI."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+
+import pint
+
+
+@cache
+def registry() -> pint.UnitRegistry:
+    """The one registry of the package; building one costs a tenth of a second."""
+    return pint.UnitRegistry()
+
+
+@cache
+def _powers(unit: str) -> dict[str, float]:
+    """Base symbol -> exponent of one unit string; an unknown unit stays a symbol of its own."""
+    if unit in ("", "1"):
+        return {}
+    try:
+        parsed = registry().parse_units(unit)
+    except (pint.UndefinedUnitError, AttributeError, ValueError):
+        return {unit: 1.0}
+    return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}
+
+
+def unit_product(factors: Iterable[tuple[str, int]]) -> str:
+    """Multiply units raised to integer powers: [("m^-3", 2), ("m^3/s", 1)] -> "m^-3 s^-1"."""
+    total: dict[str, float] = {}
+    for unit, power in factors:
+        for symbol, exponent in _powers(unit).items():
+            total[symbol] = total.get(symbol, 0.0) + power * exponent
+    parts = [s if p == 1 else f"{s}^{p:g}" for s, p in total.items() if p != 0]
+    return " ".join(parts) or "1"

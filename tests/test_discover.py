@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from ep2sindy.discover import discover
+from ep2sindy.library import polynomial, split_factors
+from ep2sindy.pareto import Knee
+from ep2sindy.regression import Differential
+from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps
+from ep2sindy.systems import lotka_volterra
+from ep2sindy.trajectory import Trajectory
+
+SETTINGS = {
+    "formulation": Differential(),
+    "search": AdaptiveLasso(),
+    "bootstraps": Bootstraps(n=8),
+    "selection": Knee("library"),
+}
+
+
+def test_predator_and_prey_are_found_in_noisy_data() -> None:
+    system = lotka_volterra()
+    run = system.trajectory(noise=0.01, rng=np.random.default_rng(0))
+    found = discover(
+        [run], polynomial(["x", "y"], degree=2), **SETTINGS, rng=np.random.default_rng(1)
+    )
+    for state in ("x", "y"):
+        truth, terms = system.model.terms(state), found.model.terms(state)
+        assert set(terms) == set(truth)
+        assert [terms[k] for k in truth] == pytest.approx(list(truth.values()), rel=0.02)
+    assert "AdaptiveLasso" in found.model.provenance["search"]
+
+
+def test_two_trajectories_of_different_length_are_one_problem() -> None:
+    system = lotka_volterra()
+    first = system.trajectory()
+    second = system.trajectory(initial=np.array([0.3, 1.2])).window(0, 400)
+    found = discover(
+        [first, second], polynomial(["x", "y"], degree=2), **SETTINGS, rng=np.random.default_rng(1)
+    )
+    assert found.model.terms("x") == pytest.approx({"x": 2 / 3, "x*y": -1.0}, rel=0.01)
+
+
+def test_rescaling_units_rescales_coefficients_and_nothing_else() -> None:
+    run = lotka_volterra().trajectory(noise=0.02, rng=np.random.default_rng(0))
+    scale, tempo = np.array([1e18, 3e-14]), 1e-5
+    rescaled = Trajectory(t=run.t * tempo, states=run.states * scale, state_names=["x", "y"])
+    library = polynomial(["x", "y"], degree=2)
+    plain = discover([run], library, **SETTINGS, rng=np.random.default_rng(1))
+    other = discover([rescaled], library, **SETTINGS, rng=np.random.default_rng(1))
+    unit = (scale**library.exponents).prod(axis=1)[:, None]
+    assert other.model.coef * unit * tempo / scale == pytest.approx(plain.model.coef, rel=1e-9)
+    for state, front in plain.fronts.items():
+        assert [c.terms for c in front.candidates] == [
+            c.terms for c in other.fronts[state].candidates
+        ]
+        assert other.fronts[state].errors == pytest.approx(front.errors, rel=1e-9)
+
+
+def test_permuting_the_library_changes_nothing() -> None:
+    run = lotka_volterra().trajectory(noise=0.02, rng=np.random.default_rng(0))
+    settings = {**SETTINGS, "search": BestSubset(), "bootstraps": Bootstraps(n=0)}
+    forth = discover(
+        [run], polynomial(["x", "y"], degree=2), **settings, rng=np.random.default_rng(1)
+    )
+    back = discover(
+        [run], polynomial(["y", "x"], degree=2), **settings, rng=np.random.default_rng(1)
+    )
+    for state in ("x", "y"):
+        terms = {frozenset(split_factors(t)): c for t, c in forth.model.terms(state).items()}
+        permuted = {frozenset(split_factors(t)): c for t, c in back.model.terms(state).items()}
+        assert len(terms) == 2
+        assert permuted == pytest.approx(terms, rel=1e-9)
+
+
+def test_the_model_may_use_inputs() -> None:
+    t = np.linspace(0.0, 30.0, 1501)
+    u = np.sin(t) + 0.5 * np.sin(2.3 * t)
+    x = np.zeros_like(t)
+    for k in range(len(t) - 1):  # x' = -x + 2u, exact for u linear between samples
+        a, b = u[k], (u[k + 1] - u[k]) / 0.02
+        decay = np.exp(-0.02)
+        x[k + 1] = decay * x[k] + 2 * (a * (1 - decay) + b * (0.02 - 1 + decay))
+    run = Trajectory(
+        t=t, states=x[:, None], state_names=["x"], inputs=u[:, None], input_names=["u"]
+    )
+    found = discover(
+        [run], polynomial(["x", "u"], degree=2), **SETTINGS, rng=np.random.default_rng(0)
+    )
+    assert found.model.terms("x") == pytest.approx({"x": -1.0, "u": 2.0}, rel=2e-3)

@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+import torch
+
+from ep2sindy.library import Library, named_terms, polynomial, split_factors
+from ep2sindy.units import unit_product
+
+
+def test_polynomial_is_ordered_by_degree_then_variable() -> None:
+    assert polynomial(["x", "y"], degree=2).names == ("1", "x", "y", "x^2", "x*y", "y^2")
+
+
+@pytest.mark.parametrize(
+    ("n_variables", "degree", "n_terms"), [(2, 2, 6), (3, 3, 20), (5, 2, 21), (4, 0, 1)]
+)
+def test_polynomial_counts_every_product(n_variables: int, degree: int, n_terms: int) -> None:
+    variables = [f"v{k}" for k in range(n_variables)]
+    assert len(polynomial(variables, degree=degree)) == n_terms
+
+
+def test_products_are_added_once_and_in_library_order() -> None:
+    library = polynomial(["n_i", "n_n", "R_ion"], degree=2, products=["R_ion*n_n*n_i", "n_n*n_i"])
+    assert library.names[-1] == "n_i*n_n*R_ion"
+    assert len(library) == 11
+
+
+def test_terms_evaluate_to_products_of_powers() -> None:
+    values = np.array([[2.0, 3.0, 5.0], [-1.0, 0.5, 4.0]])
+    library = named_terms(["x", "y", "z"], ["1", "x^2*z", "y", "x*y*z"])
+    expected = [[1.0, 20.0, 3.0, 30.0], [1.0, 4.0, 0.5, -2.0]]
+    assert np.array_equal(library.evaluate(values), expected)
+
+
+def test_numpy_and_torch_agree_to_the_last_bit() -> None:
+    values = np.random.default_rng(0).normal(size=(4, 7, 3)) * [1e18, 1e-14, 1.0]
+    library = polynomial(["x", "y", "z"], degree=3)
+    assert np.array_equal(
+        library.evaluate(torch.from_numpy(values)).numpy(), library.evaluate(values)
+    )
+
+
+def test_evaluation_is_differentiable_in_torch() -> None:
+    library = named_terms(["x", "y"], ["1", "x^2*y"])
+    point = torch.tensor([3.0, 5.0], dtype=torch.float64, requires_grad=True)
+    library.evaluate(point)[1].backward()
+    assert point.grad is not None
+    assert point.grad.tolist() == [30.0, 9.0]
+
+
+def test_averages_of_products_are_variables() -> None:
+    library = named_terms(["n_i", "<n_i*n_n>"], ["n_i*<n_i*n_n>^2"])
+    assert library.names == ("n_i*<n_i*n_n>^2",)
+    assert split_factors(library.names[0]) == [("n_i", 1), ("<n_i*n_n>", 2)]
+
+
+def test_index_accepts_factors_in_any_order() -> None:
+    assert polynomial(["x", "y"], degree=2).index("y*x") == 4
+
+
+def test_units_multiply() -> None:
+    library = named_terms(["n", "R", "u"], ["1", "n^2*R", "n*u", "R*n"])
+    units = library.units({"n": "m^-3", "R": "m^3/s", "u": "m/s"})
+    assert units == ("1", "m^-3 s^-1", "m^-2 s^-1", "s^-1")
+    assert unit_product([("furlong_per_fortnight!", 2)]) == "furlong_per_fortnight!^2"
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["x*q"], r"unknown variable 'q' in term 'x\*q'; there are \['x', 'y'\]"),
+        (["x^-1"], "cannot read term"),
+        ([""], "cannot read term ''"),
+        (["x*y", "y*x"], "terms must be unique"),
+        ([], "at least one term"),
+    ],
+)
+def test_bad_terms_are_refused_by_name(names: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        named_terms(["x", "y"], names)
+
+
+def test_unknown_term_names_what_exists() -> None:
+    with pytest.raises(ValueError, match=r"unknown term 'x\^3'; this library has \['1', 'x'"):
+        polynomial(["x"], degree=2).index("x^3")
+
+
+def test_libraries_over_other_variables_do_not_join() -> None:
+    with pytest.raises(ValueError, match="must share their variables"):
+        _ = polynomial(["x"], degree=1) + polynomial(["y"], degree=1)
+
+
+def test_repeated_variables_are_refused() -> None:
+    with pytest.raises(ValueError, match="variables must be unique"):
+        Library(["x", "x"], np.array([[1, 0]]))
+    with pytest.raises(ValueError, match="degree must be zero or more"):
+        polynomial(["x"], degree=-1)

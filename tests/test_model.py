@@ -1,0 +1,160 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ep2sindy.library import named_terms, polynomial
+from ep2sindy.model import SparseModel, coef_matrix
+from ep2sindy.systems import lotka_volterra
+from ep2sindy.trajectory import Trajectory
+
+VARIABLES = ["n_i", "n_n", "R_ion"]
+UNITS = {"n_i": "m^-3", "n_n": "m^-3", "R_ion": "m^3/s"}
+
+
+def breathing() -> SparseModel:
+    library = named_terms(VARIABLES, ["1", "n_i", "n_n", "n_i*n_n", "n_i*n_n*R_ion"])
+    equations = [{"n_i": -2.62e5, "n_i*n_n": 5.481e-14}, {"1": 1.83e23, "n_i*n_n*R_ion": -0.77}]
+    return SparseModel(library, ["n_i", "n_n"], coef_matrix(library, equations), UNITS)
+
+
+def driven(rate: float = 2.0) -> tuple[SparseModel, Trajectory]:
+    """x' = -rate x + u with u = sin t, whose solution is known."""
+    library = polynomial(["x", "u"], degree=1)
+    model = SparseModel(library, ["x"], coef_matrix(library, [{"x": -rate, "u": 1.0}]))
+    t = np.linspace(0.0, 5.0, 201)
+    exact = np.exp(-rate * t) * (1 + 1 / (rate**2 + 1))
+    exact += (rate * np.sin(t) - np.cos(t)) / (rate**2 + 1)
+    run = Trajectory(
+        t=t,
+        states=exact[:, None],
+        state_names=["x"],
+        inputs=np.sin(t)[:, None],
+        input_names=["u"],
+    )
+    return model, run
+
+
+def test_model_prints_as_equations() -> None:
+    expected = "n_i' = -2.6e+05 n_i + 5.5e-14 n_i n_n\nn_n' = 1.8e+23 - 0.77 n_i n_n R_ion"
+    assert breathing().text(digits=2) == expected
+
+
+def test_an_empty_equation_prints_as_zero() -> None:
+    model = SparseModel(polynomial(["x"], degree=1), ["x"], np.zeros((2, 1)))
+    assert model.text() == "x' = 0"
+    assert r"\dot{x} &= 0" in model.latex()
+    assert model.sympy()["x"] == 0
+
+
+def test_latex_has_powers_of_ten_and_subscripts() -> None:
+    latex = breathing().latex()
+    assert (
+        r"\dot{n_{i}} &= - 2.62 \cdot 10^{5} \, n_{i} + 5.48 \cdot 10^{-14} \, n_{i} n_{n}" in latex
+    )
+    assert r"- 0.77 \, n_{i} n_{n} R_{ion}" in latex
+
+
+def test_sympy_evaluates_like_the_model() -> None:
+    model = breathing()
+    point = {"n_i": 3e17, "n_n": 5e18, "R_ion": 6e-14}
+    slope = model.derivative(np.array([3e17, 5e18]), np.array([6e-14]))
+    for state, expression in model.sympy().items():
+        expected = float(slope[model.states.index(state)])
+        assert float(expression.subs(point)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_derivative_finds_its_variables_in_any_order() -> None:
+    library = named_terms(["u", "y", "x"], ["u*x", "y"])
+    model = SparseModel(library, ["x", "y"], np.array([[1.0, 0.0], [0.0, 3.0]]))
+    assert model.inputs == ("u",)
+    slope = model.derivative(np.array([[2.0, 5.0]]), np.array([[7.0]]))
+    assert slope.tolist() == [[14.0, 15.0]]
+
+
+def test_json_round_trip_is_exact(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    library = polynomial(VARIABLES, degree=2)
+    coef = rng.normal(size=(10, 2)) * 10.0 ** rng.integers(-40, 40, size=(10, 2))
+    coef[rng.random(size=coef.shape) < 0.5] = 0.0
+    model = SparseModel(library, ["n_i", "n_n"], coef, UNITS, {"seed": "0"})
+    model.save(tmp_path / "models" / "simple.json")
+    back = SparseModel.load(tmp_path / "models" / "simple.json")
+    assert np.array_equal(back.coef, model.coef)
+    assert back.library.names == model.library.names
+    assert (back.states, dict(back.units), dict(back.provenance)) == (
+        model.states,
+        dict(model.units),
+        dict(model.provenance),
+    )
+    assert back.to_json() == model.to_json()
+    assert [p.name for p in (tmp_path / "models").iterdir()] == ["simple.json"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}",
+        "not json",
+        '{"format": "other"}',
+        breathing().to_json()[:-40],
+        json.dumps({**json.loads(breathing().to_json()), "variables": ["n_i"]}),
+    ],
+)
+def test_other_files_are_not_models(text: str) -> None:
+    with pytest.raises(ValueError, match="a model file must hold ep2sindy.SparseModel/1"):
+        SparseModel.from_json(text)
+
+
+def test_rollout_of_a_driven_model_matches_its_solution() -> None:
+    model, run = driven()
+    rollout = model.rollout(run)
+    assert not rollout.diverged
+    # The cubic spline of the input is the largest error: dt^4 * |u''''| * 5/384.
+    assert np.abs(rollout.states - run.states).max() < 5 / 384 * 0.025**4 * 10
+
+
+def test_rollout_of_a_window_starts_from_the_data() -> None:
+    model, run = driven()
+    rollout = model.rollout(run, start=50, n_samples=40)
+    assert np.array_equal(rollout.t, run.t[50:90])
+    assert rollout.states[0] == pytest.approx(run.states[50])
+    assert np.abs(rollout.states - run.states[50:90]).max() < 1e-6
+
+
+def test_rollout_conserves_what_predator_and_prey_conserve() -> None:
+    system = lotka_volterra()
+    run = system.trajectory()
+    x, y = system.model.rollout(run).states.T
+    invariant = x - np.log(x) / 3 + y - 2 / 3 * np.log(y)
+    assert np.ptp(invariant) < 1e-6
+
+
+def test_a_blow_up_is_reported_and_cut() -> None:
+    library = named_terms(["x"], ["x^2"])
+    model = SparseModel(library, ["x"], np.array([[1.0]]))
+    t = np.linspace(0.0, 2.0, 401)
+    run = Trajectory(t=t, states=(1.0 + 0.1 * t)[:, None], state_names=["x"])
+    rollout = model.rollout(run)  # 1/(1 - t): infinite at t = 1
+    assert rollout.diverged
+    assert "grew past 100 times the data's largest value at t = 0.99 s" in rollout.message
+    assert rollout.t[-1] <= 1.0
+    assert np.isfinite(rollout.states).all()
+
+
+def test_missing_inputs_are_named() -> None:
+    model, run = driven()
+    bare = Trajectory(t=run.t, states=run.states, state_names=["x"])
+    with pytest.raises(ValueError, match="unknown variable 'u'"):
+        model.rollout(bare)
+
+
+def test_bad_coefficients_are_refused() -> None:
+    library = polynomial(["x"], degree=1)
+    with pytest.raises(ValueError, match="one row per term and one column per equation"):
+        SparseModel(library, ["x"], np.zeros((3, 1)))
+    with pytest.raises(ValueError, match="coefficients must be finite"):
+        SparseModel(library, ["x"], np.full((2, 1), np.nan))
+    with pytest.raises(ValueError, match=r"unknown state 'y'; this model has \['x'\]"):
+        SparseModel(library, ["x"], np.zeros((2, 1))).terms("y")

@@ -1,0 +1,143 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ep2sindy.ambiguity import ambiguities, usable_terms
+from ep2sindy.library import named_terms, polynomial
+from ep2sindy.regression import BlockSplit, Differential, RandomSplit, Regression
+from ep2sindy.smoothing import NoSmoothing, SavitzkyGolay
+from ep2sindy.systems import lotka_volterra
+from ep2sindy.trajectory import Trajectory
+
+
+def problem_of(theta: np.ndarray, target: np.ndarray, names: list[str]) -> Regression:
+    """Columns named as variables of their own, none held out."""
+    return Regression(
+        theta=theta,
+        target=target,
+        library=named_terms(names, names),
+        equations=["y"],
+        groups=np.arange(len(theta)),
+        test=np.zeros(len(theta), dtype=bool),
+    )
+
+
+def cubic(t: np.ndarray, label: str) -> Trajectory:
+    return Trajectory(t=t, states=(t**2 + 0.3)[:, None], state_names=["x"], label=label)
+
+
+def test_rows_of_one_trajectory_do_not_depend_on_the_other() -> None:
+    runs = [cubic(np.linspace(0, 1, 40), "a"), cubic(np.linspace(5, 9, 60), "b")]
+    library = polynomial(["x"], degree=2)
+    both = Differential().assemble(runs, library, rng=np.random.default_rng(0))
+    alone = [Differential().assemble([r], library, rng=np.random.default_rng(0)) for r in runs]
+    assert np.array_equal(both.theta, np.concatenate([a.theta for a in alone]))
+    assert np.array_equal(both.target, np.concatenate([a.target for a in alone]))
+    assert both.target[:, 0] == pytest.approx(2 * np.concatenate([r.t for r in runs]), abs=1e-9)
+
+
+def test_raw_and_smoothed_libraries_differ_only_in_theta() -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=np.random.default_rng(1))
+    library = polynomial(["x", "y"], degree=2)
+    form = Differential(smoother=SavitzkyGolay())
+    smooth = form.assemble([run], library, rng=np.random.default_rng(0))
+    raw = replace(form, smooth_library=False).assemble([run], library, rng=np.random.default_rng(0))
+    assert np.array_equal(raw.theta, library.evaluate(run.states))
+    assert np.array_equal(raw.target, smooth.target)
+    assert np.abs(raw.theta - smooth.theta).max() > 1e-3
+
+
+@pytest.mark.parametrize("split", [RandomSplit(0.25), BlockSplit(0.25, n_blocks=20)])
+def test_splits_hold_out_the_asked_share(split: RandomSplit | BlockSplit) -> None:
+    held_out = split.held_out(400, np.random.default_rng(0))
+    assert held_out.sum() == 100
+
+
+def test_block_split_holds_out_whole_blocks() -> None:
+    held_out = BlockSplit(0.25, n_blocks=20).held_out(400, np.random.default_rng(0))
+    assert np.all(np.ptp(held_out.reshape(20, 20).astype(int), axis=1) == 0)
+
+
+@pytest.mark.parametrize("split", [RandomSplit(1.0), BlockSplit(-0.1)])
+def test_impossible_shares_are_refused(split: RandomSplit | BlockSplit) -> None:
+    with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\)"):
+        split.held_out(10, np.random.default_rng(0))
+
+
+def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
+    rng = np.random.default_rng(0)
+    theta, target = rng.normal(size=(30, 3)) * [1e18, 1.0, 1e-14], rng.normal(size=(30, 1))
+    problem = problem_of(theta, target, ["a", "b", "c"])
+    assert np.diag(problem.train_gram.xx) == pytest.approx(1.0)
+    counts = rng.integers(0, 3, size=30).astype(float)
+    repeated = np.repeat(theta / np.linalg.norm(theta, axis=0), counts.astype(int), axis=0)
+    assert np.allclose(problem.resampled_gram(counts).xx, repeated.T @ repeated, atol=1e-14)
+
+
+def test_columns_at_the_edge_of_the_number_format_keep_finite_norms() -> None:
+    theta = np.array([[1e200, 1.0], [2e200, 3.0], [-1e200, 2.0]])
+    problem = problem_of(theta, np.ones((3, 1)), ["a", "b"])
+    assert problem.theta_scale[0] == pytest.approx(np.sqrt(6.0) * 1e200)
+
+
+def test_a_library_larger_than_the_rows_is_refused() -> None:
+    run = cubic(np.linspace(0, 1, 12), "short")
+    with pytest.raises(ValueError, match=r"library of 16 terms needs .* 9 of 12 rows"):
+        Differential().assemble([run], polynomial(["x"], degree=15), rng=np.random.default_rng(0))
+
+
+def test_an_overflowing_term_is_named() -> None:
+    t = np.linspace(0, 1, 40)
+    run = Trajectory(t=t, states=1e120 * (1 + t)[:, None], state_names=["n"])
+    with pytest.raises(ValueError, match=r"'n\^3' is not on row 0; lower the degree"):
+        Differential().assemble([run], polynomial(["n"], degree=3), rng=np.random.default_rng(0))
+
+
+def test_trajectories_must_agree() -> None:
+    t = np.linspace(0, 1, 40)
+    library = polynomial(["x"], degree=1)
+    rng = np.random.default_rng(0)
+    metre = Trajectory(t=t, states=t[:, None], state_names=["x"], units={"x": "m"})
+    foot = Trajectory(t=t, states=t[:, None], state_names=["x"], units={"x": "ft"})
+    other = Trajectory(t=t, states=t[:, None], state_names=["y"])
+    with pytest.raises(ValueError, match="'x' is in m in trajectory 0 and in ft in trajectory 1"):
+        Differential().assemble([metre, foot], library, rng=rng)
+    with pytest.raises(ValueError, match=r"trajectory 1 has states \['y'\]"):
+        Differential().assemble([metre, other], library, rng=rng)
+    with pytest.raises(ValueError, match="at least one trajectory"):
+        Differential().assemble([], library, rng=rng)
+    with pytest.raises(ValueError, match=r"trajectory 0 has states \['x'\] and inputs \[\]"):
+        Differential().assemble([metre], polynomial(["x", "u"], degree=1), rng=rng)
+
+
+def test_without_smoothing_the_derivative_is_the_plain_difference() -> None:
+    run = cubic(np.linspace(0, 1, 40), "a")
+    form = Differential(smoother=NoSmoothing())
+    problem = form.assemble([run], polynomial(["x"], degree=1), rng=np.random.default_rng(0))
+    assert problem.target[:, 0] == pytest.approx(2 * run.t, abs=1e-12)
+
+
+def degenerate() -> Regression:
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 50))
+    columns = [np.ones(50), a, np.zeros(50), -3.0 * a, b, a + 2.0 * b, a + 1e-3 * b]
+    names = ["one", "a", "zero", "minus_3a", "b", "a_plus_2b", "nearly_a"]
+    return problem_of(np.stack(columns, axis=1), (a + b)[:, None], names)
+
+
+def test_zero_and_repeated_terms_are_left_out() -> None:
+    assert usable_terms(degenerate()).tolist() == [True, True, False, False, True, True, True]
+
+
+def test_the_user_is_told_what_cannot_be_told_apart() -> None:
+    messages = [a.message for a in ambiguities(degenerate())]
+    assert "'zero' is zero on every row and is left out" in messages
+    assert "'minus_3a' is a multiple of 'a' on every row and is left out" in messages
+    assert "'a_plus_2b' is a linear combination of ['a', 'b'] on every row" in messages
+    assert any("'a' and 'nearly_a' are nearly proportional" in m for m in messages)
+
+
+def test_a_healthy_library_has_no_ambiguities() -> None:
+    theta = np.random.default_rng(0).normal(size=(50, 3))
+    assert ambiguities(problem_of(theta, theta[:, :1], ["a", "b", "c"])) == ()

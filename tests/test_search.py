@@ -1,0 +1,213 @@
+from itertools import combinations
+
+import numpy as np
+import pytest
+from sklearn.linear_model import Lasso, lars_path_gram
+
+from ep2sindy.kernels import lasso_supports
+from ep2sindy.library import named_terms
+from ep2sindy.regression import Regression
+from ep2sindy.search import STLSQ, AdaptiveLasso, BestSubset, Bootstraps, Search, pooled_supports
+
+SEARCHES = [AdaptiveLasso(), STLSQ(), BestSubset(max_terms=8)]
+
+
+def random_gram(n_terms: int, seed: int, correlation: float = 0.7) -> tuple:
+    rng = np.random.default_rng(seed)
+    shared = rng.normal(size=(200, 1))
+    theta = correlation * shared + rng.normal(size=(200, n_terms))
+    theta /= np.linalg.norm(theta, axis=0)
+    target = theta[:, :3] @ [1.0, -2.0, 0.5] + 0.02 * rng.normal(size=200)
+    return theta.T @ theta, theta.T @ target, float(target @ target)
+
+
+def residual(xx: np.ndarray, xy: np.ndarray, yy: float, columns: list[int]) -> float:
+    coef = np.linalg.solve(xx[np.ix_(columns, columns)], xy[columns])
+    return yy - coef @ xy[columns]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lasso_path_matches_an_independent_implementation(seed: int) -> None:
+    xx, xy, _ = random_gram(9, seed, correlation=1.0)
+    _, _, path = lars_path_gram(xy, xx, n_samples=200, method="lasso")
+    at_knots = {tuple(np.flatnonzero(column)) for column in path.T}
+    found = {tuple(np.flatnonzero(m)) for m in lasso_supports(xx, xy, 9)}
+    # The support between two knots is ours; at the knot itself a leaving term is zero already.
+    assert at_knots <= found
+    assert len(found) == len({tuple(c != 0) for c in (path[:, 1:] + path[:, :-1]).T}) + 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_adaptive_lasso_path_holds_the_minimisers_support(seed: int) -> None:
+    xx, xy, yy = random_gram(9, seed)
+    found = {m.tobytes() for m in AdaptiveLasso().supports(xx, xy, yy)}
+    root = np.linalg.cholesky(xx).T
+    weight = 1.0 / np.abs(np.linalg.solve(xx, xy))
+    target = np.linalg.solve(root.T, xy)
+    for penalty in np.geomspace(1e-5, 0.1, 15):
+        lasso = Lasso(alpha=penalty / 9, fit_intercept=False, tol=1e-14, max_iter=100000)
+        support = np.abs(lasso.fit(root / weight, target).coef_) > 1e-9
+        assert support.tobytes() in found
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("n_best", [1, 3])
+def test_best_subsets_match_exhaustive_enumeration(seed: int, n_best: int) -> None:
+    xx, xy, yy = random_gram(11, seed, correlation=3.0)
+    masks = BestSubset(max_terms=11, n_best=n_best).supports(xx, xy, yy)
+    for size in range(1, 12):
+        ranked = sorted(combinations(range(11), size), key=lambda c: residual(xx, xy, yy, list(c)))
+        found = {tuple(np.flatnonzero(m)) for m in masks if m.sum() == size}
+        assert found == set(ranked[:n_best])
+
+
+def test_best_subsets_stop_at_max_terms() -> None:
+    masks = BestSubset(max_terms=3).supports(*random_gram(8, 0))
+    assert masks.sum(axis=1).tolist() == [0, 1, 2, 3]
+
+
+def test_thresholding_is_iterated_to_its_end() -> None:
+    # x1 and x2 carry large opposite coefficients as long as x0, close to their mean, is there;
+    # once x0 goes, x2 falls below the threshold too: one pass would keep it.
+    xx = np.array([[1.0, 0.6, 0.6], [0.6, 1.0, 0.0], [0.6, 0.0, 1.0]])
+    coef = np.array([0.30, 1.0, 0.35])
+    xy = xx @ coef
+    threshold = 0.4
+    once = np.abs(np.linalg.solve(xx, xy)) >= threshold
+    assert once.tolist() == [False, True, False]
+    xy = xx @ np.array([-0.39, 1.0, 0.60])
+    first_pass = np.abs(np.linalg.solve(xx, xy)) >= threshold
+    assert first_pass.tolist() == [False, True, True]
+    second_pass = np.linalg.solve(xx[1:, 1:], xy[1:])
+    assert second_pass[1] < threshold
+    sweep = STLSQ(lowest=threshold, highest=2 * threshold, n_thresholds=2)
+    assert sweep.supports(xx, xy, 1.0)[0].tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=lambda s: type(s).__name__)
+def test_dependent_columns_never_share_a_support(search: Search) -> None:
+    xx, xy, yy = random_gram(5, 1)
+    mix = np.zeros((6, 5))
+    mix[:5] = np.eye(5)
+    mix[5, :2] = [0.6, 0.8]
+    scale = 1.0 / np.sqrt(np.diag(mix @ xx @ mix.T))
+    xx, xy = (mix @ xx @ mix.T) * np.outer(scale, scale), mix @ xy * scale
+    masks = search.supports(xx, xy, yy)
+    assert len(masks) > 1
+    assert not masks[:, [0, 1, 5]].all(axis=1).any()
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=lambda s: type(s).__name__)
+def test_a_target_of_zeros_gives_only_empty_supports(search: Search) -> None:
+    xx, _, _ = random_gram(4, 0)
+    assert not search.supports(xx, np.zeros(4), 0.0)[0].any()
+
+
+def noisy_problem(scale: np.ndarray, *, order: np.ndarray | None = None) -> Regression:
+    rng = np.random.default_rng(3)
+    theta = rng.normal(size=(300, 6))
+    target = theta[:, :2] @ [1.5, -0.8] + 0.3 * rng.normal(size=300)
+    order = np.arange(6) if order is None else order
+    names = np.array(["a", "b", "c", "d", "e", "f"])[order].tolist()
+    return Regression(
+        theta=(theta * scale)[:, order],
+        target=target[:, None] * 1e20,
+        library=named_terms(names, names),
+        equations=["y"],
+        groups=np.arange(300) // 3,
+        test=np.arange(300) < 60,
+    )
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=lambda s: type(s).__name__)
+def test_units_change_nothing_but_the_numbers(search: Search) -> None:
+    settings = {"rng": np.random.default_rng(0)}
+    plain = pooled_supports(noisy_problem(np.ones(6)), search, Bootstraps(), **settings)[0]
+    scale = np.array([1e18, 1e-14, 1.0, 1e36, 1e-5, 3.0])
+    settings = {"rng": np.random.default_rng(0)}
+    scaled = pooled_supports(noisy_problem(scale), search, Bootstraps(), **settings)[0]
+    assert np.array_equal(plain.masks, scaled.masks)
+    assert np.array_equal(plain.share, scaled.share)
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=lambda s: type(s).__name__)
+def test_order_of_terms_changes_nothing(search: Search) -> None:
+    order = np.array([3, 1, 5, 0, 2, 4])
+    no_draws = Bootstraps(n=0)
+    rng = np.random.default_rng(0)
+    plain = pooled_supports(noisy_problem(np.ones(6)), search, no_draws, rng=rng)[0]
+    permuted = pooled_supports(noisy_problem(np.ones(6), order=order), search, no_draws, rng=rng)
+    unpermuted = np.zeros_like(permuted[0].masks)
+    unpermuted[:, order] = permuted[0].masks
+    assert {m.tobytes() for m in unpermuted} == {m.tobytes() for m in plain.masks}
+
+
+def test_bootstraps_draw_whole_groups() -> None:
+    problem = noisy_problem(np.ones(6))
+    weights = []
+    object.__setattr__(problem, "resampled_gram", lambda w: weights.append(w) or problem.train_gram)
+    Bootstraps(n=5).draw(problem, np.ones(6, dtype=bool), np.random.default_rng(0))
+    for drawn in weights:
+        assert np.all(np.ptp(drawn.reshape(-1, 3), axis=1) == 0)
+        assert 0.2 * 240 <= drawn.sum() <= 0.8 * 240
+
+
+def test_culled_terms_are_missing_from_their_bootstrap_alone() -> None:
+    problem = noisy_problem(np.ones(6))
+    draws = Bootstraps(n=40, n_culled=2).draw(
+        problem, np.array([True] * 5 + [False]), np.random.default_rng(0)
+    )
+    kept = np.array([mask for _, mask in draws])
+    assert np.all(kept.sum(axis=1) == 3)
+    assert not kept[:, 5].any()
+    assert np.all(kept[:, :5].any(axis=0))
+
+
+def test_shares_count_bootstraps() -> None:
+    search, boots = BestSubset(max_terms=6), Bootstraps(n=50, n_culled=1)
+    pooled = pooled_supports(
+        noisy_problem(np.ones(6)), search, boots, rng=np.random.default_rng(0)
+    )[0]
+    sizes = pooled.masks.sum(axis=1)
+    assert pooled.share[sizes == 0].tolist() == [1.0]
+    assert pooled.share[sizes == 2].sum() == pytest.approx(1.0)
+    # The true pair is found unless one of its two terms was culled (a third of the draws).
+    truth = (pooled.masks == [True, True, False, False, False, False]).all(axis=1)
+    assert pooled.share[truth][0] == pytest.approx(2 / 3, abs=3 * np.sqrt(2 / 9 / 50))
+    # Where it was at hand, each true term stood in every support of two terms.
+    assert pooled.inclusion[2, :2].tolist() == [1.0, 1.0]
+    assert pooled.inclusion[2, 2:].max() < 0.5
+
+
+def test_a_fixed_seed_gives_the_same_supports() -> None:
+    runs = [
+        pooled_supports(
+            noisy_problem(np.ones(6)), AdaptiveLasso(), Bootstraps(), rng=np.random.default_rng(7)
+        )[0]
+        for _ in range(2)
+    ]
+    assert np.array_equal(runs[0].masks, runs[1].masks)
+    assert np.array_equal(runs[0].inclusion, runs[1].inclusion)
+
+
+def test_culling_everything_is_refused() -> None:
+    with pytest.raises(ValueError, match="must leave a term: 6 of 6 would go"):
+        Bootstraps(n_culled=6).draw(
+            noisy_problem(np.ones(6)), np.ones(6, dtype=bool), np.random.default_rng(0)
+        )
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: AdaptiveLasso(gamma=0.0), "gamma must be positive"),
+        (lambda: AdaptiveLasso(max_terms=0), "max_terms must be at least 1"),
+        (lambda: STLSQ(lowest=1.0, highest=0.5), "0 < lowest < highest"),
+        (lambda: BestSubset(n_best=0), "n_best must be at least 1"),
+        (lambda: Bootstraps(n=-1), "must not be negative"),
+        (lambda: Bootstraps(smallest=0.0), "0 < smallest <= largest"),
+    ],
+)
+def test_impossible_settings_are_refused(build: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build()  # type: ignore[operator]
