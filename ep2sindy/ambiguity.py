@@ -17,10 +17,14 @@ ALIKE = 1e-3
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """A finding about some terms, in words for the user."""
+    """A finding about some terms, in words for the user.
+
+    exact: no data of this kind could tell; otherwise it is a matter of noise.
+    """
 
     terms: tuple[str, ...]
     message: str
+    exact: bool
 
 
 def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
@@ -41,7 +45,7 @@ def ambiguities(problem: Regression) -> tuple[Ambiguity, ...]:
 
 def _zero(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     return [
-        Ambiguity((name,), f"{name!r} is zero on every row and is left out")
+        Ambiguity((name,), f"{name!r} is zero on every row and is left out", True)
         for name, square in zip(problem.term_names, np.diag(xx), strict=True)
         if square == 0.0
     ]
@@ -52,14 +56,15 @@ def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Am
     found = []
     for i, j in np.argwhere(np.triu(np.abs(xx) > 1.0 - ALIKE, k=1)):
         pair = (names[i], names[j])
-        if abs(xx[i, j]) > 1.0 - SAME:
+        exact = abs(xx[i, j]) > 1.0 - SAME
+        if exact:
             message = f"{pair[1]!r} is a multiple of {pair[0]!r} on every row and is left out"
         else:
             message = (
                 f"{pair[0]!r} and {pair[1]!r} are nearly proportional "
                 f"(1 - |cosine| = {1.0 - abs(xx[i, j]):.1e}): either may stand for the other"
             )
-        found.append(Ambiguity(pair, message))
+        found.append(Ambiguity(pair, message, bool(exact)))
     return found
 
 
@@ -75,7 +80,6 @@ def _dependent(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> lis
         weights = np.linalg.solve(usable[np.ix_(basis, basis)], usable[basis, j])
         parts = [names[columns[i]] for i in basis[np.abs(weights) > 1e-6]]
         name = names[columns[j]]
-        found.append(
-            Ambiguity((name, *parts), f"{name!r} is a linear combination of {parts} on every row")
-        )
+        message = f"{name!r} is a linear combination of {parts} on every row"
+        found.append(Ambiguity((name, *parts), message, True))
     return found

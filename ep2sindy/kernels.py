@@ -64,26 +64,21 @@ def independent_terms(xx):
 
 
 @njit(cache=True)
-def fit_masks(xx, xy, masks):
-    """Least squares on every support: coef (masks, terms), and whether it was solvable."""
+def solve_masks(xx, rhs, masks):
+    """Solve xx coef = rhs on each support; NaN where its columns depend on each other.
+
+    rhs, masks and the returned coef: (masks, terms); coef is zero outside the support.
+    """
     n_masks, n_terms = masks.shape
     coef = np.zeros((n_masks, n_terms))
-    solvable = np.ones(n_masks, dtype=np.bool_)
     solution = np.empty(n_terms)
     for m in range(n_masks):
         active = np.flatnonzero(masks[m])
-        solvable[m] = _solve(xx, xy, active, len(active), solution)
-        if solvable[m]:
-            for i in range(len(active)):
-                coef[m, active[i]] = solution[i]
-    return coef, solvable
-
-
-@njit(cache=True)
-def least_squares(xx, xy):
-    """Least squares on all terms; a term that depends on earlier ones gets zero."""
-    masks = independent_terms(xx).reshape(1, -1)
-    return fit_masks(xx, xy, masks)[0][0]
+        if _solve(xx, rhs[m], active, len(active), solution):
+            coef[m, active] = solution[: len(active)]
+        else:
+            coef[m] = np.nan
+    return coef
 
 
 @njit(cache=True)
@@ -165,6 +160,18 @@ def lasso_supports(xx, xy, max_terms):
             masks[n_masks, active[i]] = True
         n_masks += 1
     return masks[:n_masks]
+
+
+@njit(cache=True)
+def adaptive_lasso_supports(xx, xy, gamma, max_terms):
+    """Supports on the path of the lasso with penalties |b_ols|^-gamma (Zou 2006).
+
+    Scaling each column by |b_ols|^gamma makes it a plain lasso. A term that depends on earlier
+    ones has no least-squares coefficient of its own and never joins.
+    """
+    everything = independent_terms(xx).reshape(1, -1)
+    scale = np.abs(solve_masks(xx, xy.reshape(1, -1), everything)[0]) ** gamma
+    return lasso_supports(xx * scale.reshape(-1, 1) * scale, xy * scale, max_terms)
 
 
 @njit(cache=True)

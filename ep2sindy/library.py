@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,10 +12,8 @@ import numpy as np
 from array_api_compat import array_namespace
 from jaxtyping import Int
 
+from ep2sindy.names import split_factors
 from ep2sindy.units import unit_product
-
-# A factor is a variable, with < > around the average of a product, and maybe a power.
-_FACTOR = re.compile(r"(<[^<>]+>|[^*^<>\s]+)(?:\^(\d+))?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +111,6 @@ def term_exponents(name: str, variables: Sequence[str]) -> Int[np.ndarray, " var
             )
         exponents[list(variables).index(variable)] += power
     return exponents
-
-
-def split_factors(name: str) -> list[tuple[str, int]]:
-    """Variables and powers of a term: `n_i^2*<n_n*R_ion>` -> (n_i, 2), (<n_n*R_ion>, 1)."""
-    rest = _FACTOR.sub("", name).replace("*", "").strip()
-    if rest or not name.strip():
-        raise ValueError(f"cannot read term {name!r}: write it like 'n_i*n_n' or 'n_i^2'")
-    return [(variable, int(power or 1)) for variable, power in _FACTOR.findall(name)]
 
 
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:

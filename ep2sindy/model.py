@@ -16,7 +16,8 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.files import write_text
-from ep2sindy.library import Library, named_terms, split_factors
+from ep2sindy.library import Library, named_terms
+from ep2sindy.names import latex_derivative, latex_term_name
 from ep2sindy.pareto import Candidate
 from ep2sindy.trajectory import Trajectory, read_only
 
@@ -132,10 +133,7 @@ class SparseModel:
 
     def text(self, *, digits: int = 3) -> str:
         """One line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
-        return "\n".join(self.equation_text(s, digits=digits) for s in self.states)
-
-    def equation_text(self, state: str, *, digits: int = 3) -> str:
-        return f"{state}' = {_sum_of(self.terms(state), digits)}"
+        return "\n".join(equation_text(s, self.terms(s), digits=digits) for s in self.states)
 
     def sympy(self) -> dict[str, sympy.Expr]:
         """State name -> right-hand side as a sympy expression, coefficients as floats."""
@@ -161,7 +159,7 @@ class SparseModel:
                 _latex_term(name, coef, digits, first=k == 0)
                 for k, (name, coef) in enumerate(self.terms(state).items())
             )
-            lines.append(rf"\dot{{{_latex_name(state)}}} &= {right or '0'}")
+            lines.append(f"{latex_derivative(state)} &= {right or '0'}")
         return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
 
     def to_json(self) -> str:
@@ -275,21 +273,14 @@ def _ending(solution: object, blow_up: float) -> str:
     return f"the solver stopped at t = {last:.6g} s: {solution.message}"  # type: ignore[attr-defined]
 
 
-def _sum_of(terms: Mapping[str, float], digits: int) -> str:
+def equation_text(state: str, terms: Mapping[str, float], *, digits: int = 3) -> str:
+    """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "-" if coef < 0 else "+" if k else ""
         factors = "" if name == "1" else " " + name.replace("*", " ")
         parts.append(f"{sign}{' ' if k else ''}{abs(coef):.{digits}g}{factors}")
-    return " ".join(parts) or "0"
-
-
-def _latex_name(name: str) -> str:
-    if name.startswith("<"):
-        inner = " ".join(_latex_name(factor) for factor in name[1:-1].split("*"))
-        return rf"\langle {inner} \rangle"
-    stem, _, index = name.partition("_")
-    return rf"{stem}_{{{index.replace('_', ',')}}}" if index else stem
+    return f"{state}' = {' '.join(parts) or '0'}"
 
 
 def _latex_term(name: str, coef: float, digits: int, *, first: bool) -> str:
@@ -298,8 +289,4 @@ def _latex_term(name: str, coef: float, digits: int, *, first: bool) -> str:
     number = mantissa + (rf" \cdot 10^{{{int(exponent)}}}" if exponent else "")
     if name == "1":
         return f"{sign} {number}".strip()
-    factors = [
-        _latex_name(variable) + (f"^{{{power}}}" if power > 1 else "")
-        for variable, power in split_factors(name)
-    ]
-    return f"{sign} {number} \\, {' '.join(factors)}".strip()
+    return f"{sign} {number} \\, {latex_term_name(name)}".strip()

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from ep2sindy.kernels import fit_masks
-from ep2sindy.regression import Gram, Regression
+from ep2sindy.kernels import solve_masks
+from ep2sindy.regression import Regression
 from ep2sindy.search import Supports
 
 
@@ -98,67 +98,77 @@ def pareto_front(problem: Regression, supports: Supports) -> ParetoFront:
     one is left out, and so are supports whose terms depend on each other.
     """
     equation = problem.equations.index(supports.equation)
-    errors = _errors(problem, equation, supports.masks)
-    sizes = supports.masks.sum(axis=1)
-    candidates = [_fit(problem, equation, supports, None)]
-    for size in np.unique(sizes[(sizes > 0) & np.isfinite(errors)]):
-        of_size = np.flatnonzero(sizes == size)
-        best = of_size[np.nanargmin(errors[of_size])]
-        candidate = _fit(problem, equation, supports, int(best))
-        if _score(candidate) > _score(candidates[-1]):
+    n_terms = len(problem.library)
+    best = _best_of_each_size(problem, equation, supports.masks)
+    masks = np.concatenate([np.zeros((1, n_terms), dtype=np.bool_), supports.masks[best]])
+    share = [supports.share[~supports.masks.any(axis=1)].sum(), *supports.share[best]]
+    coef = _fit(problem, equation, masks)
+    coef_SI = coef * problem.target_scale[equation] / problem.theta_scale
+    r2_train = _r2(problem.train_rows, n_terms, equation, coef)
+    r2_test = _r2(problem.test_rows, n_terms, equation, coef)
+    candidates: list[Candidate] = []
+    for k, columns in enumerate(map(np.flatnonzero, masks)):
+        candidate = Candidate(
+            equation=supports.equation,
+            terms=tuple(problem.term_names[j] for j in columns),
+            coef=coef_SI[k, columns],
+            r2_train=float(r2_train[k]),
+            r2_test=float(r2_test[k]),
+            share=float(share[k]),
+            inclusion=supports.inclusion[len(columns), columns],
+        )
+        if not candidates or _score(candidate) > _score(candidates[-1]):
             candidates.append(candidate)
-    return ParetoFront(supports.equation, candidates, len(problem.library))
+    return ParetoFront(supports.equation, candidates, n_terms)
 
 
-def _errors(
-    problem: Regression, equation: int, masks: np.ndarray
-) -> Float[np.ndarray, " supports"]:
-    """1 - R2 of every support from the Gram matrices alone; NaN where terms depend."""
+def _best_of_each_size(
+    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"]
+) -> Int[np.ndarray, " sizes"]:
+    """Indices of the supports of least error, by number of terms, from Gram matrices alone."""
     train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
-    coef, solvable = fit_masks(train.xx, np.ascontiguousarray(train.xy[:, equation]), masks)
-    errors = _residual(judge, equation, coef) / judge.total[equation]
-    errors[~solvable] = np.nan
-    return errors
+    rhs = np.where(masks, train.xy[:, equation], 0.0)
+    coef = solve_masks(train.xx, rhs, masks)
+    explained = 2.0 * coef @ judge.xy[:, equation] - np.einsum("st,st->s", coef @ judge.xx, coef)
+    sizes = masks.sum(axis=1)
+    order = np.lexsort((-explained, sizes))
+    order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
+    return order[np.unique(sizes[order], return_index=True)[1]]
 
 
-def _residual(
-    gram: Gram, equation: int, coef: Float[np.ndarray, "supports terms"]
+def _fit(
+    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"]
+) -> Float[np.ndarray, "supports terms"]:
+    """Least squares on the training rows, in scaled columns.
+
+    The Gram matrix squares the condition of the rows, so its solution is refined against the
+    residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
+    """
+    gram, n_terms = problem.train_gram, len(problem.library)
+    theta, target = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms + equation]
+    coef = solve_masks(gram.xx, np.where(masks, gram.xy[:, equation], 0.0), masks)
+    for _ in range(2):
+        residual = target - coef @ theta.T
+        coef = coef + solve_masks(gram.xx, residual @ theta, masks)
+    return coef
+
+
+def _r2(
+    rows: Float[np.ndarray, "rows columns"],
+    n_terms: int,
+    equation: int,
+    coef: Float[np.ndarray, "supports terms"],
 ) -> Float[np.ndarray, " supports"]:
-    explained = 2.0 * coef @ gram.xy[:, equation] - np.einsum("st,st->s", coef @ gram.xx, coef)
-    return gram.yy[equation] - explained
+    """R2 of every support on some rows; NaN where there are none."""
+    if not len(rows):
+        return np.full(len(coef), np.nan)
+    return r2(truth=rows[:, n_terms + equation], prediction=coef @ rows[:, :n_terms].T)
 
 
-def _fit(problem: Regression, equation: int, supports: Supports, chosen: int | None) -> Candidate:
-    """Fit one support on the rows themselves: the Gram matrix would square its condition."""
-    if chosen is None:
-        columns, share = np.zeros(0, dtype=np.int64), _share_of_empty(supports)
-    else:
-        columns, share = np.flatnonzero(supports.masks[chosen]), supports.share[chosen]
-    target = len(problem.library) + equation
-    rows = problem.train_rows
-    scaled = np.linalg.lstsq(rows[:, columns], rows[:, target], rcond=None)[0]
-
-    def score(rows: np.ndarray) -> float:
-        return r2(truth=rows[:, target], prediction=rows[:, columns] @ scaled)
-
-    return Candidate(
-        equation=supports.equation,
-        terms=tuple(problem.term_names[k] for k in columns),
-        coef=scaled * problem.target_scale[equation] / problem.theta_scale[columns],
-        r2_train=score(rows),
-        r2_test=score(problem.test_rows) if problem.test.any() else float("nan"),
-        share=float(share),
-        inclusion=supports.inclusion[len(columns), columns],
-    )
-
-
-def _share_of_empty(supports: Supports) -> float:
-    empty = ~supports.masks.any(axis=1)
-    return float(supports.share[empty].sum())
-
-
-def r2(*, truth: Float[np.ndarray, " rows"], prediction: Float[np.ndarray, " rows"]) -> float:
+def r2(
+    *, truth: Float[np.ndarray, " rows"], prediction: Float[np.ndarray, "models rows"]
+) -> Float[np.ndarray, " models"]:
     """Coefficient of determination, 1 - SS_res/SS_tot, the total about the truth's mean."""
     total = np.square(truth - truth.mean()).sum()
     if total == 0.0:
@@ -166,4 +176,4 @@ def r2(*, truth: Float[np.ndarray, " rows"], prediction: Float[np.ndarray, " row
             "R2 needs a target that varies: it is constant on these rows; hold out more rows "
             "or check that the state varies"
         )
-    return float(1.0 - np.square(truth - prediction).sum() / total)
+    return 1.0 - np.square(truth - prediction).sum(axis=1) / total

@@ -14,6 +14,8 @@ from ep2sindy.library import Library
 from ep2sindy.smoothing import SavitzkyGolay, Smoother
 from ep2sindy.trajectory import Trajectory, read_only
 
+ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the cache
+
 
 @dataclass(frozen=True, eq=False)
 class Gram:
@@ -96,32 +98,49 @@ class Regression:
 
     @cached_property
     def train_gram(self) -> Gram:
-        return self._gram_of(self.train_rows, None)
+        return self._gram_of(self.train_rows)
 
     @cached_property
     def test_gram(self) -> Gram:
-        return self._gram_of(self.test_rows, None)
+        return self._gram_of(self.test_rows)
 
-    def resampled_gram(self, weights: Float[np.ndarray, " train"]) -> Gram:
-        """Gram matrix of the training rows, each counted `weights` times."""
-        used = weights > 0
-        return self._gram_of(self.train_rows[used], weights[used])
+    def resampled_grams(self, weights: Float[np.ndarray, "draws train"]) -> list[Gram]:
+        """Gram matrices of the training rows, each row counted `weights` times, per draw.
+
+        All draws share the products of pairs of columns, so each draw is one row of a matrix
+        product; blocks of rows keep those products small.
+        """
+        rows = self.train_rows
+        first, second = np.triu_indices(rows.shape[1])
+        sums = np.zeros((len(weights), len(first)))
+        column_sums = np.zeros((len(weights), rows.shape[1]))
+        for start in range(0, len(rows), ROW_BLOCK):
+            block = slice(start, start + ROW_BLOCK)
+            columns = np.ascontiguousarray(rows[block].T)
+            sums += weights[:, block] @ (columns[first] * columns[second]).T
+            column_sums += weights[:, block] @ columns.T
+        products = np.empty((len(weights), rows.shape[1], rows.shape[1]))
+        products[:, first, second] = sums
+        products[:, second, first] = sums
+        totals = zip(products, column_sums, weights.sum(axis=1).tolist(), strict=True)
+        return [self._gram(*total) for total in totals]
 
     def _scaled(self, rows: np.ndarray) -> np.ndarray:
         return np.concatenate(
             [self.theta[rows] / self.theta_scale, self.target[rows] / self.target_scale], axis=1
         )
 
-    def _gram_of(self, rows: np.ndarray, weights: np.ndarray | None) -> Gram:
+    def _gram_of(self, rows: np.ndarray) -> Gram:
+        return self._gram(rows.T @ rows, rows.sum(axis=0), float(len(rows)))
+
+    def _gram(self, products: np.ndarray, sums: np.ndarray, weight: float) -> Gram:
         n = len(self.library)
-        weighted = rows if weights is None else rows * weights[:, None]
-        products = weighted.T @ rows
         return Gram(
             xx=np.ascontiguousarray(products[:n, :n]),
             xy=products[:n, n:],
-            yy=np.diag(products)[n:],
-            y_sum=weighted[:, n:].sum(axis=0),
-            weight=float(len(rows) if weights is None else weights.sum()),
+            yy=products.diagonal()[n:],
+            y_sum=sums[n:],
+            weight=weight,
         )
 
 

@@ -7,15 +7,10 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.ambiguity import usable_terms
-from ep2sindy.kernels import (
-    best_subsets,
-    lasso_supports,
-    least_squares,
-    thresholded_supports,
-)
+from ep2sindy.kernels import adaptive_lasso_supports, best_subsets, thresholded_supports
 from ep2sindy.regression import Gram, Regression
 
 
@@ -38,9 +33,8 @@ class Search(Protocol):
 class AdaptiveLasso:
     """All supports on the exact path of the adaptive lasso.
 
-    Each coefficient is penalised by |b_ols|^-gamma; scaling its column by |b_ols|^gamma makes
-    that a plain lasso, whose path is piecewise linear and needs the Gram matrix alone. The
-    result does not depend on the units of the columns.
+    Each coefficient is penalised by |b_ols|^-gamma. The path is piecewise linear and needs the
+    Gram matrix alone; it does not depend on the units of the columns.
     max_terms: stop the path there, or None for all terms.
     Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8.
     """
@@ -59,9 +53,7 @@ class AdaptiveLasso:
         xy: Float[np.ndarray, " terms"],
         yy: float,
     ) -> Bool[np.ndarray, "supports terms"]:
-        scale = np.abs(least_squares(xx, xy)) ** self.gamma
-        scaled_xx = xx * scale[:, None] * scale
-        return lasso_supports(scaled_xx, xy * scale, self.max_terms or len(xy))
+        return adaptive_lasso_supports(xx, xy, self.gamma, self.max_terms or len(xy))
 
 
 @dataclass(frozen=True)
@@ -177,14 +169,13 @@ class Bootstraps:
             )
         _, group = np.unique(problem.groups[~problem.test], return_inverse=True)
         n_groups = int(group.max()) + 1
-        draws = []
-        for _ in range(self.n):
+        counts = np.empty((self.n, n_groups))
+        kept = np.repeat(terms[None], self.n, axis=0)
+        for k in range(self.n):
             size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
-            counts = np.bincount(rng.integers(n_groups, size=size), minlength=n_groups)
-            kept = terms.copy()
-            kept[rng.choice(usable, self.n_culled, replace=False)] = False
-            draws.append((problem.resampled_gram(counts[group].astype(np.float64)), kept))
-        return draws
+            counts[k] = np.bincount(rng.integers(n_groups, size=size), minlength=n_groups)
+            kept[k, rng.permutation(usable)[: self.n_culled]] = False
+        return list(zip(problem.resampled_grams(counts[:, group]), kept, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,47 +206,56 @@ def pooled_supports(
     The same resamples serve all equations, so their Gram matrices are computed once.
     """
     draws = bootstraps.draw(problem, usable_terms(problem), rng)
+    found = [_supports_of_all_equations(search, gram, kept) for gram, kept in draws]
+    at_hand = np.sum([kept for _, kept in draws], axis=0)
     return tuple(
-        _pool(name, [_search_one(search, gram, kept, k) for gram, kept in draws], draws)
+        _pool(name, [masks[k] for masks in found], at_hand)
         for k, name in enumerate(problem.equations)
     )
 
 
-def _search_one(search: Search, gram: Gram, kept: np.ndarray, equation: int) -> np.ndarray:
-    """Supports of one equation in one bootstrap, as masks over the whole library."""
+def _supports_of_all_equations(
+    search: Search, gram: Gram, kept: Bool[np.ndarray, " terms"]
+) -> list[Bool[np.ndarray, "supports terms"]]:
+    """Supports of each equation in one bootstrap, as masks over the whole library."""
     columns = np.flatnonzero(kept)
     # A resample changes the norms: unit columns again, so that no unit or draw leaks in.
-    diagonal = np.diag(gram.xx)[columns]
+    diagonal = gram.xx.diagonal()[columns]
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    xx = gram.xx[np.ix_(columns, columns)] * scale[:, None] * scale
-    xy = gram.xy[columns, equation] * scale
-    found = search.supports(xx, xy, float(gram.yy[equation]))
-    masks = np.zeros((len(found), len(kept)), dtype=np.bool_)
-    masks[:, columns] = found
-    return masks
+    xx = gram.xx[columns[:, None], columns] * scale[:, None] * scale
+    xy = gram.xy[columns] * scale[:, None]
+    found = []
+    for equation, yy in enumerate(gram.yy.tolist()):
+        masks = search.supports(xx, np.ascontiguousarray(xy[:, equation]), yy)
+        whole = np.zeros((len(masks), len(kept)), dtype=np.bool_)
+        whole[:, columns] = masks
+        found.append(whole)
+    return found
 
 
 def _pool(
     equation: str,
-    found: Sequence[np.ndarray],
-    draws: Sequence[tuple[Gram, np.ndarray]],
+    found: Sequence[Bool[np.ndarray, "_ terms"]],
+    at_hand: Int[np.ndarray, " terms"],
 ) -> Supports:
-    n_terms = found[0].shape[1]
-    counts: dict[bytes, int] = {}
-    included = np.zeros((n_terms + 1, n_terms))
-    for masks in found:
-        for key in {mask.tobytes() for mask in masks}:
-            counts[key] = counts.get(key, 0) + 1
-        of_size = np.zeros((n_terms + 1, n_terms), dtype=np.bool_)
-        np.logical_or.at(of_size, masks.sum(axis=1), masks)
-        included += of_size
-    masks = np.frombuffer(b"".join(counts), dtype=np.bool_).reshape(-1, n_terms)
-    at_hand = np.sum([kept for _, kept in draws], axis=0)
-    # Sorted, so that the result does not depend on the order of the bootstraps.
-    order = np.lexsort((*masks.T[::-1], masks.sum(axis=1)))
+    """Count supports and terms over the bootstraps; at_hand: in how many each term was kept."""
+    n_terms = len(at_hand)
+    source = np.repeat(np.arange(len(found)), [len(masks) for masks in found])
+    masks = np.concatenate(found)
+    sizes = masks.sum(axis=1)
+    included = np.zeros((len(found), n_terms + 1, n_terms), dtype=np.bool_)
+    rows, columns = np.nonzero(masks)
+    included[source[rows], sizes[rows], columns] = True
+    # One byte string per mask: sorting those is much faster than sorting rows.
+    packed = np.packbits(masks, axis=1)
+    keys = packed.view(f"S{packed.shape[1]}")[:, 0]
+    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
+    found_in = np.zeros((len(first), len(found)), dtype=np.bool_)
+    found_in[which, source] = True
+    order = np.argsort(sizes[first], kind="stable")
     return Supports(
         equation=equation,
-        masks=masks[order],
-        share=np.array(list(counts.values()), dtype=np.float64)[order] / len(found),
-        inclusion=included / np.maximum(at_hand, 1),
+        masks=masks[first[order]],
+        share=found_in.mean(axis=1)[order],
+        inclusion=included.sum(axis=0) / np.maximum(at_hand, 1),
     )

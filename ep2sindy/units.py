@@ -21,9 +21,9 @@ def _powers(unit: str) -> dict[str, float]:
         return {}
     try:
         parsed = registry().parse_units(unit)
-    except (pint.UndefinedUnitError, AttributeError, ValueError):
+    except (pint.PintError, AttributeError, ValueError, TypeError):
         return {unit: 1.0}
-    return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}
+    return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}  # type: ignore[arg-type]
 
 
 def unit_product(factors: Iterable[tuple[str, int]]) -> str:

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from ep2sindy.discover import discover
-from ep2sindy.library import polynomial, split_factors
+from ep2sindy.library import polynomial
+from ep2sindy.names import split_factors
 from ep2sindy.pareto import Knee
 from ep2sindy.regression import Differential
 from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps

@@ -10,9 +10,11 @@ PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 ORDER = [
     "files",
     "units",
+    "names",
     "kernels",
     "trajectory",
     "fields",
+    "readers",
     "io",
     "spectrum",
     "thruster",

@@ -51,7 +51,7 @@ def test_an_empty_equation_prints_as_zero() -> None:
 def test_latex_has_powers_of_ten_and_subscripts() -> None:
     latex = breathing().latex()
     assert (
-        r"\dot{n_{i}} &= - 2.62 \cdot 10^{5} \, n_{i} + 5.48 \cdot 10^{-14} \, n_{i} n_{n}" in latex
+        r"\dot{n}_{i} &= - 2.62 \cdot 10^{5} \, n_{i} + 5.48 \cdot 10^{-14} \, n_{i} n_{n}" in latex
     )
     assert r"- 0.77 \, n_{i} n_{n} R_{ion}" in latex
 

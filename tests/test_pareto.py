@@ -1,9 +1,18 @@
 import numpy as np
 import pytest
 
+from ep2sindy.library import named_terms
 from ep2sindy.pareto import Candidate, Knee, ParetoFront, pareto_front, r2
 from ep2sindy.regression import RandomSplit, Regression
-from ep2sindy.search import STLSQ, AdaptiveLasso, BestSubset, Bootstraps, Search, pooled_supports
+from ep2sindy.search import (
+    STLSQ,
+    AdaptiveLasso,
+    BestSubset,
+    Bootstraps,
+    Search,
+    Supports,
+    pooled_supports,
+)
 from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
@@ -87,14 +96,13 @@ def test_unknown_normalisation_is_refused() -> None:
 
 def test_r2_takes_the_data_as_truth() -> None:
     truth = np.array([0.0, 1.0, 2.0, 3.0])
-    assert r2(truth=truth, prediction=truth) == 1.0
-    assert r2(truth=truth, prediction=np.full(4, 1.5)) == 0.0
-    assert r2(truth=truth, prediction=np.zeros(4)) == pytest.approx(1 - 14 / 5)
+    prediction = np.array([truth, np.full(4, 1.5), np.zeros(4)])
+    assert r2(truth=truth, prediction=prediction) == pytest.approx([1.0, 0.0, 1 - 14 / 5])
 
 
 def test_r2_of_a_constant_is_refused() -> None:
     with pytest.raises(ValueError, match="constant on these rows"):
-        r2(truth=np.ones(4), prediction=np.ones(4))
+        r2(truth=np.ones(4), prediction=np.ones((1, 4)))
 
 
 def test_a_front_scores_on_training_rows_when_none_are_held_out() -> None:
@@ -115,5 +123,25 @@ def test_candidate_scores_are_those_of_the_rows() -> None:
         columns = [problem.library.index(t) for t in candidate.terms]
         rows = problem.test
         prediction = problem.theta[rows][:, columns] @ candidate.coef
-        expected = r2(truth=problem.target[rows, 1], prediction=prediction)
+        (expected,) = r2(truth=problem.target[rows, 1], prediction=prediction[None])
         assert candidate.r2_test == pytest.approx(expected, abs=1e-12)
+
+
+def test_ill_conditioned_supports_are_fitted_as_well_as_by_qr() -> None:
+    t = np.linspace(1.0, 1.2, 400)
+    theta = t[:, None] ** np.arange(5)  # the condition number of these columns is 1e7
+    truth = np.array([1.0, -2.0, 3.0, -4.0, 5.0])
+    names = [f"t{k}" for k in range(5)]
+    problem = Regression(
+        theta=theta,
+        target=(theta @ truth)[:, None],
+        library=named_terms(names, names),
+        equations=["y"],
+        groups=np.arange(400),
+        test=np.zeros(400, dtype=bool),
+    )
+    every = np.ones((1, 5), dtype=bool)
+    supports = Supports("y", every, np.ones(1), np.ones((6, 5)))
+    fitted = pareto_front(problem, supports).candidates[-1].coef
+    by_qr = np.linalg.lstsq(theta, theta @ truth, rcond=None)[0]
+    assert np.abs(fitted - truth).max() < 10 * max(np.abs(by_qr - truth).max(), 1e-9)

@@ -72,7 +72,9 @@ def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
     assert np.diag(problem.train_gram.xx) == pytest.approx(1.0)
     counts = rng.integers(0, 3, size=30).astype(float)
     repeated = np.repeat(theta / np.linalg.norm(theta, axis=0), counts.astype(int), axis=0)
-    assert np.allclose(problem.resampled_gram(counts).xx, repeated.T @ repeated, atol=1e-14)
+    assert np.allclose(
+        problem.resampled_grams(counts[None])[0].xx, repeated.T @ repeated, atol=1e-14
+    )
 
 
 def test_columns_at_the_edge_of_the_number_format_keep_finite_norms() -> None:

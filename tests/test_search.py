@@ -144,10 +144,16 @@ def test_order_of_terms_changes_nothing(search: Search) -> None:
 
 def test_bootstraps_draw_whole_groups() -> None:
     problem = noisy_problem(np.ones(6))
-    weights = []
-    object.__setattr__(problem, "resampled_gram", lambda w: weights.append(w) or problem.train_gram)
+    seen: list[np.ndarray] = []
+
+    def record(weights: np.ndarray) -> list:
+        seen.append(weights)
+        return [problem.train_gram] * len(weights)
+
+    object.__setattr__(problem, "resampled_grams", record)
     Bootstraps(n=5).draw(problem, np.ones(6, dtype=bool), np.random.default_rng(0))
-    for drawn in weights:
+    assert len(seen[0]) == 5
+    for drawn in seen[0]:
         assert np.all(np.ptp(drawn.reshape(-1, 3), axis=1) == 0)
         assert 0.2 * 240 <= drawn.sum() <= 0.8 * 240
 

@@ -1,0 +1,1 @@
+"""Speed claims, each as a ratio measured in one run on one thread."""

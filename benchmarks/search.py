@@ -1,0 +1,116 @@
+"""A whole bootstrapped adaptive-lasso search against the plain way, in CPU time.
+
+Lorenz, 3000 samples, 10 terms, 3 equations, 32 bootstraps. The plain way is scikit-learn's
+lasso_path with 100 alphas on the resampled rows of every bootstrap, then one lstsq on all
+training rows per support: for the support of every alpha, as the thesis's algorithm goes, or
+for each distinct support once, which already takes some care. All start from the same
+assembled rows and end with the best candidate of every size on the held-out rows.
+
+    python -m benchmarks.search
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import sklearn
+from sklearn.linear_model import lasso_path
+from threadpoolctl import threadpool_limits
+
+from ep2sindy.pareto import ParetoFront, pareto_front
+from ep2sindy.regression import Differential, Regression
+from ep2sindy.search import AdaptiveLasso, Bootstraps, pooled_supports
+from ep2sindy.systems import lorenz
+
+BOOTSTRAPS = Bootstraps(n=32, n_culled=1)
+# scikit-learn 1.7 renamed the argument.
+N_ALPHAS = {
+    "alphas" if tuple(map(int, sklearn.__version__.split(".")[:2])) >= (1, 7) else "n_alphas": 100
+}
+
+
+def ours(problem: Regression, rng: np.random.Generator) -> list[ParetoFront]:
+    supports = pooled_supports(problem, AdaptiveLasso(), BOOTSTRAPS, rng=rng)
+    return [pareto_front(problem, found) for found in supports]
+
+
+def plain(
+    problem: Regression, rng: np.random.Generator, *, distinct: bool
+) -> list[dict[int, tuple]]:
+    rows = problem.train_rows
+    n_terms = len(problem.library)
+    theta, targets = rows[:, :n_terms], rows[:, n_terms:]
+    supports: list[list[tuple[int, ...]]] = [[] for _ in problem.equations]
+    for _ in range(BOOTSTRAPS.n):
+        size = round(rng.uniform(BOOTSTRAPS.smallest, BOOTSTRAPS.largest) * len(rows))
+        drawn = rng.integers(len(rows), size=size)
+        kept = np.sort(rng.permutation(n_terms)[BOOTSTRAPS.n_culled :])
+        sample = theta[np.ix_(drawn, kept)]
+        for equation, found in enumerate(supports):
+            target = targets[drawn, equation]
+            scale = np.abs(np.linalg.lstsq(sample, target, rcond=None)[0])
+            _, path, _ = lasso_path(sample * scale, target, **N_ALPHAS)
+            found += [tuple(kept[column != 0.0]) for column in path.T]
+    return [
+        plain_front(problem, equation, sorted(set(found)) if distinct else found)
+        for equation, found in enumerate(supports)
+    ]
+
+
+def plain_front(
+    problem: Regression, equation: int, supports: list[tuple[int, ...]]
+) -> dict[int, tuple]:
+    """Best support of every size by its error on the held-out rows."""
+    train, test = problem.train_rows, problem.test_rows
+    target = len(problem.library) + equation
+    best: dict[int, tuple] = {}
+    for columns in map(list, supports):
+        coef = np.linalg.lstsq(train[:, columns], train[:, target], rcond=None)[0]
+        error = np.square(test[:, target] - test[:, columns] @ coef).sum()
+        if error < best.get(len(columns), (np.inf,))[0]:
+            best[len(columns)] = (error, columns, coef)
+    return best
+
+
+def cpu_s(run: Callable[[], object], *, n_runs: int) -> float:
+    """Median CPU time of a few runs, after one that warms caches."""
+    run()
+    times = []
+    for _ in range(n_runs):
+        start = time.process_time()
+        run()
+        times.append(time.process_time() - start)
+    return float(np.median(times))
+
+
+def main() -> None:
+    system = lorenz()
+    data = system.trajectory(noise=0.05, rng=np.random.default_rng(0))
+    library = system.model.library
+
+    def fresh() -> Regression:
+        # A new value each time, so that no cached Gram matrix flatters us.
+        return Differential().assemble([data], library, rng=np.random.default_rng(1))
+
+    with threadpool_limits(limits=1):
+        assembly_s = cpu_s(fresh, n_runs=9)
+        ours_s = cpu_s(lambda: ours(fresh(), np.random.default_rng(2)), n_runs=9) - assembly_s
+        plain_s = {
+            distinct: cpu_s(
+                lambda d=distinct: plain(fresh(), np.random.default_rng(2), distinct=d), n_runs=3
+            )
+            - assembly_s
+            for distinct in (False, True)
+        }
+    print(f"Lorenz {data.n_samples} x {len(library)}, 3 equations, {BOOTSTRAPS.n} bootstraps")
+    print(f"assembly of the rows                        {1e3 * assembly_s:8.1f} ms")
+    print(f"search and fronts, ours                     {1e3 * ours_s:8.1f} ms")
+    for distinct, name in ((False, "every alpha refitted"), (True, "each support once")):
+        ratio = plain_s[distinct] / ours_s
+        print(
+            f"the plain way, {name:<22}       {1e3 * plain_s[distinct]:8.1f} ms, {ratio:.0f} times"
+        )
+
+
+if __name__ == "__main__":
+    main()
