@@ -1,0 +1,505 @@
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from scipy.io import savemat
+
+from ep2sindy.fields import Zone, zone_average
+from ep2sindy.io import Variable, conversion, open_field, read_field, same_unit, write_field
+from ep2sindy.prepare import keep_where
+
+ROOT = Path(__file__).resolve().parents[1]
+RNG = np.random.default_rng(3)
+NT, NZ, NR = 6, 4, 3
+TIME = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 7.0]) * 1e-6
+Z = np.linspace(0.0, 0.03, NZ)
+R = np.linspace(0.02, 0.04, NR)
+N_I = RNG.uniform(1.0, 2.0, (NT, NZ, NR))
+T_E = RNG.uniform(5.0, 20.0, (NT, NZ))
+I_D = RNG.uniform(3.0, 5.0, NT)
+ARRAYS = {"t": TIME, "z": Z, "r": R, "ni": N_I, "Te": T_E, "Id": I_D}
+MAPPING = {
+    "n_i": Variable("ni", "m^-3"),
+    "T_e_eV": Variable("Te", "eV"),
+    "I_d": Variable("Id", "A"),
+    "u_iz": Variable(None, "m/s"),
+}
+AXES = {"time": Variable("t", "s"), "z": Variable("z", "m"), "r": Variable("r", "m")}
+SETTINGS = {"variables": MAPPING, **AXES}
+
+
+def dataset() -> xr.Dataset:
+    """The arrays with the dimension names of some other code."""
+    dims = {"t": "t", "z": "z", "r": "r", "ni": ("t", "z", "r"), "Te": ("t", "z"), "Id": "t"}
+    return xr.Dataset({name: (dims[name], values) for name, values in ARRAYS.items()})
+
+
+def write_netcdf4(path: Path) -> None:
+    dataset().to_netcdf(path, engine="h5netcdf")
+
+
+def write_netcdf3(path: Path) -> None:
+    dataset().to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+
+
+def write_zarr(path: Path) -> None:
+    dataset().to_zarr(path, consolidated=False)
+
+
+def write_hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        for name, values in ARRAYS.items():
+            file[name] = values
+
+
+def write_matlab5(path: Path) -> None:
+    savemat(path, {**ARRAYS, "note": "text"}, do_compression=True)
+
+
+def write_matlab73(path: Path) -> None:
+    """As MATLAB does: a text header of 512 bytes, axes reversed, vectors as (1, n) or (n, 1)."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in ARRAYS.items():
+            file[name] = values[None] if values.ndim == 1 else values.T
+        file["#refs#/a"] = 1.0
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def write_npz(path: Path) -> None:
+    np.savez(path, **ARRAYS)
+
+
+WRITERS = {
+    "field.nc": write_netcdf4,
+    "classic.nc": write_netcdf3,
+    "field.zarr": write_zarr,
+    "field.h5": write_hdf5,
+    "v7.mat": write_matlab5,
+    "v73.mat": write_matlab73,
+    "field.npz": write_npz,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_kind_of_file_gives_the_same_field(tmp_path: Path, name: str) -> None:
+    WRITERS[name](tmp_path / name)
+    field = open_field(tmp_path / name, **SETTINGS)
+    assert field["n_i"].dims == ("time", "z", "r")
+    assert field["T_e_eV"].dims == ("time", "z")
+    for ours, values in {"n_i": N_I, "T_e_eV": T_E, "I_d": I_D, "time": TIME, "z": Z}.items():
+        assert np.array_equal(field[ours].values, values), ours
+    units = {str(ours): array.attrs["units"] for ours, array in field.variables.items()}
+    expected = {"n_i": "m^-3", "T_e_eV": "eV", "I_d": "A", "time": "s", "z": "m", "r": "m"}
+    assert units == expected
+
+
+def test_csv_is_a_probe_trace(tmp_path: Path) -> None:
+    rows = "\n".join(f"{1e6 * t}, {i}, {2 * i}" for t, i in zip(TIME, I_D, strict=True))
+    (tmp_path / "probe.csv").write_text(f"# scope 4\ntime_us, Id, V\n{rows}\n")
+    variables = {"I_d": Variable("Id", "A"), "V_d": Variable("V", "kV")}
+    field = open_field(tmp_path / "probe.csv", variables=variables, time=Variable("time_us", "us"))
+    assert field["time"].values == pytest.approx(TIME, rel=1e-15)
+    assert field["V_d"].values == pytest.approx(2e3 * I_D, rel=1e-15)
+    assert field["V_d"].attrs["units"] == "V"
+
+
+def frame(k: int) -> dict:
+    """One frame in the layout of HallThruster.jl 0.19 to 0.22."""
+    ion = {"n": N_I[k, :, 0].tolist(), "u": N_I[k, :, 1].tolist(), "Z": 1}
+    return {
+        "t": TIME[k],
+        "z": Z.tolist(),
+        "discharge_current": I_D[k],
+        "Tev": T_E[k].tolist(),
+        "neutrals": {"Xe": {"n": N_I[k, :, 2].tolist()}},
+        "ions": {"Xe": [ion, {**ion, "Z": 2}]},
+        "anom_variables": [],
+    }
+
+
+JSON_MAPPING = {
+    "n_i": Variable("ions.Xe.0.n", "m^-3"),
+    "n_n": Variable("neutrals.Xe.n", "m^-3"),
+    "T_e_eV": Variable("Tev", "eV"),
+    "I_d": Variable("discharge_current", "A"),
+}
+
+
+def test_hallthruster_frames_become_a_field(tmp_path: Path) -> None:
+    frames = [frame(k) for k in range(NT)]
+    content = {"input": {}, "output": {"retcode": "success", "error": "", "frames": frames}}
+    (tmp_path / "out.json").write_text(json.dumps(content))
+    field = open_field(
+        tmp_path / "out.json", variables=JSON_MAPPING, time=AXES["time"], z=AXES["z"]
+    )
+    assert np.array_equal(field["n_i"].values, N_I[:, :, 0])
+    assert np.array_equal(field["n_n"].values, N_I[:, :, 2])
+    assert np.array_equal(field["T_e_eV"].values, T_E)
+    assert np.array_equal(field["I_d"].values, I_D)
+
+
+def test_older_hallthruster_output_is_a_bare_list_of_frames(tmp_path: Path) -> None:
+    frames = [{"t": TIME[k], "z": Z.tolist(), "ni_1": N_I[k, :, 0].tolist()} for k in range(NT)]
+    (tmp_path / "old.json").write_text(json.dumps(frames))
+    variables = {"n_i": Variable("ni_1", "m^-3")}
+    field = open_field(tmp_path / "old.json", variables=variables, time=AXES["time"], z=AXES["z"])
+    assert np.array_equal(field["n_i"].values, N_I[:, :, 0])
+
+
+def test_averaged_hallthruster_output_says_what_to_ask_for(tmp_path: Path) -> None:
+    (tmp_path / "mean.json").write_text(json.dumps({"output": {"average": frame(0)}}))
+    with pytest.raises(ValueError, match="no output.frames; run the simulation with save_time_res"):
+        open_field(tmp_path / "mean.json", variables=JSON_MAPPING, time=AXES["time"])
+
+
+def test_structs_and_groups_are_paths(tmp_path: Path) -> None:
+    savemat(tmp_path / "s.mat", {"data": {"t": TIME, "ion": {"ni": N_I[:, 0, 0]}}})
+    with h5py.File(tmp_path / "g.h5", "w") as file:
+        file["data/t"], file["data/ion/ni"] = TIME, N_I[:, 0, 0]
+    for name, dot in (("s.mat", "."), ("g.h5", "/")):
+        field = open_field(
+            tmp_path / name,
+            variables={"n_i": Variable(f"data{dot}ion{dot}ni", "m^-3")},
+            time=Variable(f"data{dot}t", "s"),
+        )
+        assert np.array_equal(field["n_i"].values, N_I[:, 0, 0])
+
+
+@pytest.mark.parametrize("dims", [("r", "z", "time"), ("z", "time", "r"), ("time", "r", "z")])
+def test_dimension_orders_are_undone(tmp_path: Path, dims: tuple[str, ...]) -> None:
+    order = [("time", "z", "r").index(d) for d in dims]
+    np.savez(tmp_path / "a.npz", **{**ARRAYS, "ni": N_I.transpose(order)})
+    field = open_field(tmp_path / "a.npz", variables={"n_i": Variable("ni", "m^-3", dims)}, **AXES)
+    assert field["n_i"].dims == ("time", "z", "r")
+    assert np.array_equal(field["n_i"].values, N_I)
+
+
+def test_equal_lengths_ask_for_dims_instead_of_guessing(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", t=TIME, z=Z, r=Z + 1, Te=T_E, ni=np.ones((NT, NZ, NZ)))
+    settings = {"variables": {"T_e_eV": Variable("Te", "eV")}, **AXES}
+    with pytest.raises(ValueError, match=r"shape \(6, 4\) and the grid .*'z': 4, 'r': 4.*give its"):
+        open_field(tmp_path / "a.npz", **settings)
+    settings["variables"] = {"T_e_eV": Variable("Te", "eV", ["time", "r"])}
+    assert open_field(tmp_path / "a.npz", **settings)["T_e_eV"].dims == ("time", "r")
+
+
+def test_axes_of_length_one_may_be_missing_in_the_file(tmp_path: Path) -> None:
+    arrays = {"t": TIME[:, None], "z": [[0.01]], "r": R[None], "ni": N_I[:, :1, :]}
+    savemat(tmp_path / "a.mat", arrays)  # the reader gets a scalar z and ni of shape (6, 3)
+    variables = {"n_i": Variable("ni", "m^-3", ["time", "z", "r"])}
+    field = open_field(tmp_path / "a.mat", variables=variables, **AXES)
+    assert field["z"].values.tolist() == [0.01]
+    assert np.array_equal(field["n_i"].values, N_I[:, :1, :])
+
+
+def test_units_become_si_and_suffixes_keep_theirs(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz")
+    variables = {
+        "n_i": Variable("ni", "1e12 cm^-3"),
+        "u_iz": Variable("ni", "km/s"),
+        "T_e_eV": Variable("Te", "keV"),
+        "T_K": Variable("Te", "degC"),
+        "mdot_mg_s": Variable("Id", "kg/s"),
+    }
+    axes = {"time": Variable("t", "ms"), "z": Variable("z", "cm"), "r": Variable("r", "mm")}
+    field = open_field(tmp_path / "a.npz", variables=variables, **axes)
+    for ours, values, unit in (
+        ("n_i", 1e18 * N_I, "m^-3"),
+        ("u_iz", 1e3 * N_I, "m s^-1"),
+        ("T_e_eV", 1e3 * T_E, "eV"),
+        ("T_K", T_E + 273.15, "K"),
+        ("mdot_mg_s", 1e6 * I_D, "mg s^-1"),
+        ("time", 1e-3 * TIME, "s"),
+        ("z", 1e-2 * Z, "m"),
+        ("r", 1e-3 * R, "m"),
+    ):
+        assert field[ours].values == pytest.approx(values, rel=1e-15), ours
+        assert field[ours].attrs["units"] == unit
+
+
+@pytest.mark.parametrize(
+    ("ours", "unit", "factor", "target"),
+    [
+        ("n", "cm-3", 1e6, "m^-3"),
+        ("R_ion", "cm3/s", 1e-6, "m^3 s^-1"),
+        ("V_d", "kV", 1e3, "V"),
+        ("I_d", "mA", 1e-3, "A"),
+        ("f_kHz", "Hz", 1e-3, "kHz"),
+        ("B", "1e-4 T", 1e-4, "T"),
+        ("E", "V/m", 1.0, "V m^-1"),
+        ("x", "1", 1.0, "1"),
+        ("x", "percent", 0.01, "1"),
+        ("x", "1000 mm", 1.0, "m"),
+        ("T_e", "eV", 1.602176634e-19, "J"),
+    ],
+)
+def test_conversion_factors(ours: str, unit: str, factor: float, target: str) -> None:
+    assert conversion(ours, unit) == (factor, 0.0, target)
+
+
+@pytest.mark.parametrize(
+    ("ours", "unit", "message"),
+    [
+        ("n_i", "furlongg^-3", "the unit of n_i must be one that converts to SI: 'furlongg"),
+        ("n_i", "m(", r"'m\(' came"),
+        ("n_i", "", "'' came"),
+        ("T_e_eV", "m", "the unit of T_e_eV must be one that converts to eV: 'm' came"),
+        ("time", "m", "the unit of time must be one that converts to s: 'm' came"),
+        ("B", "gauss", "'gauss' is not; write a gauss as '1e-4 T'"),
+        ("P", "dBm", "'dBm' is not"),
+        ("T", "degC/s", "'degC/s' came"),
+    ],
+)
+def test_units_without_a_factor_to_si_are_refused(ours: str, unit: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        conversion(ours, unit)
+
+
+def test_a_unit_that_contradicts_the_file_is_refused(tmp_path: Path) -> None:
+    written = dataset()
+    written["ni"].attrs["units"] = "cm-3"
+    written["Te"].attrs["units"] = "electron volts (mean)"
+    written.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with pytest.raises(ValueError, match=r"unit of n_i must agree .* 'm\^-3', the file 'cm-3'"):
+        open_field(tmp_path / "a.nc", **SETTINGS)
+    agreed = {**MAPPING, "n_i": Variable("ni", "1/cm^3")}
+    field = open_field(tmp_path / "a.nc", variables=agreed, **AXES)
+    assert field["n_i"].values == pytest.approx(1e6 * N_I, rel=1e-15)
+    assert same_unit("m^-3", "no unit at all")
+
+
+def test_a_step_stands_in_for_time(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz")
+    for first in (MAPPING["n_i"], Variable("ni", "m^-3", ["time", "z", "r"])):
+        field = open_field(
+            tmp_path / "a.npz", **{**SETTINGS, "variables": {"n_i": first}}, dt_s=1.5e-6
+        )
+        assert np.array_equal(field["time"].values, 1.5e-6 * np.arange(NT))
+
+
+def test_a_mask_leaves_only_the_plasma(tmp_path: Path) -> None:
+    inside = np.ones((NZ, NR), dtype=int)
+    inside[0, 1:] = 0
+    np.savez(tmp_path / "a.npz", **ARRAYS, plasma=inside)
+    field = open_field(tmp_path / "a.npz", **SETTINGS, mask=Variable("plasma", "1"))
+    assert np.array_equal(np.isnan(field["n_i"].values), np.tile(inside == 0, (NT, 1, 1)))
+    assert np.array_equal(field["T_e_eV"].values, T_E)
+
+
+def test_float32_stays_float32_and_integers_become_real(tmp_path: Path) -> None:
+    whole = {**ARRAYS, "ni": N_I.astype(np.float32), "Te": np.arange(NT * NZ).reshape(NT, NZ)}
+    np.savez(tmp_path / "a.npz", **whole)
+    variables = {**MAPPING, "n_i": Variable("ni", "cm^-3")}
+    field = open_field(tmp_path / "a.npz", variables=variables, **AXES)
+    assert field["n_i"].dtype == np.float32
+    assert field["T_e_eV"].dtype == np.float64
+
+
+def npz(path: Path, **changes: np.ndarray) -> Path:
+    np.savez(path / "a.npz", **{**ARRAYS, **changes})
+    return path / "a.npz"
+
+
+@pytest.mark.parametrize(
+    ("arrays", "settings", "message"),
+    [
+        (
+            {},
+            {"variables": {"n_i": Variable("nii", "m^-3")}},
+            r"no variable 'nii' \(wanted as n_i\); it holds \['t', 'z', 'r', 'ni', 'Te', 'Id'\]",
+        ),
+        ({}, {"z": Variable("x", "m")}, r"has no variable 'x' \(wanted as z\)"),
+        ({}, {"variables": {"n_i": Variable(None, "m^-3")}}, "none of .* has a name"),
+        ({}, {"variables": {"n_i": {"nmae": "ni", "unit": "m^-3"}}}, "n_i needs a name, a unit"),
+        ({}, {"time": None}, "name the file's time or give its step dt_s; .* holds"),
+        (
+            {"ni": N_I.T},
+            {},
+            r"n_i must fit the grid: the file has shape \(3, 4, 6\) and the grid .*'time': 6",
+        ),
+        (
+            {},
+            {"variables": {"n_i": Variable("ni", "m^-3", ["time", "r", "z"])}},
+            r"dims given: \['time', 'r', 'z'\]; give its dims in the order of the file",
+        ),
+        (
+            {},
+            {"variables": {"n_i": Variable("ni", "m^-3", ["time", "x", "r"])}},
+            "must fit the grid",
+        ),
+        ({"t": TIME[:5]}, {}, "n_i must fit the grid"),
+        ({"t": np.r_[TIME[:5], 3e-6]}, {}, r"t must increase: t\[5\] = 3e-06 s follows 5e-06 s"),
+        ({"t": TIME[[0, 1, 2, 3, 4, 4]]}, {}, r"t\[5\] = 5e-06 s follows 5e-06 s"),
+        ({"z": np.tile(Z, (2, 1))}, {}, r"z must be a vector: 'z' has shape \(2, 4\)"),
+        ({"z": Z[::-1]}, {}, "z must be finite and increase"),
+        ({"ni": N_I.astype(str)}, {}, "'ni' in .* must be real numbers, not <U"),
+        ({"ni": N_I.astype(object)}, {}, "cannot be read: Object arrays cannot be loaded"),
+    ],
+)
+def test_a_mapping_that_does_not_fit_is_refused(
+    tmp_path: Path, arrays: dict, settings: dict, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        open_field(npz(tmp_path, **arrays), **{**SETTINGS, **settings})
+
+
+def test_a_missing_file_is_named_in_full(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=f"no such file: {tmp_path}/none.h5"):
+        open_field(tmp_path / "none.h5", **SETTINGS)
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"a folder that ends in .zarr: .* is a folder"):
+        open_field(tmp_path, **SETTINGS)
+
+
+@pytest.mark.parametrize("name", ["a.nc", "a.h5", "a.mat", "a.npz", "a.dat"])
+def test_text_under_another_name_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("t,ni\n0,1\n")
+    with pytest.raises(ValueError, match=rf"{name} begins with b't,ni"):
+        open_field(tmp_path / name, **SETTINGS)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.95])
+@pytest.mark.parametrize("name", [n for n in WRITERS if not n.endswith("zarr")])
+def test_a_truncated_file_is_refused(tmp_path: Path, name: str, share: float) -> None:
+    WRITERS[name](tmp_path / name)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError, match=f"{name} (cannot be read|begins with)"):
+        open_field(tmp_path / name, **SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.json", '{"output": {"frames": [{"t": 0.0'), ("a.csv", ""), ("b.csv", "\0")],
+)
+def test_damaged_text_is_refused(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=f"{name} (cannot be read|has no variable)"):
+        open_field(tmp_path / name, **SETTINGS)
+
+
+def test_a_folder_named_zarr_without_a_store_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.zarr").mkdir()
+    with pytest.raises(ValueError, match="a.zarr cannot be read"):
+        open_field(tmp_path / "a.zarr", **SETTINGS)
+
+
+def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
+    field = open_field(npz(tmp_path), **SETTINGS).assign_attrs(label="300 V, 5 mg/s")
+    write_field(field, tmp_path / "deep" / "field.nc")
+    assert read_field(tmp_path / "deep" / "field.nc").identical(field)
+    variables = {"n_i": Variable("n_i", "m^-3")}
+    own = {axis: Variable(axis, v.unit) for axis, v in AXES.items()}
+    again = open_field(tmp_path / "deep" / "field.nc", variables=variables, **own)
+    assert again["n_i"].identical(field["n_i"])
+
+
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field = open_field(npz(tmp_path), **SETTINGS)
+    write_field(field, tmp_path / "field.nc")
+
+    def interrupted(self: xr.Dataset, path: Path, engine: str) -> None:
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(xr.Dataset, "to_netcdf", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_field(field.isel(time=slice(2)), tmp_path / "field.nc")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "field.nc"]
+    assert read_field(tmp_path / "field.nc").sizes["time"] == NT
+
+
+def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
+    field = open_field(npz(tmp_path), **SETTINGS)
+    with pytest.raises(ValueError, match=r"to a name that ends in .nc: .*field.h5 came"):
+        write_field(field, tmp_path / "field.h5")
+    with pytest.raises(ValueError, match=r"a written field is NetCDF: .*a.npz is not"):
+        read_field(tmp_path / "a.npz")
+
+
+def test_chunks_stream_a_file(tmp_path: Path) -> None:
+    pytest.importorskip("dask")
+    write_netcdf4(tmp_path / "a.nc")
+    variables = {"n_i": Variable("ni", "cm^-3")}
+    field = open_field(tmp_path / "a.nc", variables=variables, **AXES, chunks={"time": 2})
+    assert field["n_i"].chunks == ((2, 2, 2), (NZ,), (NR,))
+    assert field["n_i"].values == pytest.approx(1e6 * N_I, rel=1e-15)
+
+
+def composed(*overrides: str) -> xr.Dataset:
+    """What `data=file` with these overrides opens."""
+    with initialize_config_dir(str(ROOT / "conf"), version_base=None):
+        config = compose(overrides=["+data=file", *overrides])
+    return instantiate(config.data, _convert_="all")
+
+
+def test_the_config_group_opens_a_file_without_code(tmp_path: Path) -> None:
+    path = npz(tmp_path, nn=N_I.T)
+    field = composed(
+        f"data.path={path}",
+        "data.variables.n_i.name=ni",
+        "data.variables.n_i.unit=cm-3",
+        "data.variables.n_n.name=nn",
+        "data.variables.n_n.unit='1e19 m^-3'",
+        "data.variables.n_n.dims=[r,z,time]",
+        "data.variables.T_e_eV.name=Te",
+        "+data.variables.x.name=Id",
+        "+data.variables.x.unit=1",
+        "data.time.name=t",
+        "data.time.unit=us",
+        "data.r.name=r",
+    )
+    assert sorted(map(str, field.data_vars)) == ["T_e_eV", "n_i", "n_n", "x"]
+    assert field["x"].attrs["units"] == "1"
+    assert field["n_i"].values == pytest.approx(1e6 * N_I, rel=1e-15)
+    assert field["n_n"].values == pytest.approx(1e19 * N_I, rel=1e-15)
+    assert field["time"].values == pytest.approx(1e-6 * TIME, rel=1e-15)
+
+
+def test_the_config_group_takes_a_step_instead_of_time(tmp_path: Path) -> None:
+    field = composed(
+        f"data.path={npz(tmp_path)}",
+        "data.variables.n_i.name=ni",
+        "data.variables.n_n.name=null",
+        "data.dt_s=1.5e-6",
+        "data.r.name=r",
+    )
+    assert field["time"].values[-1] == 1.5e-6 * (NT - 1)
+
+
+REAL = ROOT.parent / "shared" / "data" / "thruster_2d_300V_5mgs.npz"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.exists(), reason="the two-dimensional field is not at hand")
+def test_a_field_of_real_size_opens_and_averages() -> None:
+    variables = {
+        "n_i": Variable("n_i", "m^-3"),
+        "n_n": Variable("n_n", "m^-3"),
+        "T_e_eV": Variable("T_e", "eV"),
+        "R_ion": Variable("R_ion", "m^3/s"),
+        "I_d": Variable("I_d", "A"),
+    }
+    field = open_field(REAL, variables=variables, **AXES)
+    assert field["n_i"].shape == (2668, 41, 49)
+    plasma = keep_where(field, condition="(z > 0.025) | ((r > 0.035) & (r < 0.05))")
+    run = zone_average(
+        plasma,
+        Zone(z=(0.015, 0.025)),
+        states=["n_i", "n_n"],
+        inputs=["R_ion", "I_d"],
+        products=["n_i*n_n*R_ion"],
+    )
+    means = run.values.mean(axis=0)
+    assert 1e17 < means[0] < 1e19
+    assert 0.3 < means[4] / (means[0] * means[1] * means[2]) < 3.0
