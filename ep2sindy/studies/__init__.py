@@ -1,0 +1,1 @@
+"""Studies: pure functions from data to tables, one module per kind of question."""

@@ -1,0 +1,129 @@
+"""Several libraries on the same data: what each finds, and how its model runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.discover import Discovery, discover
+from ep2sindy.library import Library
+from ep2sindy.model import Rollout, equation_text
+from ep2sindy.pareto import Knee, ParetoFront
+from ep2sindy.regression import Differential
+from ep2sindy.search import Bootstraps, Search
+from ep2sindy.spectrum import dominant_frequency
+from ep2sindy.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class LibraryCase:
+    """One library, and the rule that selects from its fronts."""
+
+    library: Library
+    selection: Knee
+
+
+@dataclass(frozen=True, eq=False)
+class LibraryResult:
+    """One library's discovery, its model integrated from the data, and the comparison.
+
+    frequency_Hz: dominant frequency of each state of the rollout.
+    nrmse: root mean square error over the rollout, in standard deviations of the data, RMS
+    over the states. Both are NaN for a diverged rollout.
+    """
+
+    case: LibraryCase
+    discovery: Discovery
+    rollout: Rollout
+    frequency_Hz: Mapping[str, float]
+    nrmse: float
+
+
+def compare_libraries(
+    run: Trajectory,
+    cases: Mapping[str, LibraryCase],
+    *,
+    formulation: Differential,
+    search: Search,
+    bootstraps: Bootstraps,
+    rollout_s: float | None,
+    rng: np.random.Generator,
+) -> dict[str, LibraryResult]:
+    """Discover a model with every library and integrate it from the first sample.
+
+    Each case draws from its own stream, so that adding a case changes no other.
+    rollout_s: how far to integrate; None, or more than there is, means to the data's end.
+    """
+    n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
+    results = {}
+    for (name, case), stream in zip(cases.items(), rng.spawn(len(cases)), strict=True):
+        discovery = discover(
+            [run],
+            case.library,
+            formulation=formulation,
+            search=search,
+            bootstraps=bootstraps,
+            selection=case.selection,
+            rng=stream,
+        )
+        rollout = discovery.model.rollout(run, n_samples=n_samples)
+        results[name] = LibraryResult(
+            case=case,
+            discovery=discovery,
+            rollout=rollout,
+            frequency_Hz=_frequencies(rollout, run.state_names),
+            nrmse=_nrmse(rollout, run),
+        )
+    return results
+
+
+def samples_in(run: Trajectory, duration_s: float) -> int:
+    """Number of samples in the first `duration_s`, or in all where the data end before.
+
+    Raises ValueError for a duration that holds fewer than two samples.
+    """
+    n = int(np.searchsorted(run.t, run.t[0] + duration_s * (1 + 1e-9), side="right"))
+    if n < 2:
+        raise ValueError(
+            f"a window must hold two samples: {duration_s:g} s was asked of steps of {run.dt_s:g} s"
+        )
+    return n
+
+
+def _frequencies(rollout: Rollout, names: Sequence[str]) -> dict[str, float]:
+    if rollout.diverged:
+        return dict.fromkeys(names, float("nan"))
+    return {
+        name: dominant_frequency(rollout.t, column)
+        for name, column in zip(names, rollout.states.T, strict=True)
+    }
+
+
+def _nrmse(rollout: Rollout, run: Trajectory) -> float:
+    if rollout.diverged:
+        return float("nan")
+    data = run.states[: len(rollout.t)]
+    return float(np.sqrt(np.mean(np.square((rollout.states - data) / data.std(axis=0)))))
+
+
+def front_table(front: ParetoFront, selection: Knee) -> pd.DataFrame:
+    """A front as the thesis's Tables I-III: one row per candidate, with its equation."""
+    selected = selection.select(front)
+    return pd.DataFrame(
+        {
+            "equation": front.equation,
+            "n_terms": [c.n_terms for c in front.candidates],
+            "r2_test": [c.r2_test for c in front.candidates],
+            "r2_train": [c.r2_train for c in front.candidates],
+            "d_pareto": selection.distances(front),
+            "share": [c.share for c in front.candidates],
+            "selected": [c is selected for c in front.candidates],
+            "text": [
+                equation_text(c.equation, dict(zip(c.terms, c.coef.tolist(), strict=True)))
+                for c in front.candidates
+            ],
+        }
+    )

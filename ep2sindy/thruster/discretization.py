@@ -1,0 +1,89 @@
+"""From parameters to the arrays of the compiled loop: grid, closure table, first state."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster import kernels
+from ep2sindy.thruster.closures import E_CHARGE, K_BOLTZMANN, M_ELECTRON, M_XENON
+from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+
+TABLE_STEP_EV = 0.01  # linear interpolation is then within 1e-4 of the formulas above 1 eV
+TABLE_TOP_EV = 200.0  # a mean energy beyond counts as divergence: the fits end below
+CFL = 0.8
+
+
+def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
+    """Tabulate every closure at steps of TABLE_STEP_EV; columns as named in `kernels`."""
+    T = TABLE_STEP_EV * np.arange(round(TABLE_TOP_EV / TABLE_STEP_EV) + 1)
+    T[0] = 0.1 * TABLE_STEP_EV  # the formulas divide by T; nothing happens this cold
+    rates, wall = thruster.rates, thruster.wall
+    table = np.empty((T.size, 8))
+    table[:, kernels.IONIZATION] = rates.ionization(T)
+    table[:, kernels.COLLISION] = rates.collision(T)
+    table[:, kernels.INELASTIC] = rates.energy_loss(T)
+    table[:, kernels.COULOMB] = rates.coulomb(T)
+    table[:, kernels.COULOMB_LOG] = 23.0 - 0.5 * np.log(1e-6 * T**-3)  # less 0.5 ln(n)
+    table[:, kernels.WALL_COLLISION] = wall.collision(T, thruster.gap)
+    table[:, kernels.WALL_POWER] = wall.power(T, thruster.gap)
+    table[:, kernels.ION_LOSS] = wall.ion_loss(T, thruster.gap)
+    return table
+
+
+def cell_centres(thruster: Thruster, n_cells: int) -> Float[np.ndarray, " z"]:
+    """Centres of the interior cells in m, from the anode."""
+    return (np.arange(n_cells) + 0.5) * thruster.domain_length / n_cells
+
+
+def build_model(thruster: Thruster, point: OperatingPoint, n_cells: int) -> kernels.Model:
+    """Gather every constant of one run; arrays hold one ghost cell at each end."""
+    dz = thruster.domain_length / n_cells
+    distance = (np.arange(n_cells + 2) - 0.5) * dz - thruster.channel_length
+    omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
+    inflow = 1e-6 * point.mass_flow_mg_s / (M_XENON * thruster.area)
+    channel = distance < 0.0
+    return kernels.Model(
+        dz=dz,
+        area=thruster.area,
+        ion_mass=M_XENON,
+        sound_speed_squared=K_BOLTZMANN * thruster.ion_temperature / M_XENON,
+        neutral_speed=point.neutral_speed,
+        neutral_inflow=inflow,
+        voltage=point.voltage - thruster.cathode_potential,
+        resistance=thruster.series_resistance,
+        pressure_factor=thruster.pressure_factor,
+        conduction_factor=thruster.conduction_factor,
+        drift_weight=thruster.rates.drift_weight,
+        boundary_T_e_eV=thruster.boundary_T_e_eV,
+        cfl=CFL,
+        omega_ce=omega_ce,
+        anomalous=thruster.transport.at(distance) * omega_ce,
+        wall_ion_weight=np.where(channel, 1.0, 0.0),
+        wall_collision_weight=np.where(channel, *thruster.wall.collision_weights),
+        wall_power_weight=np.where(channel, *thruster.wall.power_weights),
+        table=closure_table(thruster),
+        table_step_eV=TABLE_STEP_EV,
+    )
+
+
+def initial_state(thruster: Thruster, model: kernels.Model) -> kernels.State:
+    """A gentle guess: a violent start can starve the anode of electrons and end the run."""
+    size = model.omega_ce.size
+    z = (np.arange(size) - 0.5) * model.dz / thruster.channel_length  # 1 at the exit
+    n_i = np.full(size, 5e17)
+    u_i = -1000.0 + 8000.0 * z
+    n_n = model.neutral_inflow / model.neutral_speed * np.clip(1.0 - z, 0.05, 1.0)
+    T_e = model.boundary_T_e_eV + 10.0 * np.exp(-0.5 * ((z - 1.0) / 0.4) ** 2)
+    return kernels.State(
+        n_i=n_i,
+        flux_i=n_i * u_i,
+        n_n=n_n,
+        T_e_eV=T_e,
+        energy=1.5 * n_i * T_e,
+        drift_eV=np.zeros(size),
+        E=np.zeros(size),
+        ionization=np.zeros(size),
+        wall_loss=np.zeros(size),
+        current=np.zeros(1),
+    )

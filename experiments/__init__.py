@@ -1,0 +1,1 @@
+"""Command-line experiments: configs in, run folders out."""

@@ -1,0 +1,335 @@
+"""Several libraries on the same data, side by side: `+exp=breathing`, `+exp=discover`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from hydra.utils import instantiate
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+
+from ep2sindy import plots
+from ep2sindy.model import equation_text
+from ep2sindy.report import (
+    RunFolder,
+    Screen,
+    equation_html,
+    figure_html,
+    page_html,
+    table_html,
+    write_tensorboard,
+)
+from ep2sindy.spectrum import dominant_frequency
+from ep2sindy.studies.libraries import LibraryCase, LibraryResult, compare_libraries, front_table
+from ep2sindy.trajectory import Trajectory
+from experiments.build import library_of, open_prepared_field, started_run, trajectory_of
+
+# Published equations to stand beside ours: library -> state -> term -> SI coefficient.
+Published = Mapping[str, Mapping[str, Mapping[str, float]]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the tables, the figures and the page are made from."""
+
+    title: str
+    run: Trajectory
+    results: Mapping[str, LibraryResult]
+    published: Published
+
+
+def run(config: DictConfig) -> Path:
+    """Discover, integrate, compare; everything lands in a new run folder."""
+    with started_run(config) as (folder, screen):
+        # Everything but the data is built first: a misspelt key must not cost a simulation.
+        settings = {
+            "formulation": instantiate(config.formulation),
+            "search": instantiate(config.search),
+            "bootstraps": instantiate(config.bootstraps),
+            "rollout_s": config.rollout_s,
+            "rng": np.random.default_rng(config.seed),
+        }
+        selections = {
+            name: instantiate(case.get("selection", config.selection))
+            for name, case in config.libraries.items()
+        }
+        field = open_prepared_field(config)
+        libraries = {name: library_of(case, field) for name, case in config.libraries.items()}
+        variables = [v for library in libraries.values() for v in library.variables]
+        data = trajectory_of(config, field, variables)
+        _print_data(screen, data, field.attrs)
+
+        cases = {n: LibraryCase(library, selections[n]) for n, library in libraries.items()}
+        outcome = Outcome(
+            title=config.experiment,
+            run=data,
+            results=compare_libraries(data, cases, **settings),
+            published=OmegaConf.to_container(config.thesis),  # type: ignore[arg-type]
+        )
+        _print_outcome(screen, outcome)
+        figures = _figures(outcome, config)
+        _write(folder, config, outcome, figures)
+    return folder.path
+
+
+def _write(
+    folder: RunFolder, config: DictConfig, outcome: Outcome, figures: Mapping[str, Figure]
+) -> None:
+    for name, result in outcome.results.items():
+        folder.write_model(name, result.discovery.model)
+        folder.write_table(f"front_{name}", _front_tables(result))
+        folder.write_table(
+            f"ambiguities_{name}",
+            pd.DataFrame(
+                [(a.exact, " ".join(a.terms), a.message) for a in result.discovery.ambiguities],
+                columns=["exact", "terms", "message"],
+            ),
+        )
+        folder.write_table(f"rollout_{name}", _rollout_table(outcome.run, result))
+    folder.write_table("comparison", _comparison(outcome))
+    folder.write_figures(figures)
+    summary = _summary(config, outcome)
+    write_tensorboard(
+        folder.path / "tensorboard",
+        figures=figures,
+        scalars=_scalars(summary),
+        texts={n: f"    {r.discovery.model.text()}" for n, r in outcome.results.items()},
+        hparams=_hparams(config),
+        metrics=_scalars(summary),
+    )
+    folder.write_text("report.html", _page(outcome, figures))
+    folder.write_json("summary.json", summary)
+
+
+def _front_tables(result: LibraryResult) -> pd.DataFrame:
+    fronts = result.discovery.fronts.values()
+    return pd.concat([front_table(front, result.case.selection) for front in fronts])
+
+
+def _rollout_table(run: Trajectory, result: LibraryResult) -> pd.DataFrame:
+    """Model and data, sample by sample, so that the figure can be drawn again."""
+    rollout, states = result.rollout, result.discovery.model.states
+    data = run.columns(states)[: len(rollout.t)]
+    columns: dict[str, Any] = {"t_s": rollout.t}
+    for k, state in enumerate(states):
+        columns |= {f"{state}_data": data[:, k], f"{state}_model": rollout.states[:, k]}
+    return pd.DataFrame(columns)
+
+
+def _comparison(outcome: Outcome) -> pd.DataFrame:
+    """One row per library: frequencies in kHz and trajectory error."""
+    run = outcome.run
+    rows = []
+    for name, result in outcome.results.items():
+        row: dict[str, Any] = {"library": name}
+        for state, column in zip(run.state_names, run.states.T, strict=True):
+            row[f"f_data_{state}_kHz"] = 1e-3 * dominant_frequency(run.t, column)
+            row[f"f_model_{state}_kHz"] = 1e-3 * result.frequency_Hz[state]
+        rows.append(row | {"nrmse": result.nrmse, "ending": result.rollout.message})
+    return pd.DataFrame(rows)
+
+
+def _figures(outcome: Outcome, config: DictConfig) -> dict[str, Figure]:
+    run, results = outcome.run, outcome.results
+    span_s = float(run.t[-1] - run.t[0])
+    duration_s = config.figures.duration_s or span_s
+    f_max_Hz = config.figures.f_max_Hz or 0.5 / run.dt_s
+    smoother = instantiate(config.formulation).smoother
+    models = {name: r.discovery.model for name, r in results.items()}
+    rollouts = {name: r.rollout for name, r in results.items()}
+    figures = {
+        "data": plots.data_figure(run, duration_s=duration_s, f_max_Hz=f_max_Hz),
+        **{
+            f"front_{name}": plots.front_figure(r.discovery.fronts, r.case.selection)
+            for name, r in results.items()
+        },
+        "trajectories": plots.trajectory_figure(run, rollouts, duration_s=duration_s),
+        "derivatives": plots.derivative_figure(
+            run, models, smoother=smoother, duration_s=duration_s
+        ),
+    }
+    if len(run.state_names) > 1:
+        plane = run.state_names[:2]
+        figures["phase"] = plots.phase_figure(run, rollouts, plane=plane, duration_s=duration_s)
+    return figures
+
+
+def _print_data(screen: Screen, run: Trajectory, attributes: Mapping[str, Any]) -> None:
+    if "status" in attributes:  # ours, from a simulation
+        screen.print(
+            f"simulation: {attributes['status']}; discharge current "
+            f"{attributes['I_d_mean']:.2f} A, standard deviation {attributes['I_d_std']:.2f} A; "
+            f"mass out/in {attributes['mass_balance']:.4f}"
+        )
+        if attributes["status"] != "oscillating":
+            screen.print("[bold red]this case does not sustain its oscillation[/bold red]")
+    frequencies = ", ".join(
+        f"{name} {1e-3 * dominant_frequency(run.t, column):.2f} kHz"
+        for name, column in zip(run.state_names, run.states.T, strict=True)
+    )
+    screen.print(
+        f"data: {run.n_samples} samples of {run.dt_s:.4g} s; dominant frequency {frequencies}"
+    )
+
+
+def _print_outcome(screen: Screen, outcome: Outcome) -> None:
+    for name, result in outcome.results.items():
+        library = result.case.library
+        screen.print(
+            f"\n[bold]{name}[/bold]: {len(library)} terms in {', '.join(library.variables)}; "
+            f"n_norm: {result.case.selection.n_norm}"
+        )
+        for ambiguity in result.discovery.ambiguities:
+            if ambiguity.exact:
+                screen.print(f"  note: {ambiguity.message}")
+        n_alike = sum(not a.exact for a in result.discovery.ambiguities)
+        if n_alike:
+            screen.print(
+                f"  note: {n_alike} pairs of terms are nearly proportional, "
+                f"see tables/ambiguities_{name}.csv"
+            )
+        for state in result.discovery.fronts:
+            screen.print(_rich_front(outcome, name, state))
+    screen.print(_rich_comparison(outcome))
+
+
+def _rich_front(outcome: Outcome, name: str, state: str) -> Table:
+    result = outcome.results[name]
+    frame = front_table(result.discovery.fronts[state], result.case.selection)
+    table = Table("terms", "R2 test", "d_pareto", "share", "model", show_edge=False)
+    for row in frame.itertuples():
+        table.add_row(
+            str(row.n_terms),
+            f"{row.r2_test:.3f}",
+            f"{row.d_pareto:.3f}",
+            f"{row.share:.2f}",
+            str(row.text),
+            style="bold green" if row.selected else None,
+        )
+    published = outcome.published.get(name, {}).get(state)
+    if published:
+        text = equation_text(state, published)
+        table.add_row("", "", "", "", f"thesis: {text}", style="italic", end_section=True)
+    return table
+
+
+def _rich_comparison(outcome: Outcome) -> Table:
+    table = Table("library", "f data (kHz)", "f model (kHz)", "nrmse", "ending", title="integrated")
+    for row in _comparison(outcome).to_dict("records"):
+        states = outcome.run.state_names
+        table.add_row(
+            row["library"],
+            " ".join(f"{row[f'f_data_{s}_kHz']:.2f}" for s in states),
+            " ".join(_or_dash(row[f"f_model_{s}_kHz"], ".2f") for s in states),
+            _or_dash(row["nrmse"], ".3f"),
+            row["ending"],
+        )
+    return table
+
+
+def _or_dash(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)
+
+
+def _summary(config: DictConfig, outcome: Outcome) -> dict[str, Any]:
+    run = outcome.run
+    first = run.state_names[0]
+    return {
+        "experiment": config.experiment,
+        "seed": config.seed,
+        "data": {
+            "n_samples": run.n_samples,
+            "dt_s": run.dt_s,
+            "f_kHz": 1e-3 * dominant_frequency(run.t, run.states[:, 0]),
+            "variables": list(run.names),
+            "units": dict(run.units),
+        },
+        "models": {
+            name: {
+                "equations": {s: _equation_summary(result, s) for s in result.discovery.fronts},
+                "trajectory": {
+                    "f_kHz": 1e-3 * result.frequency_Hz[first],
+                    "nrmse": result.nrmse,
+                    "diverged": result.rollout.diverged,
+                },
+            }
+            for name, result in outcome.results.items()
+        },
+    }
+
+
+def _equation_summary(result: LibraryResult, state: str) -> dict[str, Any]:
+    front, selection = result.discovery.fronts[state], result.case.selection
+    chosen = selection.select(front)
+    terms = result.discovery.model.terms(state)
+    return {
+        "terms": terms,
+        "n_terms": chosen.n_terms,
+        "r2_test": chosen.r2_test,
+        "r2_train": chosen.r2_train,
+        "d_pareto": float(selection.distances(front)[front.candidates.index(chosen)]),
+        "share": chosen.share,
+        "inclusion": dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True)),
+        "text": equation_text(state, terms),
+    }
+
+
+def _scalars(summary: Mapping[str, Any]) -> dict[str, float]:
+    scalars = {"data/f_kHz": summary["data"]["f_kHz"]}
+    for name, model in summary["models"].items():
+        scalars[f"{name}/f_kHz"] = model["trajectory"]["f_kHz"]
+        scalars[f"{name}/nrmse"] = model["trajectory"]["nrmse"]
+        for state, equation in model["equations"].items():
+            for key in ("r2_test", "n_terms", "d_pareto"):
+                scalars[f"{name}/{state}/{key}"] = equation[key]
+    return scalars
+
+
+def _hparams(config: DictConfig) -> dict[str, Any]:
+    """The settings that decide a search; fixed keys, so that runs can be compared."""
+    return {
+        "seed": config.seed,
+        "formulation": str(OmegaConf.to_container(config.formulation)),
+        "search": str(OmegaConf.to_container(config.search)),
+        "selection": str(OmegaConf.to_container(config.selection)),
+        "n_bootstraps": config.bootstraps.n,
+        "n_culled": config.bootstraps.n_culled,
+    }
+
+
+CAPTIONS = {
+    "data": "States (start of the record) and their power spectra; the line marks the peak.",
+    "trajectories": "Models integrated from the first sample of the data, over the data.",
+    "derivatives": "Derivative of the data, and each right-hand side evaluated on the data.",
+    "phase": "Phase portraits: data (grey behind the models) and integrated models.",
+}
+
+
+def _page(outcome: Outcome, figures: Mapping[str, Figure]) -> str:
+    body = ["<h2>Equations</h2>"]
+    for name, result in outcome.results.items():
+        body.append(f"<h3>{name}</h3>")
+        for state in result.discovery.fronts:
+            terms = result.discovery.model.terms(state)
+            body.append(f'<p class="equation">{equation_html(state, terms)}</p>')
+            published = outcome.published.get(name, {}).get(state)
+            if published:
+                text = equation_html(state, published)
+                body.append(f'<p class="equation published">thesis: {text}</p>')
+    comparison = _comparison(outcome)
+    body += ["<h2>Integrated</h2>", table_html(comparison)]
+    body += [figure_html(n, CAPTIONS[n]) for n in CAPTIONS if n in figures]
+    body.append("<h2>Pareto fronts</h2>")
+    for name, result in outcome.results.items():
+        frame = _front_tables(result)
+        body += [
+            f"<h3>{name}</h3>",
+            figure_html(f"front_{name}", "Error against number of terms; the star is selected."),
+            table_html(frame.drop(columns="selected"), bold=frame["selected"].tolist()),
+        ]
+    body.append("<footer>All values in SI units. Config, models and tables lie beside.</footer>")
+    return page_html(outcome.title, body)

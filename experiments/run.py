@@ -1,0 +1,38 @@
+"""Run one experiment from its config: python -m experiments.run +exp=breathing."""
+
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from experiments import libraries
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+STUDIES = {"libraries": libraries.run}
+
+
+@hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Errors of the user's making end in one message; all others keep their traceback."""
+    if config.experiment is None:
+        known = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
+        sys.exit(f"error: choose an experiment with +exp=NAME; there are {known}")
+    try:
+        folder = STUDIES[config.study](config)
+    except KeyboardInterrupt:
+        sys.exit("interrupted: files under their final names are whole")
+    except (ValueError, OSError, hydra.errors.HydraException) as error:
+        sys.exit(f"error: {_innermost(error)}")
+    print(folder)
+
+
+def _innermost(error: BaseException) -> BaseException:
+    """Hydra wraps what a constructor raised; the user needs the constructor's own words."""
+    while isinstance(error, hydra.errors.HydraException) and error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,232 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from ep2sindy.io import write_field
+from ep2sindy.model import SparseModel
+from experiments import libraries
+
+ROOT = Path(__file__).resolve().parents[1]
+EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"))
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
+
+
+@pytest.fixture(scope="module")
+def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""
+    a, b, c = 1.64e5, 4.66e-14, 4.39e4
+    dt_s, n_samples = 1.5e-6, 1200
+    states = np.empty((n_samples, 2))
+    states[0] = x = np.array([5e17, 4e18])
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        burn = b * x[0] * x[1]
+        return np.array([burn - a * x[0], c * x[1] - burn])
+
+    for k in range(1, n_samples):
+        for _ in range(4):  # classical Runge-Kutta, a quarter of a sample per step
+            h = dt_s / 4
+            k1 = slope(x)
+            k2 = slope(x + h / 2 * k1)
+            k3 = slope(x + h / 2 * k2)
+            k4 = slope(x + h * k3)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        states[k] = x
+    profile = np.ones((1, 5))
+    time = dt_s * np.arange(n_samples)
+    data = {
+        "n_i": (states[:, :1] * profile, "m^-3"),
+        "n_n": (states[:, 1:] * profile, "m^-3"),
+        "R_ion": (4e-14 * (1 + 0.3 * np.sin(9e4 * time))[:, None] * profile, "m^3/s"),
+        "u_iz": (5e3 * (1 + 0.2 * np.sin(7e4 * time))[:, None] * profile, "m/s"),
+    }
+    field = xr.Dataset(
+        {name: (("time", "z"), v, {"units": unit}) for name, (v, unit) in data.items()},
+        coords={"time": time, "z": np.linspace(0.012, 0.028, 5)},
+    )
+    path = tmp_path_factory.mktemp("data") / "predator_prey.nc"
+    write_field(field, path)
+    return path
+
+
+def breathing(path: Path, output: Path) -> list[str]:
+    """Overrides that run `+exp=breathing` on a file."""
+    return [
+        "+exp=breathing",
+        "data=file",
+        f"data.path={path}",
+        "data.variables.R_ion.name=R_ion",
+        "data.variables.u_iz.name=u_iz",
+        f"output={output}",
+        "bootstraps.n=8",
+    ]
+
+
+@pytest.fixture(scope="module")
+def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of one breathing experiment on known data."""
+    output = tmp_path_factory.mktemp("outputs")
+    return libraries.run(composed(*breathing(predator_prey, output)))
+
+
+def summary_of(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
+    summary = summary_of(breathing_run)
+    simple = summary["models"]["simple"]
+    ions, neutrals = simple["equations"]["n_i"], simple["equations"]["n_n"]
+    # Second-order differences at 1.5 us on a 14 kHz wave: (omega dt)^2 / 6 = 0.3 %, and the
+    # smoothing window flattens peaks by about 1 %.
+    assert ions["terms"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=0.02)
+    assert neutrals["terms"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
+    assert simple["trajectory"]["f_kHz"] == pytest.approx(summary["data"]["f_kHz"], rel=0.02)
+    assert set(summary["models"]) == {"simple", "ionization", "velocity"}
+    for key in ("n_terms", "r2_test", "d_pareto", "text"):
+        assert key in ions
+
+
+def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
+    folder = breathing_run
+    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert {
+        "config.yaml",
+        "provenance.json",
+        "run.log",
+        "summary.json",
+        "report.html",
+        "models/simple.json",
+        "tables/front_velocity.csv",
+        "tables/comparison.csv",
+        "figures/data.png",
+        "figures/trajectories.pdf",
+    } <= files
+    assert any(name.startswith("tensorboard/events") for name in files)
+    model = SparseModel.load(folder / "models" / "simple.json")
+    assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]["terms"]
+    page = (folder / "report.html").read_text()
+    for image in ("figures/data.png", "figures/phase.png", "figures/front_simple.png"):
+        assert image in page
+        assert image in files
+
+
+def test_a_fixed_seed_gives_the_same_summary(
+    breathing_run: Path, predator_prey: Path, tmp_path: Path
+) -> None:
+    again = libraries.run(composed(*breathing(predator_prey, tmp_path)))
+    assert summary_of(again) == summary_of(breathing_run)
+
+
+def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 20.0, 1001)
+    damped = 3.0 * np.sqrt(1 - 0.01)
+    x = np.exp(-0.3 * t) * np.cos(damped * t)
+    v = -0.3 * x - damped * np.exp(-0.3 * t) * np.sin(damped * t)
+    table = np.column_stack([t, x, v])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, delimiter=",", header="time,x,v", comments="")
+    config = composed(
+        "+exp=discover",
+        "data=file",
+        f"data.path={path}",
+        "data.z.name=null",
+        "data.variables.n_i.name=null",
+        "data.variables.n_n.name=null",
+        "+data.variables.x.name=x",
+        "+data.variables.x.unit=1",
+        "+data.variables.v.name=v",
+        "+data.variables.v.unit=1",
+        "trajectory.states=[x,v]",
+        "search=best_subset",
+        f"output={tmp_path}",
+    )
+    found = summary_of(libraries.run(config))["models"]["model"]["equations"]
+    assert found["x"]["terms"] == pytest.approx({"v": 1.0}, rel=0.01)
+    assert found["v"]["terms"]["x"] == pytest.approx(-9.0, rel=0.05)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_composes(name: str) -> None:
+    config = composed(f"+exp={name}")
+    assert config.experiment == name
+
+
+@pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])
+def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> None:
+    config = composed(
+        "+exp=discover",
+        "data=file",
+        f"data.path={predator_prey}",
+        "trajectory.states=[n_i,n_n]",
+        f"search={search}",
+        f"output={tmp_path}",
+    )
+    equations = summary_of(libraries.run(config))["models"]["model"]["equations"]
+    assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
+
+
+def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
+    config = composed(
+        "+exp=breathing",
+        "data.duration_s=0.3e-3",
+        "data.warm_up_s=0.0",
+        "data.n_cells=30",
+        "data.progress=false",
+        f"data.cache={tmp_path / 'cache'}",
+        "bootstraps.n=4",
+        "libraries.ionization.degree=2",
+        f"output={tmp_path}",
+    )
+    folder = libraries.run(config)
+    assert summary_of(folder)["data"]["n_samples"] == 201
+    assert "simulation: " in (folder / "run.log").read_text()
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def run_program(*overrides: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.run", *overrides],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_last_line_names_the_run_folder(predator_prey: Path, tmp_path: Path) -> None:
+    result = run_program(*breathing(predator_prey, tmp_path))
+    assert result.returncode == 0, result.stderr
+    assert (Path(result.stdout.splitlines()[-1]) / "summary.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([], "error: choose an experiment with +exp=NAME; there are breathing"),
+        (["+exp=breathing", "sede=1"], "Could not override 'sede'"),
+        (["+exp=breathing", "+search.max_term=3"], "unexpected keyword argument 'max_term'"),
+        (["+exp=breathing", "selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
+        (["+exp=breathing", "data=file", "data.path=none.nc"], "error: no such file: "),
+        (["+exp=breathing", "output=Makefile"], "choose another with output=PATH"),
+    ],
+)
+def test_mistakes_end_in_one_clear_message(
+    overrides: list[str], message: str, tmp_path: Path
+) -> None:
+    output = [] if any(o.startswith("output=") for o in overrides) else [f"output={tmp_path}"]
+    result = run_program(*overrides, *output)
+    assert result.returncode != 0
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr

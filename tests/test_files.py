@@ -1,0 +1,89 @@
+import json
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from ep2sindy.files import replacing, write_text
+from ep2sindy.report import RunFolder, equation_html, table_html
+
+NOW = datetime(2026, 1, 2, 3, 4, 5)
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, ValueError, OSError])
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, end: type) -> None:
+    target = tmp_path / "result.json"
+    write_text(target, "old")
+
+    def write() -> None:
+        with replacing(target) as temporary:
+            temporary.write_text("half of the n")
+            raise end
+
+    with pytest.raises(end):
+        write()
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_a_write_creates_its_folder(tmp_path: Path) -> None:
+    write_text(tmp_path / "a" / "b.txt", "text")
+    assert (tmp_path / "a" / "b.txt").read_text() == "text"
+
+
+def test_two_runs_in_one_second_get_two_folders(tmp_path: Path) -> None:
+    first = RunFolder.create(tmp_path, "breathing", now=NOW)
+    second = RunFolder.create(tmp_path, "breathing", now=NOW)
+    assert first.path == tmp_path / "breathing" / "2026-01-02_030405"
+    assert second.path == tmp_path / "breathing" / "2026-01-02_030405_2"
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_with_a_way_out(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(OSError, match="a run needs a folder it can write to.*output=PATH"):
+        RunFolder.create(tmp_path / "taken", "breathing", now=NOW)
+
+
+def test_json_has_null_for_what_is_not_a_number(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path, "x", now=NOW)
+    folder.write_json("summary.json", {"a": [1.0, float("nan")], "b": {"c": float("inf")}})
+    content = json.loads((folder.path / "summary.json").read_text())
+    assert content == {"a": [1.0, None], "b": {"c": None}}
+
+
+def test_figures_are_written_as_png_and_pdf(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path, "x", now=NOW)
+    figure = Figure()
+    figure.subplots().plot(np.arange(3))
+    folder.write_figures({"line": figure})
+    names = sorted(p.name for p in (folder.path / "figures").iterdir())
+    assert names == ["line.pdf", "line.png"]
+
+
+def test_provenance_names_commit_and_versions(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path, "x", now=NOW)
+    folder.write_provenance(seed=3, command=["run", "+exp=x"])
+    content = json.loads((folder.path / "provenance.json").read_text())
+    assert content["seed"] == 3
+    assert content["commit"]
+    assert content["versions"]["numpy"] == np.__version__
+
+
+def test_equations_read_in_html() -> None:
+    html = equation_html("n_i", {"n_i": -2.62e5, "n_i^2*n_n": 0.5, "1": 1e-3})
+    assert html == (
+        "d<i>n</i><sub>i</sub>/dt = &minus; 2.62&times;10<sup>5</sup> <i>n</i><sub>i</sub> "
+        "+ 0.5 <i>n</i><sub>i</sub><sup>2</sup> <i>n</i><sub>n</sub> + 0.001"
+    )
+    assert equation_html("x", {}) == "d<i>x</i>/dt = 0"
+    assert "10<sup>&minus;14</sup>" in equation_html("x", {"x": 4e-14})
+    assert "&lang;<i>n</i><sub>i</sub> <i>R</i>&rang;" in equation_html("x", {"<n_i*R>": 1.0})
+
+
+def test_tables_mark_the_selected_row() -> None:
+    table = pd.DataFrame({"n_terms": [1, 2], "r2": [0.5, float("nan")]})
+    html = table_html(table, bold=[False, True])
+    assert '<tr class="selected"><td>2</td><td>&ndash;</td></tr>' in html

@@ -1,0 +1,227 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from ep2sindy.prepare import (
+    crop,
+    decimate,
+    derive,
+    ionization_rate,
+    keep_where,
+    low_pass,
+    read_rate_table,
+)
+from ep2sindy.thruster import closures
+
+DT = 1e-6
+N = 2000
+
+
+def field(**variables: tuple[tuple[str, ...], np.ndarray, str]) -> xr.Dataset:
+    """Field on 2000 samples, z = 0, 1, 2 m, r = 1, 2 m; name=(dims, values, unit)."""
+    axes = {"time": DT * np.arange(N), "z": [0.0, 1.0, 2.0], "r": [1.0, 2.0]}
+    used = {"time"}.union(*(dims for dims, _, _ in variables.values()))
+    return xr.Dataset(
+        {name: (dims, values, {"units": unit}) for name, (dims, values, unit) in variables.items()},
+        coords={a: (a, np.asarray(x), {"units": "SI"}) for a, x in axes.items() if a in used},
+    )
+
+
+def ramp() -> xr.Dataset:
+    return field(I_d=(("time",), np.arange(float(N)), "A"))
+
+
+def test_crop_keeps_both_ends() -> None:
+    t = ramp()["time"].values
+    part = crop(ramp(), start_s=t[100], stop_s=t[200])
+    assert part["I_d"].values.tolist() == list(range(100, 201))
+    assert part["I_d"].attrs == {"units": "A"}
+    assert crop(ramp()).equals(ramp())
+
+
+def test_a_crop_outside_the_record_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"0.01 to 0.001999 s leaves 0 of 2000, .* 0 to 0.001999"):
+        crop(ramp(), start_s=0.01)
+
+
+def test_decimate_keeps_every_nth_sample() -> None:
+    part = decimate(ramp(), factor=500)
+    assert part["I_d"].values.tolist() == [0, 500, 1000, 1500]
+    assert part["time"].values == pytest.approx([0, 5e-4, 1e-3, 1.5e-3])
+
+
+@pytest.mark.parametrize("factor", [0, -2, 2000])
+def test_a_factor_that_leaves_no_series_is_refused(factor: int) -> None:
+    with pytest.raises(ValueError, match=f"{factor} came with 2000 samples"):
+        decimate(ramp(), factor=factor)
+
+
+def tone(f_Hz: float) -> np.ndarray:
+    return np.sin(2 * np.pi * f_Hz * DT * np.arange(N))
+
+
+def test_low_pass_keeps_phase_and_halves_the_cutoff() -> None:
+    waves = np.stack([tone(2e3), tone(2e4), tone(2e5)], axis=1)
+    slow, cutoff, fast = low_pass(
+        field(I_d=(("z", "time"), waves.T.astype(np.float32), "A")), cutoff_Hz=2e4
+    )["I_d"].values.T
+    inner = slice(200, -200)  # four periods of the cutoff: the ends have died away to 1e-5
+    assert slow[inner] == pytest.approx(tone(2e3)[inner], abs=1e-4)
+    assert cutoff[inner] == pytest.approx(0.5 * tone(2e4)[inner], abs=1e-4)
+    assert np.abs(fast[inner]).max() < 1e-4
+
+
+def test_low_pass_keeps_masked_cells_units_and_static_variables() -> None:
+    waves = np.stack([tone(2e3), np.full(N, np.nan), tone(1e3)], axis=1)
+    before = field(n_i=(("time", "z"), waves, "m^-3"), B=(("z",), np.arange(3.0), "T"))
+    after = low_pass(before, cutoff_Hz=1e5)
+    assert np.isnan(after["n_i"].values).all(axis=0).tolist() == [False, True, False]
+    assert after["n_i"].attrs == {"units": "m^-3"}
+    assert after["B"].identical(before["B"])
+
+
+def test_low_pass_refuses_a_gap_instead_of_spreading_it() -> None:
+    wave = tone(2e3)
+    wave[70] = np.nan
+    with pytest.raises(ValueError, match="I_d = nan at time = 7e-05 s"):
+        low_pass(field(I_d=(("time",), wave, "A")), cutoff_Hz=1e5)
+
+
+@pytest.mark.parametrize(
+    ("samples", "settings", "message"),
+    [
+        (np.arange(N), {"cutoff_Hz": 5e5}, "half the sampling rate, 500000 Hz: 500000 came"),
+        (np.arange(N), {"cutoff_Hz": 0.0}, "cutoff_Hz must lie between 0"),
+        (np.arange(15), {"cutoff_Hz": 1e5}, "of order 4 needs more than 15 samples: 15 came"),
+        (np.r_[0:70, 71:90], {"cutoff_Hz": 1e5}, r"t\[70\] - t\[69\] = 2e-06 s, the mean is"),
+    ],
+)
+def test_low_pass_says_what_it_cannot_filter(
+    samples: np.ndarray, settings: dict, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        low_pass(ramp().isel(time=samples), **settings)
+
+
+def test_low_pass_then_decimate_matches_a_slow_tone() -> None:
+    both = tone(2e3) + tone(2.02e5)  # 202 kHz would fold onto 2 kHz at every fifth sample
+    part = decimate(low_pass(field(I_d=(("time",), both, "A")), cutoff_Hz=5e4), factor=5)
+    assert part["I_d"].values[40:-40] == pytest.approx(tone(2e3)[::5][40:-40], abs=1e-2)
+
+
+def grid() -> xr.Dataset:
+    values = np.arange(1.0, 1 + N * 6).reshape(N, 3, 2)
+    return field(
+        u_iz=(("time", "z", "r"), values, "m/s"),
+        u_ir=(("time", "z", "r"), 2 * values, "m/s"),
+        T_e_eV=(("time", "z"), values[:, :, 0], "eV"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("expression", "expected"),
+    [
+        ("sqrt(u_iz^2 + u_ir**2)", lambda f: np.hypot(f.u_iz, f.u_ir)),
+        ("-u_iz / 2 + 1e3", lambda f: 1e3 - f.u_iz / 2),
+        ("u_iz * z * exp(-r)", lambda f: f.u_iz * f.z * np.exp(-f.r)),
+        ("log(abs(u_iz - T_e_eV) + 1)", lambda f: np.log(abs(f.u_iz - f.T_e_eV) + 1)),
+    ],
+)
+def test_derive_computes_expressions(expression: str, expected: object) -> None:
+    before = grid()
+    after = derive(before, name="w", expression=expression, units="m/s")
+    xr.testing.assert_allclose(after["w"].drop_attrs(), expected(before), rtol=1e-15)
+    assert after["w"].attrs == {"units": "m/s"}
+    assert after.drop_vars("w").identical(before)
+    assert "w" not in before
+
+
+def test_derive_does_not_overflow_in_float32() -> None:
+    dense = field(n=(("time",), np.full(N, 1e20, np.float32), "m^-3"))
+    squared = derive(dense, name="n2", expression="n^2", units="m^-6")["n2"]
+    assert squared.values == pytest.approx(np.full(N, 1e40), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"expression": "u_z * 2"}, r"unknown variable 'u_z'; this field has \[.*'u_iz'"),
+        ({"expression": "2 + 3"}, "must use at least one variable"),
+        ({"expression": "u_iz +"}, "'u_iz \\+' is no expression"),
+        ({"expression": "__import__('os')"}, "an expression may use .* came"),
+        ({"expression": "u_iz.values"}, r"'u_iz.values' came"),
+        ({"expression": "u_iz[0]"}, r"'u_iz\[0\]' came"),
+        ({"expression": "u_iz > 3"}, "w must hold real numbers: its type is bool"),
+        ({"expression": "u_iz", "name": "u_ir"}, "the field already has 'u_ir'"),
+        ({"expression": "u_iz", "name": "time"}, "the field already has 'time'"),
+    ],
+)
+def test_derive_refuses_what_is_no_arithmetic(settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        derive(grid(), **{"name": "w", "units": "1", **settings})
+
+
+def test_keep_where_masks_walls() -> None:
+    after = keep_where(grid(), condition="(z > 0.5) | ((r >= 1) & (r < 1.5))")
+    assert np.isnan(after["u_iz"].values[7]).tolist() == [[False, True], [False] * 2, [False] * 2]
+    assert after["u_iz"].attrs == {"units": "m/s"}
+    assert after["T_e_eV"].identical(grid()["T_e_eV"])
+
+
+@pytest.mark.parametrize("condition", ["u_iz > 3", "z", "1 < 2", "0 < z < 1"])
+def test_a_condition_must_compare_places(condition: str) -> None:
+    with pytest.raises(ValueError, match="a condition must compare|an expression may use"):
+        keep_where(grid(), condition=condition)
+
+
+def warm() -> xr.Dataset:
+    T = np.outer(np.linspace(1.0, 2.0, N), [5.0, 10.0, np.nan])
+    return field(T_e_eV=(("time", "z"), T, "eV"))
+
+
+def test_the_rate_comes_from_the_fits() -> None:
+    after = ionization_rate(warm())
+    expected = closures.ionization_rate(warm()["T_e_eV"].values[:, :2])
+    assert np.array_equal(after["R_ion"].values[:, :2], expected)
+    assert np.isnan(after["R_ion"].values[:, 2]).all()
+    assert after["R_ion"].attrs == {"units": "m^3/s"}
+
+
+TABLE = (
+    "Energy (eV),rate coefficient (m3/s),energy loss\n1,1e-22,0\n5,2e-14,0\n# a gap\n25,6e-14,0\n"
+)
+
+
+def test_the_rate_comes_from_a_table(tmp_path: Path) -> None:
+    (tmp_path / "rates.csv").write_text(TABLE)
+    after = ionization_rate(warm(), table=tmp_path / "rates.csv")
+    expected = 2e-14 + 2e-15 * (warm()["T_e_eV"].values - 5.0)
+    assert after["R_ion"].values[:, :2] == pytest.approx(expected[:, :2], rel=1e-12)
+    assert np.isnan(after["R_ion"].values[:, 2]).all()
+
+
+def test_a_table_is_not_extrapolated(tmp_path: Path) -> None:
+    (tmp_path / "rates.csv").write_text("1,1e-22\n15,5e-14\n")
+    with pytest.raises(ValueError, match="1 to 15 eV: it runs from 5 to 20 eV; extend .*rates.csv"):
+        ionization_rate(warm(), table=tmp_path / "rates.csv")
+
+
+@pytest.mark.parametrize("text", ["1,1e-22\n", "5,1\n1,2\n", "1\n2\n", "a,b\nc,d\n"])
+def test_a_bad_table_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "rates.csv").write_text(text)
+    with pytest.raises(ValueError, match="a rate table must have two columns"):
+        read_rate_table(tmp_path / "rates.csv")
+
+
+def test_a_missing_table_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such rate table: .*none.csv"):
+        ionization_rate(warm(), table=tmp_path / "none.csv")
+
+
+def test_the_rate_is_never_overwritten_nor_guessed() -> None:
+    with pytest.raises(ValueError, match="the field already has R_ion: leave this step out"):
+        ionization_rate(ionization_rate(warm()))
+    with pytest.raises(ValueError, match=r"R_ion needs T_e_eV; this field has \['I_d'\]"):
+        ionization_rate(ramp())

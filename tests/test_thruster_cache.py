@@ -1,0 +1,68 @@
+"""Kept simulations: identical on reading back, never half-written, never answered from old code."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from ep2sindy import files
+from ep2sindy.thruster import OperatingPoint, Thruster, cache, simulate_cached
+
+POINT = OperatingPoint(300.0, 5.0)
+BRIEF = {"duration_s": 3e-5, "warm_up_s": 0.0, "n_cells": 40, "progress": False}
+
+
+def kept(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_second_call_reads_identical_values(tmp_path, monkeypatch):
+    first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    monkeypatch.setattr(cache, "simulate", lambda *_, **__: pytest.fail("simulated twice"))
+    second = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    xr.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
+    assert all(first[name].dtype == second[name].dtype for name in first.variables)
+    for name, value in first.attrs.items():
+        np.testing.assert_equal(second.attrs[name], value)
+
+
+@pytest.mark.parametrize("size", [0, 1000])
+def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, size):
+    first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:size])
+    again = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    xr.testing.assert_identical(first.drop_attrs(), again.drop_attrs())
+    printed = capsys.readouterr()
+    assert "cannot be read" in printed.out + printed.err
+    xr.testing.assert_identical(again.drop_attrs(), cache.read(path).drop_attrs())
+
+
+@pytest.mark.parametrize(
+    ("thruster", "point", "change"),
+    [
+        (Thruster(series_resistance=2.0), POINT, {}),
+        (Thruster(), OperatingPoint(300.0, 5.0, neutral_speed=281.0), {}),
+        (Thruster(), POINT, {"n_cells": 41}),
+    ],
+)
+def test_other_parameters_have_another_file(tmp_path, thruster, point, change):
+    simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    simulate_cached(thruster, point, cache=tmp_path, **(BRIEF | change))
+    assert len(kept(tmp_path)) == 2
+
+
+def test_changed_source_has_another_key(tmp_path, monkeypatch):
+    before = cache.cache_key("{}")
+    (tmp_path / "closures.py").write_text("changed = True\n")
+    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    assert cache.cache_key("{}") != before
+
+
+def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files.os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    assert kept(tmp_path) == []
