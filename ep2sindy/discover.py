@@ -11,15 +11,16 @@ from ep2sindy.ambiguity import Ambiguity, ambiguities
 from ep2sindy.library import Library
 from ep2sindy.model import SparseModel, assemble_model
 from ep2sindy.pareto import Knee, ParetoFront, pareto_front
-from ep2sindy.regression import Differential
+from ep2sindy.regression import Differential, Regression
 from ep2sindy.search import Bootstraps, Search, pooled_supports
 from ep2sindy.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """fronts: one per state. model: the selected candidates. ambiguities: what to beware of."""
+    """What a search leaves: its rows, a front per state, the selected model, what to beware of."""
 
+    problem: Regression
     fronts: Mapping[str, ParetoFront]
     model: SparseModel
     ambiguities: Sequence[Ambiguity]
@@ -55,4 +56,4 @@ def discover(
             "trajectories": ", ".join(run.label for run in trajectories),
         },
     )
-    return Discovery(fronts, model, ambiguities(problem))
+    return Discovery(problem, fronts, model, ambiguities(problem))

@@ -253,7 +253,7 @@ def assemble_model(
     provenance: Mapping[str, str],
 ) -> SparseModel:
     """Join one candidate per equation into a model."""
-    equations = [dict(zip(c.terms, c.coef.tolist(), strict=True)) for c in candidates]
+    equations = [c.coef_by_term for c in candidates]
     return SparseModel(
         library=library,
         states=[c.equation for c in candidates],

@@ -34,6 +34,10 @@ class Candidate:
     def n_terms(self) -> int:
         return len(self.terms)
 
+    @property
+    def coef_by_term(self) -> dict[str, float]:
+        return dict(zip(self.terms, self.coef.tolist(), strict=True))
+
 
 @dataclass(frozen=True, eq=False)
 class ParetoFront:
@@ -91,35 +95,63 @@ class Knee:
         return front.candidates[int(np.argmin(self.distances(front)))]
 
 
+def fit_support(problem: Regression, equation: str, terms: Sequence[str]) -> Candidate:
+    """Fit one given support of one equation to the training rows; no bootstrap stands behind it.
+
+    Raises ValueError for an unknown term, or terms that depend on each other on these rows.
+    """
+    mask = np.zeros((1, len(problem.library)), dtype=np.bool_)
+    mask[0, [problem.library.index(name) for name in terms]] = True
+    nothing = np.full((len(problem.library) + 1, len(problem.library)), np.nan)
+    (candidate,) = _candidates(problem, Supports(equation, mask, np.array([np.nan]), nothing))
+    if not np.isfinite(candidate.coef).all():
+        raise ValueError(f"terms must be independent to be fitted: {list(terms)} are not")
+    return candidate
+
+
 def pareto_front(problem: Regression, supports: Supports) -> ParetoFront:
     """Fit every support on all training rows and keep the best of each size.
 
     "Best" is by held-out rows, as in the thesis. A size whose best does not beat a smaller
     one is left out, and so are supports whose terms depend on each other.
     """
-    equation = problem.equations.index(supports.equation)
     n_terms = len(problem.library)
+    equation = problem.equations.index(supports.equation)
     best = _best_of_each_size(problem, equation, supports.masks)
-    masks = np.concatenate([np.zeros((1, n_terms), dtype=np.bool_), supports.masks[best]])
-    share = [supports.share[~supports.masks.any(axis=1)].sum(), *supports.share[best]]
-    coef = _fit(problem, equation, masks)
+    empty = np.zeros((1, n_terms), dtype=np.bool_)
+    chosen = Supports(
+        equation=supports.equation,
+        masks=np.concatenate([empty, supports.masks[best]]),
+        share=np.append(supports.share[~supports.masks.any(axis=1)].sum(), supports.share[best]),
+        inclusion=supports.inclusion,
+    )
+    front: list[Candidate] = []
+    for candidate in _candidates(problem, chosen):
+        if not front or _score(candidate) > _score(front[-1]):
+            front.append(candidate)
+    return ParetoFront(supports.equation, front, n_terms)
+
+
+def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
+    """Every support fitted to the training rows and scored on both kinds of rows."""
+    n_terms = len(problem.library)
+    equation = problem.equations.index(supports.equation)
+    coef = _fit(problem, equation, supports.masks)
     coef_SI = coef * problem.target_scale[equation] / problem.theta_scale
     r2_train = _r2(problem.train_rows, n_terms, equation, coef)
     r2_test = _r2(problem.test_rows, n_terms, equation, coef)
-    candidates: list[Candidate] = []
-    for k, columns in enumerate(map(np.flatnonzero, masks)):
-        candidate = Candidate(
+    return [
+        Candidate(
             equation=supports.equation,
             terms=tuple(problem.term_names[j] for j in columns),
             coef=coef_SI[k, columns],
             r2_train=float(r2_train[k]),
             r2_test=float(r2_test[k]),
-            share=float(share[k]),
+            share=float(supports.share[k]),
             inclusion=supports.inclusion[len(columns), columns],
         )
-        if not candidates or _score(candidate) > _score(candidates[-1]):
-            candidates.append(candidate)
-    return ParetoFront(supports.equation, candidates, n_terms)
+        for k, columns in enumerate(map(np.flatnonzero, supports.masks))
+    ]
 
 
 def _best_of_each_size(

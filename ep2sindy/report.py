@@ -222,6 +222,7 @@ th, td { padding: 0.2rem 0.8rem; text-align: left; border-bottom: 1px solid #ddd
 tr.selected { font-weight: bold; background: #fdf3e1; }
 figure { margin: 1.5rem 0; } img { max-width: 100%; }
 figcaption, footer { color: #555; font-size: 0.9rem; }
+.published { margin: 0.1rem 1.5rem; color: #555; }
 .equation { font-size: 1.15rem; margin: 0.4rem 1.5rem; }
 """
 

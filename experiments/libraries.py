@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -24,12 +24,16 @@ from ep2sindy.report import (
     write_tensorboard,
 )
 from ep2sindy.spectrum import dominant_frequency
-from ep2sindy.studies.libraries import LibraryCase, LibraryResult, compare_libraries, front_table
+from ep2sindy.studies.libraries import (
+    Integrated,
+    LibraryCase,
+    LibraryResult,
+    candidate_text,
+    compare_libraries,
+    front_table,
+)
 from ep2sindy.trajectory import Trajectory
 from experiments.build import library_of, open_prepared_field, started_run, trajectory_of
-
-# Published equations to stand beside ours: library -> state -> term -> SI coefficient.
-Published = Mapping[str, Mapping[str, Mapping[str, float]]]
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,17 @@ class Outcome:
     title: str
     run: Trajectory
     results: Mapping[str, LibraryResult]
-    published: Published
+
+    @property
+    def models(self) -> dict[str, Integrated]:
+        """Selected models by library, then those of published terms."""
+        selected = {name: r.selected for name, r in self.results.items()}
+        published = {
+            f"{name}, thesis's terms": r.published
+            for name, r in self.results.items()
+            if r.published is not None
+        }
+        return selected | published
 
 
 def run(config: DictConfig) -> Path:
@@ -63,13 +77,13 @@ def run(config: DictConfig) -> Path:
         data = trajectory_of(config, field, variables)
         _print_data(screen, data, field.attrs)
 
-        cases = {n: LibraryCase(library, selections[n]) for n, library in libraries.items()}
-        outcome = Outcome(
-            title=config.experiment,
-            run=data,
-            results=compare_libraries(data, cases, **settings),
-            published=OmegaConf.to_container(config.thesis),  # type: ignore[arg-type]
-        )
+        published = cast(dict, OmegaConf.to_container(config.thesis))
+        cases = {
+            name: LibraryCase(library, selections[name], published.get(name, {}))
+            for name, library in libraries.items()
+        }
+        results = compare_libraries(data, cases, **settings)
+        outcome = Outcome(config.experiment, data, results)
         _print_outcome(screen, outcome)
         figures = _figures(outcome, config)
         _write(folder, config, outcome, figures)
@@ -89,7 +103,8 @@ def _write(
                 columns=["exact", "terms", "message"],
             ),
         )
-        folder.write_table(f"rollout_{name}", _rollout_table(outcome.run, result))
+    for name, integrated in outcome.models.items():
+        folder.write_table(f"rollout_{_slug(name)}", _rollout_table(outcome.run, integrated))
     folder.write_table("comparison", _comparison(outcome))
     folder.write_figures(figures)
     summary = _summary(config, outcome)
@@ -110,9 +125,14 @@ def _front_tables(result: LibraryResult) -> pd.DataFrame:
     return pd.concat([front_table(front, result.case.selection) for front in fronts])
 
 
-def _rollout_table(run: Trajectory, result: LibraryResult) -> pd.DataFrame:
+def _slug(name: str) -> str:
+    """A model's name as a file name."""
+    return name.replace(", ", "_").replace("'s ", "_").replace(" ", "_")
+
+
+def _rollout_table(run: Trajectory, integrated: Integrated) -> pd.DataFrame:
     """Model and data, sample by sample, so that the figure can be drawn again."""
-    rollout, states = result.rollout, result.discovery.model.states
+    rollout, states = integrated.rollout, integrated.model.states
     data = run.columns(states)[: len(rollout.t)]
     columns: dict[str, Any] = {"t_s": rollout.t}
     for k, state in enumerate(states):
@@ -121,15 +141,15 @@ def _rollout_table(run: Trajectory, result: LibraryResult) -> pd.DataFrame:
 
 
 def _comparison(outcome: Outcome) -> pd.DataFrame:
-    """One row per library: frequencies in kHz and trajectory error."""
+    """One row per model: frequencies in kHz and trajectory error."""
     run = outcome.run
     rows = []
-    for name, result in outcome.results.items():
-        row: dict[str, Any] = {"library": name}
+    for name, model in outcome.models.items():
+        row: dict[str, Any] = {"model": name}
         for state, column in zip(run.state_names, run.states.T, strict=True):
             row[f"f_data_{state}_kHz"] = 1e-3 * dominant_frequency(run.t, column)
-            row[f"f_model_{state}_kHz"] = 1e-3 * result.frequency_Hz[state]
-        rows.append(row | {"nrmse": result.nrmse, "ending": result.rollout.message})
+            row[f"f_model_{state}_kHz"] = 1e-3 * model.frequency_Hz[state]
+        rows.append(row | {"nrmse": model.nrmse, "ending": model.rollout.message})
     return pd.DataFrame(rows)
 
 
@@ -139,8 +159,9 @@ def _figures(outcome: Outcome, config: DictConfig) -> dict[str, Figure]:
     duration_s = config.figures.duration_s or span_s
     f_max_Hz = config.figures.f_max_Hz or 0.5 / run.dt_s
     smoother = instantiate(config.formulation).smoother
-    models = {name: r.discovery.model for name, r in results.items()}
-    rollouts = {name: r.rollout for name, r in results.items()}
+    models = {name: r.selected.model for name, r in results.items()}
+    rollouts = {name: r.selected.rollout for name, r in results.items()}
+    published = {n: r.published.rollout for n, r in results.items() if r.published is not None}
     figures = {
         "data": plots.data_figure(run, duration_s=duration_s, f_max_Hz=f_max_Hz),
         **{
@@ -152,6 +173,10 @@ def _figures(outcome: Outcome, config: DictConfig) -> dict[str, Figure]:
             run, models, smoother=smoother, duration_s=duration_s
         ),
     }
+    if published:
+        figures["trajectories_thesis"] = plots.trajectory_figure(
+            run, published, duration_s=duration_s
+        )
     if len(run.state_names) > 1:
         plane = run.state_names[:2]
         figures["phase"] = plots.phase_figure(run, rollouts, plane=plane, duration_s=duration_s)
@@ -193,12 +218,11 @@ def _print_outcome(screen: Screen, outcome: Outcome) -> None:
                 f"see tables/ambiguities_{name}.csv"
             )
         for state in result.discovery.fronts:
-            screen.print(_rich_front(outcome, name, state))
+            screen.print(_rich_front(result, state))
     screen.print(_rich_comparison(outcome))
 
 
-def _rich_front(outcome: Outcome, name: str, state: str) -> Table:
-    result = outcome.results[name]
+def _rich_front(result: LibraryResult, state: str) -> Table:
     frame = front_table(result.discovery.fronts[state], result.case.selection)
     table = Table("terms", "R2 test", "d_pareto", "share", "model", show_edge=False)
     for row in frame.itertuples():
@@ -210,19 +234,28 @@ def _rich_front(outcome: Outcome, name: str, state: str) -> Table:
             str(row.text),
             style="bold green" if row.selected else None,
         )
-    published = outcome.published.get(name, {}).get(state)
-    if published:
-        text = equation_text(state, published)
-        table.add_row("", "", "", "", f"thesis: {text}", style="italic", end_section=True)
+    if state in result.refitted:
+        published = equation_text(state, result.case.published[state])
+        here = result.refitted[state]
+        table.add_row("", "", "", "", f"thesis: {published}", style="italic")
+        table.add_row(
+            str(here.n_terms),
+            f"{here.r2_test:.3f}",
+            "",
+            "",
+            f"its terms here: {candidate_text(here)}",
+            style="italic",
+            end_section=True,
+        )
     return table
 
 
 def _rich_comparison(outcome: Outcome) -> Table:
-    table = Table("library", "f data (kHz)", "f model (kHz)", "nrmse", "ending", title="integrated")
+    table = Table("model", "f data (kHz)", "f model (kHz)", "nrmse", "ending", title="integrated")
     for row in _comparison(outcome).to_dict("records"):
         states = outcome.run.state_names
         table.add_row(
-            row["library"],
+            row["model"],
             " ".join(f"{row[f'f_data_{s}_kHz']:.2f}" for s in states),
             " ".join(_or_dash(row[f"f_model_{s}_kHz"], ".2f") for s in states),
             _or_dash(row["nrmse"], ".3f"),
@@ -251,14 +284,36 @@ def _summary(config: DictConfig, outcome: Outcome) -> dict[str, Any]:
         "models": {
             name: {
                 "equations": {s: _equation_summary(result, s) for s in result.discovery.fronts},
-                "trajectory": {
-                    "f_kHz": 1e-3 * result.frequency_Hz[first],
-                    "nrmse": result.nrmse,
-                    "diverged": result.rollout.diverged,
-                },
+                "trajectory": _trajectory_summary(result.selected, first),
+                "thesis_terms": _published_summary(result, first),
             }
             for name, result in outcome.results.items()
         },
+    }
+
+
+def _trajectory_summary(integrated: Integrated, state: str) -> dict[str, Any]:
+    return {
+        "f_kHz": 1e-3 * integrated.frequency_Hz[state],
+        "nrmse": integrated.nrmse,
+        "diverged": integrated.rollout.diverged,
+    }
+
+
+def _published_summary(result: LibraryResult, state: str) -> dict[str, Any] | None:
+    """The published terms fitted to our data."""
+    if result.published is None:
+        return None
+    return {
+        "equations": {
+            name: {
+                "terms": result.published.model.terms(name),
+                "r2_test": candidate.r2_test,
+                "text": candidate_text(candidate),
+            }
+            for name, candidate in result.refitted.items()
+        },
+        "trajectory": _trajectory_summary(result.published, state),
     }
 
 
@@ -304,6 +359,7 @@ def _hparams(config: DictConfig) -> dict[str, Any]:
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
     "trajectories": "Models integrated from the first sample of the data, over the data.",
+    "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
     "derivatives": "Derivative of the data, and each right-hand side evaluated on the data.",
     "phase": "Phase portraits: data (grey behind the models) and integrated models.",
 }
@@ -316,10 +372,12 @@ def _page(outcome: Outcome, figures: Mapping[str, Figure]) -> str:
         for state in result.discovery.fronts:
             terms = result.discovery.model.terms(state)
             body.append(f'<p class="equation">{equation_html(state, terms)}</p>')
-            published = outcome.published.get(name, {}).get(state)
-            if published:
-                text = equation_html(state, published)
-                body.append(f'<p class="equation published">thesis: {text}</p>')
+            if state in result.refitted:
+                there = equation_html(state, result.case.published[state])
+                here = equation_html(state, result.refitted[state].coef_by_term)
+                r2 = result.refitted[state].r2_test
+                body.append(f'<p class="published">thesis: {there}</p>')
+                body.append(f'<p class="published">its terms here: {here} (R2 {r2:.2f})</p>')
     comparison = _comparison(outcome)
     body += ["<h2>Integrated</h2>", table_html(comparison)]
     body += [figure_html(n, CAPTIONS[n]) for n in CAPTIONS if n in figures]

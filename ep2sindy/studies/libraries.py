@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.discover import Discovery, discover
 from ep2sindy.library import Library
-from ep2sindy.model import Rollout, equation_text
-from ep2sindy.pareto import Knee, ParetoFront
+from ep2sindy.model import Rollout, SparseModel, assemble_model, equation_text
+from ep2sindy.pareto import Candidate, Knee, ParetoFront, fit_support
 from ep2sindy.regression import Differential
 from ep2sindy.search import Bootstraps, Search
 from ep2sindy.spectrum import dominant_frequency
@@ -20,26 +20,40 @@ from ep2sindy.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class LibraryCase:
-    """One library, and the rule that selects from its fronts."""
+    """One library, the rule that selects from its fronts, and published equations if any.
+
+    published: state -> term -> SI coefficient; its terms are fitted to the data as well.
+    """
 
     library: Library
     selection: Knee
+    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
-class LibraryResult:
-    """One library's discovery, its model integrated from the data, and the comparison.
+class Integrated:
+    """A model, its run from the first sample of the data, and how far it strays.
 
     frequency_Hz: dominant frequency of each state of the rollout.
     nrmse: root mean square error over the rollout, in standard deviations of the data, RMS
     over the states. Both are NaN for a diverged rollout.
     """
 
-    case: LibraryCase
-    discovery: Discovery
+    model: SparseModel
     rollout: Rollout
     frequency_Hz: Mapping[str, float]
     nrmse: float
+
+
+@dataclass(frozen=True, eq=False)
+class LibraryResult:
+    """One library's discovery and its selected model; the published terms, fitted to our data."""
+
+    case: LibraryCase
+    discovery: Discovery
+    selected: Integrated
+    refitted: Mapping[str, Candidate]
+    published: Integrated | None
 
 
 def compare_libraries(
@@ -69,15 +83,38 @@ def compare_libraries(
             selection=case.selection,
             rng=stream,
         )
-        rollout = discovery.model.rollout(run, n_samples=n_samples)
+        refitted = {
+            state: fit_support(discovery.problem, state, list(terms))
+            for state, terms in case.published.items()
+        }
         results[name] = LibraryResult(
             case=case,
             discovery=discovery,
-            rollout=rollout,
-            frequency_Hz=_frequencies(rollout, run.state_names),
-            nrmse=_nrmse(rollout, run),
+            selected=integrate(discovery.model, run, n_samples),
+            refitted=refitted,
+            published=_integrate_refitted(discovery, refitted, run, n_samples),
         )
     return results
+
+
+def integrate(model: SparseModel, run: Trajectory, n_samples: int) -> Integrated:
+    """Run a model over the first samples of the data, and compare."""
+    rollout = model.rollout(run, n_samples=n_samples)
+    return Integrated(model, rollout, _frequencies(rollout, model.states), _nrmse(rollout, run))
+
+
+def _integrate_refitted(
+    discovery: Discovery, refitted: Mapping[str, Candidate], run: Trajectory, n_samples: int
+) -> Integrated | None:
+    if set(refitted) != set(run.state_names):
+        return None
+    model = assemble_model(
+        discovery.model.library,
+        [refitted[state] for state in run.state_names],
+        units=run.units,
+        provenance={**discovery.model.provenance, "search": "published terms, refitted"},
+    )
+    return integrate(model, run, n_samples)
 
 
 def samples_in(run: Trajectory, duration_s: float) -> int:
@@ -121,9 +158,11 @@ def front_table(front: ParetoFront, selection: Knee) -> pd.DataFrame:
             "d_pareto": selection.distances(front),
             "share": [c.share for c in front.candidates],
             "selected": [c is selected for c in front.candidates],
-            "text": [
-                equation_text(c.equation, dict(zip(c.terms, c.coef.tolist(), strict=True)))
-                for c in front.candidates
-            ],
+            "text": [candidate_text(c) for c in front.candidates],
         }
     )
+
+
+def candidate_text(candidate: Candidate) -> str:
+    """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
+    return equation_text(candidate.equation, candidate.coef_by_term)

@@ -62,8 +62,8 @@ def momentum_transfer_rate(T_e_eV: FloatArray) -> FloatArray:
 class XenonFits:
     """Xenon coefficients as published formulas (Goebel & Katz, appendix E and chapter 3).
 
-    Inelastic rates are taken at the electrons' whole mean energy 1.5 T_e + K, K the kinetic
-    energy of their drift, hence at the temperature T_e + 2 K/3 (`drift_weight` 1).
+    Inelastic rates and wall losses are taken at the electrons' whole mean energy 1.5 T_e + K,
+    K the kinetic energy of their drift, hence at the temperature T_e + 2 K/3 (`drift_weight` 1).
     """
 
     drift_weight: ClassVar[float] = 1.0
@@ -77,10 +77,13 @@ class XenonFits:
         ionization = E_IONIZATION_EV * ionization_rate(T_e_eV)
         return ionization + E_EXCITATION_EV * excitation_rate(T_e_eV)
 
-    def collision(self, T_e_eV: FloatArray) -> FloatArray:
-        """Momentum lost to neutrals: elastic, ionising and exciting collisions, in m^3/s."""
-        inelastic = ionization_rate(T_e_eV) + excitation_rate(T_e_eV)
-        return momentum_transfer_rate(T_e_eV) + inelastic
+    def events(self, T_e_eV: FloatArray) -> FloatArray:
+        """Ionising and exciting collisions together, in m^3/s."""
+        return ionization_rate(T_e_eV) + excitation_rate(T_e_eV)
+
+    def momentum(self, T_e_eV: FloatArray) -> FloatArray:
+        """Momentum lost to neutrals in elastic collisions, in m^3/s."""
+        return momentum_transfer_rate(T_e_eV)
 
     def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
         """2.9e-12 T^-1.5; times n and ln(Lambda) it is nu_ei in 1/s (Goebel & Katz, chapter 3)."""
@@ -124,7 +127,11 @@ class TabulatedRates:
         """Energy lost in all inelastic collisions, in eV m^3/s."""
         return self._interpolate(T_e_eV, self.energy_loss_rate)
 
-    def collision(self, T_e_eV: FloatArray) -> FloatArray:
+    def events(self, T_e_eV: FloatArray) -> FloatArray:
+        """LANDMARK's constant momentum transfer holds all collisions: none are added to it."""
+        return np.zeros_like(T_e_eV)
+
+    def momentum(self, T_e_eV: FloatArray) -> FloatArray:
         """Momentum lost to neutrals, in m^3/s."""
         return np.full_like(T_e_eV, self.elastic_rate)
 

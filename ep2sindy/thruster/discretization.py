@@ -14,14 +14,15 @@ TABLE_TOP_EV = 200.0  # a mean energy beyond counts as divergence: the fits end 
 CFL = 0.8
 
 
-def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
+def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 9"]:
     """Tabulate every closure at steps of TABLE_STEP_EV; columns as named in `kernels`."""
     T = TABLE_STEP_EV * np.arange(round(TABLE_TOP_EV / TABLE_STEP_EV) + 1)
     T[0] = 0.1 * TABLE_STEP_EV  # the formulas divide by T; nothing happens this cold
     rates, wall = thruster.rates, thruster.wall
-    table = np.empty((T.size, 8))
+    table = np.empty((T.size, 9))
     table[:, kernels.IONIZATION] = rates.ionization(T)
-    table[:, kernels.COLLISION] = rates.collision(T)
+    table[:, kernels.EVENTS] = rates.events(T)
+    table[:, kernels.MOMENTUM] = rates.momentum(T)
     table[:, kernels.INELASTIC] = rates.energy_loss(T)
     table[:, kernels.COULOMB] = rates.coulomb(T)
     table[:, kernels.COULOMB_LOG] = 23.0 - 0.5 * np.log(1e-6 * T**-3)  # less 0.5 ln(n)
@@ -86,4 +87,5 @@ def initial_state(thruster: Thruster, model: kernels.Model) -> kernels.State:
         ionization=np.zeros(size),
         wall_loss=np.zeros(size),
         current=np.zeros(1),
+        left=np.zeros(1),
     )

@@ -11,10 +11,20 @@ from numba import njit
 
 from ep2sindy.thruster.closures import E_CHARGE, M_ELECTRON
 
+COLDEST_EV = 1.0  # of the ghost cells: a steep end would otherwise turn them negative
+
 # Columns of `Model.table`, one row per electron temperature; coefficients in SI, energies in eV.
-IONIZATION, INELASTIC, COLLISION, COULOMB, COULOMB_LOG, WALL_COLLISION, WALL_POWER, ION_LOSS = (
-    range(8)
-)
+(
+    IONIZATION,
+    INELASTIC,
+    EVENTS,
+    MOMENTUM,
+    COULOMB,
+    COULOMB_LOG,
+    WALL_COLLISION,
+    WALL_POWER,
+    ION_LOSS,
+) = range(9)
 
 
 class Model(NamedTuple):
@@ -38,7 +48,7 @@ class Model(NamedTuple):
     wall_ion_weight: np.ndarray  # (n + 2,): ion loss, electron collisions and power loss
     wall_collision_weight: np.ndarray
     wall_power_weight: np.ndarray
-    table: np.ndarray  # (temperatures, 8)
+    table: np.ndarray  # (temperatures, 9)
     table_step_eV: float
 
 
@@ -55,6 +65,7 @@ class State(NamedTuple):
     ionization: np.ndarray  # k, m^3/s
     wall_loss: np.ndarray  # nu_iw, 1/s
     current: np.ndarray  # (1,), A
+    left: np.ndarray  # (1,), atoms that left through the cathode plane, 1/m^2
 
 
 @njit(cache=True, inline="always")
@@ -126,11 +137,13 @@ def heavy_step(state, model, dt, w):
     """One SSP-RK2 (Heun) step of ions and neutrals in a frozen field."""
     n, g, nn = state.n_i, state.flux_i, state.n_n
     heavy_rates(n, g, nn, state, model, w, w[4], w[5], w[6])
+    leaving = w[0, -2] + w[2, -2]  # through the last face
     for i in range(1, n.size - 1):
         w[7, i] = n[i] + dt * w[4, i]
         w[8, i] = g[i] + dt * w[5, i]
         w[9, i] = nn[i] + dt * w[6, i]
     heavy_rates(w[7], w[8], w[9], state, model, w, w[4], w[5], w[6])
+    state.left[0] += 0.5 * dt * (leaving + w[0, -2] + w[2, -2])
     for i in range(1, n.size - 1):
         n[i] = 0.5 * (n[i] + w[7, i] + dt * w[4, i])
         g[i] = 0.5 * (g[i] + w[8, i] + dt * w[5, i])
@@ -149,25 +162,28 @@ def collisions(state, model, nu, mobility, kappa, source):
     n, nn, T, table = state.n_i, state.n_n, state.T_e_eV, model.table
     per_eV = 1.0 / model.table_step_eV
     top = table.shape[0] - 1.0
-    drift = model.drift_weight * 2.0 / 3.0  # mean energy 1.5 T + K as a temperature
     for i in range(n.size):
+        drift = model.drift_weight * state.drift_eV[i]
         x = T[i] * per_eV
-        y = x + drift * state.drift_eV[i] * per_eV
+        y = x + drift * 2.0 / 3.0 * per_eV  # mean energy 1.5 T + K as a temperature
         if not (x >= 0.0 and y < top and n[i] > 0.0):
             return False
         row, hot = int(x), int(y)
         share, hot_share = x - row, y - hot
+        events = nn[i] * lookup(table, hot, hot_share, EVENTS)
         log_lambda = lookup(table, row, share, COULOMB_LOG) - 0.5 * np.log(n[i])
         nu[i] = (
-            nn[i] * lookup(table, row, share, COLLISION)
+            nn[i] * lookup(table, row, share, MOMENTUM)
+            + events
             + n[i] * log_lambda * lookup(table, row, share, COULOMB)
-            + model.wall_collision_weight[i] * lookup(table, row, share, WALL_COLLISION)
+            + model.wall_collision_weight[i] * lookup(table, hot, hot_share, WALL_COLLISION)
             + model.anomalous[i]
         )
         mobility[i] = E_CHARGE / M_ELECTRON * nu[i] / (nu[i] ** 2 + model.omega_ce[i] ** 2)
         kappa[i] = model.conduction_factor * mobility[i] * n[i] * T[i]
-        inelastic = nn[i] * lookup(table, hot, hot_share, INELASTIC)
-        wall = model.wall_power_weight[i] * lookup(table, row, share, WALL_POWER)
+        # An event's energy is taken from drift and heat together; the drift pays K.
+        inelastic = nn[i] * lookup(table, hot, hot_share, INELASTIC) - events * drift
+        wall = model.wall_power_weight[i] * lookup(table, hot, hot_share, WALL_POWER)
         source[i] = -n[i] * (inelastic + wall)
         state.ionization[i] = lookup(table, hot, hot_share, IONIZATION)
         state.wall_loss[i] = model.wall_ion_weight[i] * lookup(table, row, share, ION_LOSS)
@@ -225,7 +241,9 @@ def electron_step(state, model, dt, w):
     n, g, nn, T = state.n_i, state.flux_i, state.n_n, state.T_e_eV
     n[0], g[0], nn[0] = n[1], g[1], nn[1]
     n[-1], g[-1], nn[-1] = n[-2], g[-2], nn[-2]
-    T[0] = T[-1] = model.boundary_T_e_eV
+    # The ends of the domain, half a cell outside the last centres, are held at their temperature.
+    T[0] = max(2.0 * model.boundary_T_e_eV - T[1], COLDEST_EV)
+    T[-1] = max(2.0 * model.boundary_T_e_eV - T[-2], COLDEST_EV)
     nu, mobility, kappa, source = w[0], w[1], w[2], w[3]
     if not collisions(state, model, nu, mobility, kappa, source):
         return False
@@ -245,7 +263,7 @@ def time_step(state, model, left):
 
 
 @njit(cache=True)
-def advance(state, model, sample_s, n_i, u, n_n, T_e, R, E, current, thrust):
+def advance(state, model, sample_s, n_i, u, n_n, T_e, R, E, current, thrust, mass_out):
     """Fill the rows of the output arrays, one every `sample_s`; return (rows filled, steps)."""
     cells = state.n_i.size - 2
     steps = 0
@@ -270,4 +288,5 @@ def advance(state, model, sample_s, n_i, u, n_n, T_e, R, E, current, thrust):
             E[row, i] = state.E[i + 1]
         current[row] = state.current[0]
         thrust[row] = model.ion_mass * model.area * state.flux_i[cells] * u[row, cells - 1]
+        mass_out[row] = model.ion_mass * model.area * state.left[0]
     return current.size, steps

@@ -142,7 +142,7 @@ class OperatingPoint:
 
 OPERATING_POINTS = (
     OperatingPoint(200.0, 5.0),
-    OperatingPoint(300.0, 2.0, neutral_speed=200.0),
+    OperatingPoint(300.0, 2.0, neutral_speed=190.0),
     OperatingPoint(300.0, 4.0),
     OperatingPoint(300.0, 5.0),
     OperatingPoint(300.0, 6.0),

@@ -32,6 +32,7 @@ SERIES = {
     "I_d": ("A", "discharge current"),
     "V_d": ("V", "discharge voltage behind the series resistance"),
     "thrust": ("N", "ion momentum flux through the cathode plane"),
+    "mass_out": ("kg", "xenon that left through the cathode plane since the start"),
 }
 
 
@@ -103,7 +104,7 @@ def run(
     """Advance `state` by n_rows samples in chunks; fewer rows come back where it diverges."""
     n_cells = state.n_i.size - 2
     rows: dict[str, np.ndarray] = {name: np.empty((n_rows, n_cells), np.float32) for name in FIELDS}
-    rows |= {name: np.empty(n_rows) for name in ("I_d", "thrust")}
+    rows |= {name: np.empty(n_rows) for name in ("I_d", "thrust", "mass_out")}
     filled = 0
     bar = tqdm(total=n_rows, desc=label, unit="sample", disable=not progress)
     with bar, np.errstate(all="ignore"):
@@ -170,14 +171,12 @@ def judge_status(current: Float[np.ndarray, " time"]) -> str:
 
 def mass_balance(field: xr.Dataset, point: OperatingPoint, thruster: Thruster) -> float:
     """Xenon that left plus xenon that accumulated, over xenon that entered."""
-    last = field.isel(z=-1)
-    outflow = last["n_i"] * last["u_iz"] + last["n_n"] * point.neutral_speed
-    left = float(np.trapezoid(outflow.values.astype(float), field["time"].values))
-    stored = (field["n_i"] + field["n_n"]).isel(time=[0, -1]).astype(float).sum("z").values
+    left = float(field["mass_out"][-1] - field["mass_out"][0])
+    first, last = (field["n_i"] + field["n_n"]).isel(time=[0, -1]).astype(float).sum("z").values
     dz = float(field["z"][1] - field["z"][0])
-    elapsed = float(field["time"][-1])
-    entered = 1e-6 * point.mass_flow_mg_s / (M_XENON * thruster.area) * elapsed
-    return (left + dz * float(stored[1] - stored[0])) / entered
+    accumulated = M_XENON * thruster.area * dz * float(last - first)
+    entered = 1e-6 * point.mass_flow_mg_s * float(field["time"][-1])
+    return (left + accumulated) / entered
 
 
 def to_json(parameters: dict[str, Any]) -> str:
