@@ -29,7 +29,7 @@ class Ambiguity:
 
 def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and do not repeat an earlier one, over the training rows."""
-    xx = problem.train_gram.xx
+    xx = problem.train_gram.xx[0]
     usable = np.diag(xx) > 0.0
     repeats = np.triu(np.abs(xx) > 1.0 - SAME, k=1)
     for first, second in np.argwhere(repeats):
@@ -39,7 +39,7 @@ def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
 
 def ambiguities(problem: Regression) -> tuple[Ambiguity, ...]:
     """Everything that keeps terms from being told apart, over the training rows."""
-    xx = problem.train_gram.xx
+    xx = problem.train_gram.xx[0]
     return (*_zero(problem, xx), *_alike(problem, xx), *_dependent(problem, xx))
 
 

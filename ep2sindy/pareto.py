@@ -160,9 +160,8 @@ def _best_of_each_size(
     """Indices of the supports of least error, by number of terms, from Gram matrices alone."""
     train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
-    rhs = np.where(masks, train.xy[:, equation], 0.0)
-    coef = solve_masks(train.xx, rhs, masks)
-    explained = 2.0 * coef @ judge.xy[:, equation] - np.einsum("st,st->s", coef @ judge.xx, coef)
+    coef = solve_masks(train.xx[0], np.where(masks, train.xy[0, equation], 0.0), masks)
+    explained = (coef * (2.0 * judge.xy[0, equation] - coef @ judge.xx[0])).sum(axis=1)
     sizes = masks.sum(axis=1)
     order = np.lexsort((-explained, sizes))
     order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
@@ -178,11 +177,12 @@ def _fit(
     residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
     """
     gram, n_terms = problem.train_gram, len(problem.library)
+    xx = gram.xx[0]
     theta, target = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms + equation]
-    coef = solve_masks(gram.xx, np.where(masks, gram.xy[:, equation], 0.0), masks)
+    coef = solve_masks(xx, np.where(masks, gram.xy[0, equation], 0.0), masks)
     for _ in range(2):
         residual = target - coef @ theta.T
-        coef = coef + solve_masks(gram.xx, residual @ theta, masks)
+        coef = coef + solve_masks(xx, residual @ theta, masks)
     return coef
 
 

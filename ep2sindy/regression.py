@@ -18,23 +18,16 @@ ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the c
 
 
 @dataclass(frozen=True, eq=False)
-class Gram:
+class Grams:
     """Weighted sums of products of scaled columns: all that least squares needs of the rows.
 
-    xx: (terms, terms), xy: (terms, equations), yy and y_sum: (equations,), weight: sum of the
-    row weights.
+    One per draw of row weights. xx: (draws, terms, terms), xy: (draws, equations, terms),
+    yy: (draws, equations).
     """
 
-    xx: Float[np.ndarray, "terms terms"]
-    xy: Float[np.ndarray, "terms equations"]
-    yy: Float[np.ndarray, " equations"]
-    y_sum: Float[np.ndarray, " equations"]
-    weight: float
-
-    @property
-    def total(self) -> Float[np.ndarray, " equations"]:
-        """Sum of squares of each target about its mean."""
-        return self.yy - self.y_sum**2 / self.weight
+    xx: Float[np.ndarray, "draws terms terms"]
+    xy: Float[np.ndarray, "draws equations terms"]
+    yy: Float[np.ndarray, "draws equations"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +90,14 @@ class Regression:
         return self._scaled(self.test)
 
     @cached_property
-    def train_gram(self) -> Gram:
-        return self._gram_of(self.train_rows)
+    def train_gram(self) -> Grams:
+        return self._grams((self.train_rows.T @ self.train_rows)[None])
 
     @cached_property
-    def test_gram(self) -> Gram:
-        return self._gram_of(self.test_rows)
+    def test_gram(self) -> Grams:
+        return self._grams((self.test_rows.T @ self.test_rows)[None])
 
-    def resampled_grams(self, weights: Float[np.ndarray, "draws train"]) -> list[Gram]:
+    def resampled_grams(self, weights: Float[np.ndarray, "draws train"]) -> Grams:
         """Gram matrices of the training rows, each row counted `weights` times, per draw.
 
         All draws share the products of pairs of columns, so each draw is one row of a matrix
@@ -113,34 +106,26 @@ class Regression:
         rows = self.train_rows
         first, second = np.triu_indices(rows.shape[1])
         sums = np.zeros((len(weights), len(first)))
-        column_sums = np.zeros((len(weights), rows.shape[1]))
         for start in range(0, len(rows), ROW_BLOCK):
-            block = slice(start, start + ROW_BLOCK)
-            columns = np.ascontiguousarray(rows[block].T)
-            sums += weights[:, block] @ (columns[first] * columns[second]).T
-            column_sums += weights[:, block] @ columns.T
-        products = np.empty((len(weights), rows.shape[1], rows.shape[1]))
-        products[:, first, second] = sums
-        products[:, second, first] = sums
-        totals = zip(products, column_sums, weights.sum(axis=1).tolist(), strict=True)
-        return [self._gram(*total) for total in totals]
+            columns = np.ascontiguousarray(rows[start : start + ROW_BLOCK].T)
+            products = columns[first] * columns[second]
+            sums += weights[:, start : start + ROW_BLOCK] @ products.T
+        whole = np.empty((len(weights), rows.shape[1], rows.shape[1]))
+        whole[:, first, second] = sums
+        whole[:, second, first] = sums
+        return self._grams(whole)
 
     def _scaled(self, rows: np.ndarray) -> np.ndarray:
         return np.concatenate(
             [self.theta[rows] / self.theta_scale, self.target[rows] / self.target_scale], axis=1
         )
 
-    def _gram_of(self, rows: np.ndarray) -> Gram:
-        return self._gram(rows.T @ rows, rows.sum(axis=0), float(len(rows)))
-
-    def _gram(self, products: np.ndarray, sums: np.ndarray, weight: float) -> Gram:
+    def _grams(self, products: np.ndarray) -> Grams:
         n = len(self.library)
-        return Gram(
-            xx=np.ascontiguousarray(products[:n, :n]),
-            xy=products[:n, n:],
-            yy=products.diagonal()[n:],
-            y_sum=sums[n:],
-            weight=weight,
+        return Grams(
+            xx=products[:, :n, :n],
+            xy=products[:, n:, :n],
+            yy=products.diagonal(axis1=1, axis2=2)[:, n:],
         )
 
 

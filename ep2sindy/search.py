@@ -7,18 +7,19 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from ep2sindy.ambiguity import usable_terms
 from ep2sindy.kernels import adaptive_lasso_supports, best_subsets, thresholded_supports
-from ep2sindy.regression import Gram, Regression
+from ep2sindy.regression import Grams, Regression
 
 
 @runtime_checkable
 class Search(Protocol):
     """Turns one equation's Gram matrix into candidate supports.
 
-    xx: (terms, terms) and xy: (terms,) of columns with unit norm, yy the target's square.
+    xx: (terms, terms) and xy: (terms,) of columns with unit norm, yy the target's square. A
+    column of zeros is a term that is not at hand, and may not appear.
     """
 
     def supports(
@@ -158,10 +159,10 @@ class Bootstraps:
 
     def draw(
         self, problem: Regression, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
-    ) -> list[tuple[Gram, Bool[np.ndarray, " terms"]]]:
-        """Gram matrix and kept terms of every bootstrap, out of the terms that may be used."""
+    ) -> tuple[Grams, Bool[np.ndarray, "draws terms"]]:
+        """Gram matrices and kept terms of every bootstrap, out of the terms that may be used."""
         if self.n == 0:
-            return [(problem.train_gram, terms)]
+            return problem.train_gram, terms[None]
         usable = np.flatnonzero(terms)
         if self.n_culled >= len(usable):
             raise ValueError(
@@ -175,7 +176,7 @@ class Bootstraps:
             size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
             counts[k] = np.bincount(rng.integers(n_groups, size=size), minlength=n_groups)
             kept[k, rng.permutation(usable)[: self.n_culled]] = False
-        return list(zip(problem.resampled_grams(counts[:, group]), kept, strict=True))
+        return problem.resampled_grams(counts[:, group]), kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,41 +206,27 @@ def pooled_supports(
     Terms that are zero, or repeat an earlier term, are left out (see `ambiguities`).
     The same resamples serve all equations, so their Gram matrices are computed once.
     """
-    draws = bootstraps.draw(problem, usable_terms(problem), rng)
-    found = [_supports_of_all_equations(search, gram, kept) for gram, kept in draws]
-    at_hand = np.sum([kept for _, kept in draws], axis=0)
+    grams, kept = bootstraps.draw(problem, usable_terms(problem), rng)
+    # A resample changes the norms: unit columns again, so that no unit or draw leaks in; a
+    # culled term becomes a column of zeros.
+    diagonal = np.diagonal(grams.xx, axis1=1, axis2=2)
+    at_hand = kept & (diagonal > 0.0)
+    scale = at_hand / np.sqrt(np.where(at_hand, diagonal, 1.0))
+    xx = grams.xx * scale[:, :, None] * scale[:, None, :]
+    xy = grams.xy * scale[:, None, :]
     return tuple(
-        _pool(name, [masks[k] for masks in found], at_hand)
-        for k, name in enumerate(problem.equations)
+        _pool(name, [search.supports(*draw) for draw in zip(xx, xy[:, k], yy, strict=True)], kept)
+        for k, (name, yy) in enumerate(zip(problem.equations, grams.yy.T.tolist(), strict=True))
     )
-
-
-def _supports_of_all_equations(
-    search: Search, gram: Gram, kept: Bool[np.ndarray, " terms"]
-) -> list[Bool[np.ndarray, "supports terms"]]:
-    """Supports of each equation in one bootstrap, as masks over the whole library."""
-    columns = np.flatnonzero(kept)
-    # A resample changes the norms: unit columns again, so that no unit or draw leaks in.
-    diagonal = gram.xx.diagonal()[columns]
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    xx = gram.xx[columns[:, None], columns] * scale[:, None] * scale
-    xy = gram.xy[columns] * scale[:, None]
-    found = []
-    for equation, yy in enumerate(gram.yy.tolist()):
-        masks = search.supports(xx, np.ascontiguousarray(xy[:, equation]), yy)
-        whole = np.zeros((len(masks), len(kept)), dtype=np.bool_)
-        whole[:, columns] = masks
-        found.append(whole)
-    return found
 
 
 def _pool(
     equation: str,
     found: Sequence[Bool[np.ndarray, "_ terms"]],
-    at_hand: Int[np.ndarray, " terms"],
+    kept: Bool[np.ndarray, "draws terms"],
 ) -> Supports:
-    """Count supports and terms over the bootstraps; at_hand: in how many each term was kept."""
-    n_terms = len(at_hand)
+    """Count supports and terms over the bootstraps; kept: which terms each had at hand."""
+    n_terms = kept.shape[1]
     source = np.repeat(np.arange(len(found)), [len(masks) for masks in found])
     masks = np.concatenate(found)
     sizes = masks.sum(axis=1)
@@ -257,5 +244,5 @@ def _pool(
         equation=equation,
         masks=masks[first[order]],
         share=found_in.mean(axis=1)[order],
-        inclusion=included.sum(axis=0) / np.maximum(at_hand, 1),
+        inclusion=included.sum(axis=0) / np.maximum(kept.sum(axis=0), 1),
     )

@@ -1,7 +1,6 @@
 """Several libraries on the same data, side by side: `+exp=breathing`, `+exp=discover`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,17 +9,11 @@ import pandas as pd
 from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
-from rich.table import Table
 
 from ep2sindy import plots
 from ep2sindy.model import equation_text
 from ep2sindy.report import (
     RunFolder,
-    Screen,
-    equation_html,
-    figure_html,
-    page_html,
-    table_html,
     write_tensorboard,
 )
 from ep2sindy.spectrum import dominant_frequency
@@ -30,30 +23,17 @@ from ep2sindy.studies.libraries import (
     LibraryResult,
     candidate_text,
     compare_libraries,
-    front_table,
 )
 from ep2sindy.trajectory import Trajectory
 from experiments.build import library_of, open_prepared_field, started_run, trajectory_of
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What the tables, the figures and the page are made from."""
-
-    title: str
-    run: Trajectory
-    results: Mapping[str, LibraryResult]
-
-    @property
-    def models(self) -> dict[str, Integrated]:
-        """Selected models by library, then those of published terms."""
-        selected = {name: r.selected for name, r in self.results.items()}
-        published = {
-            f"{name}, thesis's terms": r.published
-            for name, r in self.results.items()
-            if r.published is not None
-        }
-        return selected | published
+from experiments.libraries_view import (
+    Outcome,
+    comparison,
+    front_tables,
+    page,
+    print_data,
+    print_outcome,
+)
 
 
 def run(config: DictConfig) -> Path:
@@ -75,7 +55,7 @@ def run(config: DictConfig) -> Path:
         libraries = {name: library_of(case, field) for name, case in config.libraries.items()}
         variables = [v for library in libraries.values() for v in library.variables]
         data = trajectory_of(config, field, variables)
-        _print_data(screen, data, field.attrs)
+        print_data(screen, data, field.attrs)
 
         published = cast(dict, OmegaConf.to_container(config.thesis))
         cases = {
@@ -84,7 +64,7 @@ def run(config: DictConfig) -> Path:
         }
         results = compare_libraries(data, cases, **settings)
         outcome = Outcome(config.experiment, data, results)
-        _print_outcome(screen, outcome)
+        print_outcome(screen, outcome)
         figures = _figures(outcome, config)
         _write(folder, config, outcome, figures)
     return folder.path
@@ -95,7 +75,7 @@ def _write(
 ) -> None:
     for name, result in outcome.results.items():
         folder.write_model(name, result.discovery.model)
-        folder.write_table(f"front_{name}", _front_tables(result))
+        folder.write_table(f"front_{name}", front_tables(result))
         folder.write_table(
             f"ambiguities_{name}",
             pd.DataFrame(
@@ -105,7 +85,7 @@ def _write(
         )
     for name, integrated in outcome.models.items():
         folder.write_table(f"rollout_{_slug(name)}", _rollout_table(outcome.run, integrated))
-    folder.write_table("comparison", _comparison(outcome))
+    folder.write_table("comparison", comparison(outcome))
     folder.write_figures(figures)
     summary = _summary(config, outcome)
     write_tensorboard(
@@ -116,13 +96,8 @@ def _write(
         hparams=_hparams(config),
         metrics=_scalars(summary),
     )
-    folder.write_text("report.html", _page(outcome, figures))
+    folder.write_text("report.html", page(outcome, figures))
     folder.write_json("summary.json", summary)
-
-
-def _front_tables(result: LibraryResult) -> pd.DataFrame:
-    fronts = result.discovery.fronts.values()
-    return pd.concat([front_table(front, result.case.selection) for front in fronts])
 
 
 def _slug(name: str) -> str:
@@ -138,19 +113,6 @@ def _rollout_table(run: Trajectory, integrated: Integrated) -> pd.DataFrame:
     for k, state in enumerate(states):
         columns |= {f"{state}_data": data[:, k], f"{state}_model": rollout.states[:, k]}
     return pd.DataFrame(columns)
-
-
-def _comparison(outcome: Outcome) -> pd.DataFrame:
-    """One row per model: frequencies in kHz and trajectory error."""
-    run = outcome.run
-    rows = []
-    for name, model in outcome.models.items():
-        row: dict[str, Any] = {"model": name}
-        for state, column in zip(run.state_names, run.states.T, strict=True):
-            row[f"f_data_{state}_kHz"] = 1e-3 * dominant_frequency(run.t, column)
-            row[f"f_model_{state}_kHz"] = 1e-3 * model.frequency_Hz[state]
-        rows.append(row | {"nrmse": model.nrmse, "ending": model.rollout.message})
-    return pd.DataFrame(rows)
 
 
 def _figures(outcome: Outcome, config: DictConfig) -> dict[str, Figure]:
@@ -181,91 +143,6 @@ def _figures(outcome: Outcome, config: DictConfig) -> dict[str, Figure]:
         plane = run.state_names[:2]
         figures["phase"] = plots.phase_figure(run, rollouts, plane=plane, duration_s=duration_s)
     return figures
-
-
-def _print_data(screen: Screen, run: Trajectory, attributes: Mapping[str, Any]) -> None:
-    if "status" in attributes:  # ours, from a simulation
-        screen.print(
-            f"simulation: {attributes['status']}; discharge current "
-            f"{attributes['I_d_mean']:.2f} A, standard deviation {attributes['I_d_std']:.2f} A; "
-            f"mass out/in {attributes['mass_balance']:.4f}"
-        )
-        if attributes["status"] != "oscillating":
-            screen.print("[bold red]this case does not sustain its oscillation[/bold red]")
-    frequencies = ", ".join(
-        f"{name} {1e-3 * dominant_frequency(run.t, column):.2f} kHz"
-        for name, column in zip(run.state_names, run.states.T, strict=True)
-    )
-    screen.print(
-        f"data: {run.n_samples} samples of {run.dt_s:.4g} s; dominant frequency {frequencies}"
-    )
-
-
-def _print_outcome(screen: Screen, outcome: Outcome) -> None:
-    for name, result in outcome.results.items():
-        library = result.case.library
-        screen.print(
-            f"\n[bold]{name}[/bold]: {len(library)} terms in {', '.join(library.variables)}; "
-            f"n_norm: {result.case.selection.n_norm}"
-        )
-        for ambiguity in result.discovery.ambiguities:
-            if ambiguity.exact:
-                screen.print(f"  note: {ambiguity.message}")
-        n_alike = sum(not a.exact for a in result.discovery.ambiguities)
-        if n_alike:
-            screen.print(
-                f"  note: {n_alike} pairs of terms are nearly proportional, "
-                f"see tables/ambiguities_{name}.csv"
-            )
-        for state in result.discovery.fronts:
-            screen.print(_rich_front(result, state))
-    screen.print(_rich_comparison(outcome))
-
-
-def _rich_front(result: LibraryResult, state: str) -> Table:
-    frame = front_table(result.discovery.fronts[state], result.case.selection)
-    table = Table("terms", "R2 test", "d_pareto", "share", "model", show_edge=False)
-    for row in frame.itertuples():
-        table.add_row(
-            str(row.n_terms),
-            f"{row.r2_test:.3f}",
-            f"{row.d_pareto:.3f}",
-            f"{row.share:.2f}",
-            str(row.text),
-            style="bold green" if row.selected else None,
-        )
-    if state in result.refitted:
-        published = equation_text(state, result.case.published[state])
-        here = result.refitted[state]
-        table.add_row("", "", "", "", f"thesis: {published}", style="italic")
-        table.add_row(
-            str(here.n_terms),
-            f"{here.r2_test:.3f}",
-            "",
-            "",
-            f"its terms here: {candidate_text(here)}",
-            style="italic",
-            end_section=True,
-        )
-    return table
-
-
-def _rich_comparison(outcome: Outcome) -> Table:
-    table = Table("model", "f data (kHz)", "f model (kHz)", "nrmse", "ending", title="integrated")
-    for row in _comparison(outcome).to_dict("records"):
-        states = outcome.run.state_names
-        table.add_row(
-            row["model"],
-            " ".join(f"{row[f'f_data_{s}_kHz']:.2f}" for s in states),
-            " ".join(_or_dash(row[f"f_model_{s}_kHz"], ".2f") for s in states),
-            _or_dash(row["nrmse"], ".3f"),
-            row["ending"],
-        )
-    return table
-
-
-def _or_dash(value: float, form: str) -> str:
-    return "-" if np.isnan(value) else format(value, form)
 
 
 def _summary(config: DictConfig, outcome: Outcome) -> dict[str, Any]:
@@ -354,40 +231,3 @@ def _hparams(config: DictConfig) -> dict[str, Any]:
         "n_bootstraps": config.bootstraps.n,
         "n_culled": config.bootstraps.n_culled,
     }
-
-
-CAPTIONS = {
-    "data": "States (start of the record) and their power spectra; the line marks the peak.",
-    "trajectories": "Models integrated from the first sample of the data, over the data.",
-    "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
-    "derivatives": "Derivative of the data, and each right-hand side evaluated on the data.",
-    "phase": "Phase portraits: data (grey behind the models) and integrated models.",
-}
-
-
-def _page(outcome: Outcome, figures: Mapping[str, Figure]) -> str:
-    body = ["<h2>Equations</h2>"]
-    for name, result in outcome.results.items():
-        body.append(f"<h3>{name}</h3>")
-        for state in result.discovery.fronts:
-            terms = result.discovery.model.terms(state)
-            body.append(f'<p class="equation">{equation_html(state, terms)}</p>')
-            if state in result.refitted:
-                there = equation_html(state, result.case.published[state])
-                here = equation_html(state, result.refitted[state].coef_by_term)
-                r2 = result.refitted[state].r2_test
-                body.append(f'<p class="published">thesis: {there}</p>')
-                body.append(f'<p class="published">its terms here: {here} (R2 {r2:.2f})</p>')
-    comparison = _comparison(outcome)
-    body += ["<h2>Integrated</h2>", table_html(comparison)]
-    body += [figure_html(n, CAPTIONS[n]) for n in CAPTIONS if n in figures]
-    body.append("<h2>Pareto fronts</h2>")
-    for name, result in outcome.results.items():
-        frame = _front_tables(result)
-        body += [
-            f"<h3>{name}</h3>",
-            figure_html(f"front_{name}", "Error against number of terms; the star is selected."),
-            table_html(frame.drop(columns="selected"), bold=frame["selected"].tolist()),
-        ]
-    body.append("<footer>All values in SI units. Config, models and tables lie beside.</footer>")
-    return page_html(outcome.title, body)

@@ -192,5 +192,5 @@ def test_rate_table_with_a_missing_column_is_refused(tmp_path):
 def test_six_operating_points():
     assert len({point.label for point in OPERATING_POINTS}) == 6
     speeds = {point.label: point.neutral_speed for point in OPERATING_POINTS}
-    assert speeds.pop("300V_2mgs") == 200.0
+    assert speeds.pop("300V_2mgs") == 190.0
     assert set(speeds.values()) == {280.0}

@@ -22,7 +22,8 @@ from ep2sindy.trajectory import Trajectory
 class LibraryCase:
     """One library, the rule that selects from its fronts, and published equations if any.
 
-    published: state -> term -> SI coefficient; its terms are fitted to the data as well.
+    published: state -> term -> SI coefficient; where the library has its terms, they are fitted
+    to the data as well.
     """
 
     library: Library
@@ -86,6 +87,7 @@ def compare_libraries(
         refitted = {
             state: fit_support(discovery.problem, state, list(terms))
             for state, terms in case.published.items()
+            if state in run.state_names and set(terms) <= set(case.library.names)
         }
         results[name] = LibraryResult(
             case=case,

@@ -1,0 +1,175 @@
+"""How the outcome of `experiments.libraries` reads: tables, terminal, and the report page."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ep2sindy.model import equation_text
+from ep2sindy.report import Screen, equation_html, figure_html, page_html, table_html
+from ep2sindy.spectrum import dominant_frequency
+from ep2sindy.studies.libraries import Integrated, LibraryResult, candidate_text, front_table
+from ep2sindy.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the tables, the figures and the page are made from."""
+
+    title: str
+    run: Trajectory
+    results: Mapping[str, LibraryResult]
+
+    @property
+    def models(self) -> dict[str, Integrated]:
+        """Selected models by library, then those of published terms."""
+        selected = {name: r.selected for name, r in self.results.items()}
+        published = {
+            f"{name}, thesis's terms": r.published
+            for name, r in self.results.items()
+            if r.published is not None
+        }
+        return selected | published
+
+
+def front_tables(result: LibraryResult) -> pd.DataFrame:
+    fronts = result.discovery.fronts.values()
+    return pd.concat([front_table(front, result.case.selection) for front in fronts])
+
+
+def comparison(outcome: Outcome) -> pd.DataFrame:
+    """One row per model: frequencies in kHz and trajectory error."""
+    run = outcome.run
+    rows = []
+    for name, model in outcome.models.items():
+        row: dict[str, Any] = {"model": name}
+        for state, column in zip(run.state_names, run.states.T, strict=True):
+            row[f"f_data_{state}_kHz"] = 1e-3 * dominant_frequency(run.t, column)
+            row[f"f_model_{state}_kHz"] = 1e-3 * model.frequency_Hz[state]
+        rows.append(row | {"nrmse": model.nrmse, "ending": model.rollout.message})
+    return pd.DataFrame(rows)
+
+
+def print_data(screen: Screen, run: Trajectory, attributes: Mapping[str, Any]) -> None:
+    if "status" in attributes:  # ours, from a simulation
+        screen.print(
+            f"simulation: {attributes['status']}; discharge current "
+            f"{attributes['I_d_mean']:.2f} A, standard deviation {attributes['I_d_std']:.2f} A; "
+            f"mass out/in {attributes['mass_balance']:.4f}"
+        )
+        if attributes["status"] != "oscillating":
+            screen.print("[bold red]this case does not sustain its oscillation[/bold red]")
+    frequencies = ", ".join(
+        f"{name} {1e-3 * dominant_frequency(run.t, column):.2f} kHz"
+        for name, column in zip(run.state_names, run.states.T, strict=True)
+    )
+    screen.print(
+        f"data: {run.n_samples} samples of {run.dt_s:.4g} s; dominant frequency {frequencies}"
+    )
+
+
+def print_outcome(screen: Screen, outcome: Outcome) -> None:
+    for name, result in outcome.results.items():
+        library = result.case.library
+        screen.print(
+            f"\n[bold]{name}[/bold]: {len(library)} terms in {', '.join(library.variables)}; "
+            f"n_norm: {result.case.selection.n_norm}"
+        )
+        for ambiguity in result.discovery.ambiguities:
+            if ambiguity.exact:
+                screen.print(f"  note: {ambiguity.message}")
+        n_alike = sum(not a.exact for a in result.discovery.ambiguities)
+        if n_alike:
+            screen.print(
+                f"  note: {n_alike} pairs of terms are nearly proportional, "
+                f"see tables/ambiguities_{name}.csv"
+            )
+        for state in result.discovery.fronts:
+            screen.print(_rich_front(result, state))
+    screen.print(_rich_comparison(outcome))
+
+
+def _rich_front(result: LibraryResult, state: str) -> Table:
+    frame = front_table(result.discovery.fronts[state], result.case.selection)
+    table = Table("terms", "R2 test", "d_pareto", "share", "model", show_edge=False)
+    for row in frame.itertuples():
+        table.add_row(
+            str(row.n_terms),
+            f"{row.r2_test:.3f}",
+            f"{row.d_pareto:.3f}",
+            f"{row.share:.2f}",
+            str(row.text),
+            style="bold green" if row.selected else None,
+        )
+    if state in result.refitted:
+        published = equation_text(state, result.case.published[state])
+        here = result.refitted[state]
+        table.add_row("", "", "", "", f"thesis: {published}", style="italic")
+        table.add_row(
+            str(here.n_terms),
+            f"{here.r2_test:.3f}",
+            "",
+            "",
+            f"its terms here: {candidate_text(here)}",
+            style="italic",
+            end_section=True,
+        )
+    return table
+
+
+def _rich_comparison(outcome: Outcome) -> Table:
+    table = Table("model", "f data (kHz)", "f model (kHz)", "nrmse", "ending", title="integrated")
+    for row in comparison(outcome).to_dict("records"):
+        states = outcome.run.state_names
+        table.add_row(
+            row["model"],
+            " ".join(f"{row[f'f_data_{s}_kHz']:.2f}" for s in states),
+            " ".join(_or_dash(row[f"f_model_{s}_kHz"], ".2f") for s in states),
+            _or_dash(row["nrmse"], ".3f"),
+            row["ending"],
+        )
+    return table
+
+
+def _or_dash(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)
+
+
+CAPTIONS = {
+    "data": "States (start of the record) and their power spectra; the line marks the peak.",
+    "trajectories": "Models integrated from the first sample of the data, over the data.",
+    "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
+    "derivatives": "Derivative of the data, and each right-hand side evaluated on the data.",
+    "phase": "Phase portraits: data (grey behind the models) and integrated models.",
+}
+
+
+def page(outcome: Outcome, figures: Mapping[str, Figure]) -> str:
+    body = ["<h2>Equations</h2>"]
+    for name, result in outcome.results.items():
+        body.append(f"<h3>{name}</h3>")
+        for state in result.discovery.fronts:
+            terms = result.discovery.model.terms(state)
+            body.append(f'<p class="equation">{equation_html(state, terms)}</p>')
+            if state in result.refitted:
+                there = equation_html(state, result.case.published[state])
+                here = equation_html(state, result.refitted[state].coef_by_term)
+                r2 = result.refitted[state].r2_test
+                body.append(f'<p class="published">thesis: {there}</p>')
+                body.append(f'<p class="published">its terms here: {here} (R2 {r2:.2f})</p>')
+    body += ["<h2>Integrated</h2>", table_html(comparison(outcome))]
+    body += [figure_html(n, CAPTIONS[n]) for n in CAPTIONS if n in figures]
+    body.append("<h2>Pareto fronts</h2>")
+    for name, result in outcome.results.items():
+        frame = front_tables(result)
+        body += [
+            f"<h3>{name}</h3>",
+            figure_html(f"front_{name}", "Error against number of terms; the star is selected."),
+            table_html(frame.drop(columns="selected"), bold=frame["selected"].tolist()),
+        ]
+    body.append("<footer>All values in SI units. Config, models and tables lie beside.</footer>")
+    return page_html(outcome.title, body)
