@@ -1,6 +1,6 @@
 """From config to values: what several experiments share."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -11,7 +11,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.library import Library, polynomial
 from ep2sindy.report import RunFolder, Screen, command_line
-from ep2sindy.trajectory import Trajectory
 
 
 @contextmanager
@@ -36,13 +35,26 @@ def open_prepared_field(config: DictConfig) -> xr.Dataset:
     return field
 
 
-def trajectory_of(config: DictConfig, field: xr.Dataset, variables: Sequence[str]) -> Trajectory:
-    """Time series of the states, and of those `variables` that are not states, as inputs."""
-    average = instantiate(config.trajectory, _convert_="all")
+def inputs_of(config: DictConfig, libraries: Iterable[Library]) -> list[str]:
+    """Variables of the libraries that are neither states nor averages of products."""
     products = [f"<{name.replace(' ', '')}>" for name in config.trajectory.products]
     known = {*config.trajectory.states, *products}
-    inputs = [name for name in dict.fromkeys(variables) if name not in known]
-    return average(field, inputs=inputs, label=config.experiment)
+    variables = dict.fromkeys(v for library in libraries for v in library.variables)
+    return [name for name in variables if name not in known]
+
+
+LIBRARY_KEYS = {"variables", "variables_if_present", "degree", "products", "selection"}
+
+
+def check_library(name: str, case: DictConfig) -> None:
+    """Raise ValueError for a key that would do nothing, or one that is missing."""
+    unknown = set(case) - LIBRARY_KEYS
+    missing = {"variables", "degree"} - set(case)
+    if unknown or missing:
+        raise ValueError(
+            f"libraries.{name} may have {sorted(LIBRARY_KEYS)} and needs variables and degree: "
+            f"{sorted(map(str, case))} came"
+        )
 
 
 def library_of(case: DictConfig, field: xr.Dataset) -> Library:

@@ -25,7 +25,13 @@ from ep2sindy.studies.libraries import (
     compare_libraries,
 )
 from ep2sindy.trajectory import Trajectory
-from experiments.build import library_of, open_prepared_field, started_run, trajectory_of
+from experiments.build import (
+    check_library,
+    inputs_of,
+    library_of,
+    open_prepared_field,
+    started_run,
+)
 from experiments.libraries_view import (
     Outcome,
     comparison,
@@ -47,14 +53,15 @@ def run(config: DictConfig) -> Path:
             "rollout_s": config.rollout_s,
             "rng": np.random.default_rng(config.seed),
         }
-        selections = {
-            name: instantiate(case.get("selection", config.selection))
-            for name, case in config.libraries.items()
-        }
+        to_trajectory = instantiate(config.trajectory, _convert_="all")
+        selections = {}
+        for name, case in config.libraries.items():
+            check_library(name, case)
+            selections[name] = instantiate(case.get("selection", config.selection))
         field = open_prepared_field(config)
         libraries = {name: library_of(case, field) for name, case in config.libraries.items()}
-        variables = [v for library in libraries.values() for v in library.variables]
-        data = trajectory_of(config, field, variables)
+        inputs = inputs_of(config, libraries.values())
+        data = to_trajectory(field, inputs=inputs, label=config.experiment)
         print_data(screen, data, field.attrs)
 
         published = cast(dict, OmegaConf.to_container(config.thesis))

@@ -4,7 +4,9 @@ import sys
 from pathlib import Path
 
 import hydra
+from hydra.errors import HydraException
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from experiments import libraries
 
@@ -22,14 +24,14 @@ def main(config: DictConfig) -> None:
         folder = STUDIES[config.study](config)
     except KeyboardInterrupt:
         sys.exit("interrupted: files under their final names are whole")
-    except (ValueError, OSError, hydra.errors.HydraException) as error:
+    except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
         sys.exit(f"error: {_innermost(error)}")
     print(folder)
 
 
 def _innermost(error: BaseException) -> BaseException:
     """Hydra wraps what a constructor raised; the user needs the constructor's own words."""
-    while isinstance(error, hydra.errors.HydraException) and error.__cause__ is not None:
+    while isinstance(error, HydraException) and error.__cause__ is not None:
         error = error.__cause__
     return error
 

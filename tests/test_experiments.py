@@ -219,6 +219,8 @@ def test_the_last_line_names_the_run_folder(predator_prey: Path, tmp_path: Path)
         (["+exp=breathing", "+search.max_term=3"], "unexpected keyword argument 'max_term'"),
         (["+exp=breathing", "selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+exp=breathing", "data=file", "data.path=none.nc"], "error: no such file: "),
+        (["+exp=breathing", "+libraries.simple.degre=3"], "libraries.simple may have"),
+        (["+exp=discover"], "trajectory.states"),
         (["+exp=breathing", "output=Makefile"], "choose another with output=PATH"),
     ],
 )
