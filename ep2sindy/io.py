@@ -10,7 +10,7 @@ import re
 import tokenize
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,11 @@ from ep2sindy.files import replacing
 from ep2sindy.readers import UNDECODED, Source, damage_named, open_source, read_netcdf, reader_of
 from ep2sindy.units import registry, unit_product
 
+# What our usual names mean: a unit of another kind is a mistake in the mapping.
+KNOWN_UNITS = {
+    "n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s",
+    "I_d": "A", "V_d": "V",
+}  # fmt: skip
 NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
 # Names that end so keep this unit; all others are SI.
 SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
@@ -46,7 +51,7 @@ class Variable:
         None: the file has it not.
     unit: what the file's numbers count: "cm^-3", "km/s", "degC"; with a factor, "1e19 m^-3".
     dims: dimensions in the file's order, such as ("r", "z", "time"). None: as the file names
-        them, or those whose lengths fit in the order time, z, r.
+        them, or the one order in which the lengths fit.
     """
 
     name: str | None
@@ -193,7 +198,7 @@ def _place(
     if dims is None:
         fitting = [
             option
-            for option in combinations([d for d in lengths if lengths[d] > 1], len(shape))
+            for option in permutations([d for d in lengths if lengths[d] > 1], len(shape))
             if tuple(lengths[d] for d in option) == shape
         ]
         dims = fitting[0] if len(fitting) == 1 else ()
@@ -201,7 +206,8 @@ def _place(
     if tuple(n for n in sizes if n != 1) != shape or len(set(dims)) < len(dims):
         raise ValueError(
             f"{ours} must fit the grid: the file has shape {array.shape} and the grid {lengths}, "
-            f"dims given: {list(dims) or None}; give its dims in the order of the file"
+            f"dims given: {list(dims) or None}; give data.variables.{ours}.dims in the order of "
+            "the file, such as [z,time]"
         )
     if array.shape == sizes:
         named = array.drop_vars(list(array.coords)).rename(dict(zip(array.dims, dims, strict=True)))
@@ -231,7 +237,7 @@ def to_si(array: xr.DataArray, ours: str, unit: str) -> xr.DataArray:
 def conversion(ours: str, unit: str) -> tuple[float, float, str]:
     """Factor, offset and target unit that take numbers in `unit` to the unit our name means."""
     suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
-    target = COORDINATE_UNITS.get(ours) or next(suffixes, None)
+    target = (COORDINATE_UNITS | KNOWN_UNITS).get(ours) or next(suffixes, None)
     try:
         given = _ruler(unit)
         ruler = given.to(target) if target else given.to_base_units()

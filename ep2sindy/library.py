@@ -125,8 +125,8 @@ def polynomial(variables: Sequence[str], *, degree: int, products: Sequence[str]
     Ordered by degree, then by the order of the variables: 1, x, y, x^2, x*y, y^2, ...
     Raises ValueError for a negative degree or an unknown variable in a product.
     """
-    if degree < 0:
-        raise ValueError(f"degree must be zero or more: {degree} came")
+    if not isinstance(degree, int) or degree < 0:
+        raise ValueError(f"degree must be a whole number, zero or more: {degree!r} came")
     rows = [
         np.bincount(combination, minlength=len(variables))
         for n in range(degree + 1)

@@ -191,12 +191,12 @@ class SparseModel:
         except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
             raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
 
-    def save(self, path: Path) -> None:
-        write_text(path, self.to_json())
+    def save(self, path: str | Path) -> None:
+        write_text(Path(path), self.to_json())
 
     @staticmethod
-    def load(path: Path) -> SparseModel:
-        return SparseModel.from_json(path.read_text(encoding="utf-8"))
+    def load(path: str | Path) -> SparseModel:
+        return SparseModel.from_json(Path(path).read_text(encoding="utf-8"))
 
     def _equation(self, state: str) -> int:
         if state not in self.states:

@@ -14,9 +14,9 @@ from ep2sindy.model import Rollout, SparseModel
 from ep2sindy.names import latex_derivative, latex_name, latex_term_name
 from ep2sindy.pareto import Knee, ParetoFront
 from ep2sindy.smoothing import Smoother
-from ep2sindy.spectrum import dominant_frequency, power_spectrum
+from ep2sindy.spectrum import dominant_frequency, frequency_text, power_spectrum
 from ep2sindy.trajectory import Trajectory
-from ep2sindy.units import unit_product
+from ep2sindy.units import prefixed, unit_product
 
 DATA = "#222222"
 # Okabe & Ito 2008: told apart with any colour vision, and in print.
@@ -29,18 +29,21 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figur
     figure = Figure(figsize=(9.0, 2.2 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, 2, squeeze=False, sharex="col", width_ratios=[3, 2])
     shown = run.t - run.t[0] <= duration_s
+    per_s, second = prefixed(duration_s)
+    per_Hz, hertz = prefixed(f_max_Hz)
     for k, name in enumerate(run.state_names):
-        axes[k, 0].plot(1e3 * (run.t[shown] - run.t[0]), run.states[shown, k], color=DATA, lw=1)
+        axes[k, 0].plot(per_s * (run.t[shown] - run.t[0]), run.states[shown, k], color=DATA, lw=1)
         axes[k, 0].set_ylabel(_label(name, run.units[name]))
         frequency, power = power_spectrum(run.t, run.states[:, k])
         inside = (frequency > 0) & (frequency <= f_max_Hz)
-        axes[k, 1].semilogy(1e-3 * frequency[inside], power[inside], color=COLOURS[0], lw=0.8)
-        peak = 1e-3 * dominant_frequency(run.t, run.states[:, k])
-        axes[k, 1].axvline(peak, color=COLOURS[1], lw=1, ls="--", label=f"{peak:.2f} kHz")
+        axes[k, 1].semilogy(per_Hz * frequency[inside], power[inside], color=COLOURS[0], lw=0.8)
+        peak = dominant_frequency(run.t, run.states[:, k])
+        label = frequency_text(peak)
+        axes[k, 1].axvline(per_Hz * peak, color=COLOURS[1], lw=1, ls="--", label=label)
         axes[k, 1].legend(loc="upper right", frameon=False)
         axes[k, 1].set_ylabel(f"power ({_unit(unit_product([(run.units[name], 2), ('Hz', -1)]))})")
-    axes[-1, 0].set_xlabel("time (ms)")
-    axes[-1, 1].set_xlabel("frequency (kHz)")
+    axes[-1, 0].set_xlabel(f"time ({second}s)")
+    axes[-1, 1].set_xlabel(f"frequency ({hertz}Hz)")
     return figure
 
 
@@ -78,24 +81,26 @@ def trajectory_figure(
     figure = Figure(figsize=(9.0, 2.4 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, 1, squeeze=False, sharex=True)[:, 0]
     start = min((r.t[0] for r in rollouts.values() if len(r.t)), default=run.t[0])
+    per_s, second = prefixed(duration_s)
     for k, (ax, name) in enumerate(zip(axes, run.state_names, strict=True)):
         shown = (run.t >= start) & (run.t <= start + duration_s)
         ax.plot(
-            1e3 * (run.t[shown] - start), run.states[shown, k], color=DATA, lw=1.6, label="data"
+            per_s * (run.t[shown] - start), run.states[shown, k], color=DATA, lw=1.6, label="data"
         )
         for colour, (label, rollout) in zip(COLOURS, rollouts.items(), strict=False):
             inside = rollout.t <= start + duration_s
             ending = " (diverged)" if rollout.diverged else ""
             ax.plot(
-                1e3 * (rollout.t[inside] - start),
+                per_s * (rollout.t[inside] - start),
                 rollout.states[inside, k],
                 color=colour,
                 lw=1.1,
+                ls=(0, (5, 1)),
                 label=label + ending,
             )
         ax.set_ylim(_framing(run.states[shown, k]))
         ax.set_ylabel(_label(name, run.units[name]))
-    axes[-1].set_xlabel("time since start of integration (ms)")
+    axes[-1].set_xlabel(f"time since start of integration ({second}s)")
     _legend_above(figure, axes[0])
     return figure
 
@@ -108,17 +113,18 @@ def derivative_figure(
     figure = Figure(figsize=(9.0, 2.4 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, 1, squeeze=False, sharex=True)[:, 0]
     shown = run.t - run.t[0] <= duration_s
-    t_ms = 1e3 * (run.t[shown] - run.t[0])
+    per_s, second = prefixed(duration_s)
+    t = per_s * (run.t[shown] - run.t[0])
     slope = smoother.derivative(run.t, run.states)
     for k, (ax, name) in enumerate(zip(axes, run.state_names, strict=True)):
-        ax.plot(t_ms, slope[shown, k], color=DATA, lw=1.6, label="data")
+        ax.plot(t, slope[shown, k], color=DATA, lw=1.6, label="data")
         for colour, (label, model) in zip(COLOURS, models.items(), strict=False):
             predicted = model.derivative(run.columns(model.states), run.columns(model.inputs))
             column = predicted[shown, model.states.index(name)]
-            ax.plot(t_ms, column, color=colour, lw=1.1, label=label)
+            ax.plot(t, column, color=colour, lw=1.1, ls=(0, (5, 1)), label=label)
         slope_unit = unit_product([(run.units[name], 1), ("s", -1)])
         ax.set_ylabel(f"${latex_derivative(name)}$ ({_unit(slope_unit)})")
-    axes[-1].set_xlabel("time (ms)")
+    axes[-1].set_xlabel(f"time ({second}s)")
     _legend_above(figure, axes[0])
     return figure
 

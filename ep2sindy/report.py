@@ -77,8 +77,10 @@ class RunFolder:
     def write_figures(self, figures: Mapping[str, Figure]) -> None:
         for name, figure in figures.items():
             for suffix in ("png", "pdf"):
+                # Without a date the same run gives the same file.
+                dated = {"CreationDate": None} if suffix == "pdf" else {}
                 with replacing(self.path / "figures" / f"{name}.{suffix}") as temporary:
-                    figure.savefig(temporary, dpi=150)
+                    figure.savefig(temporary, dpi=150, metadata=dated)
 
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> None:
         self.write_json(
@@ -106,6 +108,10 @@ class Screen:
         for console in self._consoles:
             console.print(*renderables, highlight=False)
         self._log.flush()
+
+    def log(self, text: str) -> None:
+        """Into run.log alone."""
+        self._consoles[1].print(text, highlight=False, markup=False)
 
     def close(self) -> None:
         self._log.close()

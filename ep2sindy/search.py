@@ -147,10 +147,10 @@ class Bootstraps:
     largest: float = 0.8
 
     def __post_init__(self) -> None:
-        if self.n < 0 or self.n_culled < 0:
-            raise ValueError(
-                f"counts must not be negative: n={self.n}, n_culled={self.n_culled} came"
-            )
+        for name in ("n", "n_culled"):
+            count = getattr(self, name)
+            if not isinstance(count, int) or count < 0:
+                raise ValueError(f"{name} must be a whole number, zero or more: {count!r} came")
         if not 0.0 < self.smallest <= self.largest:
             raise ValueError(
                 "shares must satisfy 0 < smallest <= largest: "
@@ -166,7 +166,8 @@ class Bootstraps:
         usable = np.flatnonzero(terms)
         if self.n_culled >= len(usable):
             raise ValueError(
-                f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go"
+                f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
+                "or use a larger library"
             )
         _, group = np.unique(problem.groups[~problem.test], return_inverse=True)
         n_groups = int(group.max()) + 1

@@ -7,6 +7,8 @@ from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 from scipy.signal import periodogram
 
+from ep2sindy.units import prefixed
+
 STEP_TOLERANCE = 1e-6  # relative spread of steps below which sampling counts as uniform
 
 
@@ -46,3 +48,11 @@ def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
     curvature = left - 2 * centre + right
     shift = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
     return float(frequency[k] + np.clip(shift, -0.5, 0.5) * frequency[1])
+
+
+def frequency_text(frequency_Hz: float) -> str:
+    """`14.10 kHz`, `53.1 mHz`; a dash for none."""
+    if np.isnan(frequency_Hz):
+        return "-"
+    factor, prefix = prefixed(frequency_Hz)
+    return f"{frequency_Hz * factor:.4g} {prefix}Hz"

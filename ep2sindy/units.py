@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import cache
 
@@ -34,3 +35,11 @@ def unit_product(factors: Iterable[tuple[str, int]]) -> str:
             total[symbol] = total.get(symbol, 0.0) + power * exponent
     parts = [s if p == 1 else f"{s}^{p:g}" for s, p in total.items() if p != 0]
     return " ".join(parts) or "1"
+
+
+def prefixed(value: float) -> tuple[float, str]:
+    """Factor and SI prefix that bring a value between 1 and 1000: 1.4e4 -> (1e-3, "k")."""
+    prefixes = {-9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+    power = 3 * math.floor(math.log10(value) / 3) if value > 0 else 0
+    power = min(max(power, -9), 9)
+    return 10.0**-power, prefixes[power]

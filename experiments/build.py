@@ -1,6 +1,7 @@
 """From config to values: what several experiments share."""
 
-from collections.abc import Iterable, Iterator
+import inspect
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -16,19 +17,67 @@ from ep2sindy.report import RunFolder, Screen, command_line
 @contextmanager
 def started_run(config: DictConfig) -> Iterator[tuple[RunFolder, Screen]]:
     """A new run folder that already holds its config and provenance, and its screen."""
+    check_config(config)
     folder = RunFolder.create(Path(config.output), config.experiment, now=datetime.now())
     folder.write_text("config.yaml", OmegaConf.to_yaml(config, resolve=True))
     folder.write_provenance(seed=config.seed, command=command_line())
     screen = Screen(folder.path / "run.log")
     try:
         yield folder, screen
+    except BaseException as error:
+        screen.log(f"ended early: {type(error).__name__}: {error}")
+        raise
     finally:
         screen.close()
 
 
+TOP_KEYS = {
+    "data", "formulation", "search", "bootstraps", "selection", "experiment", "study", "seed",
+    "output", "prepare", "trajectory", "libraries", "rollout_s", "figures", "thesis", "thesis_knee",
+}  # fmt: skip
+
+
+def check_config(config: DictConfig) -> None:
+    """Raise ValueError for a key that would do nothing, or a setting of the wrong kind."""
+    unknown = set(config) - TOP_KEYS
+    if unknown:
+        raise ValueError(f"unknown keys {sorted(map(str, unknown))}; there are {sorted(TOP_KEYS)}")
+    if not isinstance(config.seed, int) or config.seed < 0:
+        raise ValueError(f"seed must be a whole number, zero or more: {config.seed!r} came")
+    if not str(config.experiment).isidentifier():
+        raise ValueError(
+            f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
+        )
+    durations = {
+        "rollout_s": config.rollout_s,
+        **{f"figures.{k}": v for k, v in config.figures.items()},
+    }
+    for key, value in durations.items():
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"{key} must be a positive number, or null for all: {value!r} came")
+
+
+def prepared_steps(config: DictConfig) -> list[Callable[[xr.Dataset], xr.Dataset]]:
+    """The steps of `prepare`; an argument that a step does not know is refused here."""
+    steps = []
+    for k, entry in enumerate(config.prepare):
+        if not isinstance(entry, DictConfig):
+            raise ValueError(
+                f"prepare[{k}] must be like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: "
+                f"{entry!r} came"
+            )
+        step = instantiate(entry, _partial_=True, _convert_="all")
+        try:
+            inspect.signature(step.func).bind(None, **step.keywords)
+        except TypeError as error:
+            raise ValueError(f"prepare[{k}], {step.func.__name__}: {error}") from error
+        steps.append(step)
+    return steps
+
+
 def open_prepared_field(config: DictConfig) -> xr.Dataset:
     """The field of the `data` group after the steps of `prepare`."""
-    steps = [instantiate(step, _partial_=True, _convert_="all") for step in config.prepare]
+    steps = prepared_steps(config)
     field = instantiate(config.data, _convert_="all")
     for step in steps:
         field = step(field)

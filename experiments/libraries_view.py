@@ -11,7 +11,7 @@ from rich.table import Table
 
 from ep2sindy.model import equation_text
 from ep2sindy.report import Screen, equation_html, figure_html, page_html, table_html
-from ep2sindy.spectrum import dominant_frequency
+from ep2sindy.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.libraries import Integrated, LibraryResult, candidate_text, front_table
 from ep2sindy.trajectory import Trajectory
 
@@ -42,15 +42,15 @@ def front_tables(result: LibraryResult) -> pd.DataFrame:
 
 
 def comparison(outcome: Outcome) -> pd.DataFrame:
-    """One row per model: frequencies in kHz and trajectory error."""
+    """One row per model: frequencies in Hz, trajectory error, and a word on the trajectory."""
     run = outcome.run
     rows = []
     for name, model in outcome.models.items():
         row: dict[str, Any] = {"model": name}
         for state, column in zip(run.state_names, run.states.T, strict=True):
-            row[f"f_data_{state}_kHz"] = 1e-3 * dominant_frequency(run.t, column)
-            row[f"f_model_{state}_kHz"] = 1e-3 * model.frequency_Hz[state]
-        rows.append(row | {"nrmse": model.nrmse, "ending": model.rollout.message})
+            row[f"f_data_{state}_Hz"] = dominant_frequency(run.t, column)
+            row[f"f_model_{state}_Hz"] = model.frequency_Hz[state]
+        rows.append(row | {"nrmse": model.nrmse, "verdict": model.verdict})
     return pd.DataFrame(rows)
 
 
@@ -64,7 +64,7 @@ def print_data(screen: Screen, run: Trajectory, attributes: Mapping[str, Any]) -
         if attributes["status"] != "oscillating":
             screen.print("[bold red]this case does not sustain its oscillation[/bold red]")
     frequencies = ", ".join(
-        f"{name} {1e-3 * dominant_frequency(run.t, column):.2f} kHz"
+        f"{name} {frequency_text(dominant_frequency(run.t, column))}"
         for name, column in zip(run.state_names, run.states.T, strict=True)
     )
     screen.print(
@@ -85,8 +85,7 @@ def print_outcome(screen: Screen, outcome: Outcome) -> None:
         n_alike = sum(not a.exact for a in result.discovery.ambiguities)
         if n_alike:
             screen.print(
-                f"  note: {n_alike} pairs of terms are nearly proportional, "
-                f"see tables/ambiguities_{name}.csv"
+                f"  note: nearly proportional terms: {n_alike}, see tables/ambiguities_{name}.csv"
             )
         for state in result.discovery.fronts:
             screen.print(_rich_front(result, state))
@@ -122,23 +121,21 @@ def _rich_front(result: LibraryResult, state: str) -> Table:
 
 
 def _rich_comparison(outcome: Outcome) -> Table:
-    table = Table("model", "f data (kHz)", "f model (kHz)", "nrmse", "ending", title="integrated")
+    table = Table("model", "state", "f data", "f model", "nrmse", "verdict", title=TITLE)
     for row in comparison(outcome).to_dict("records"):
-        states = outcome.run.state_names
-        table.add_row(
-            row["model"],
-            " ".join(f"{row[f'f_data_{s}_kHz']:.2f}" for s in states),
-            " ".join(_or_dash(row[f"f_model_{s}_kHz"], ".2f") for s in states),
-            _or_dash(row["nrmse"], ".3f"),
-            row["ending"],
-        )
+        for k, state in enumerate(outcome.run.state_names):
+            table.add_row(
+                "" if k else row["model"],
+                state,
+                frequency_text(row[f"f_data_{state}_Hz"]),
+                frequency_text(row[f"f_model_{state}_Hz"]),
+                "" if k else ("-" if np.isnan(row["nrmse"]) else f"{row['nrmse']:.3f}"),
+                "" if k else row["verdict"],
+            )
     return table
 
 
-def _or_dash(value: float, form: str) -> str:
-    return "-" if np.isnan(value) else format(value, form)
-
-
+TITLE = "integrated from the first sample (nrmse 1: no better than a constant)"
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
     "trajectories": "Models integrated from the first sample of the data, over the data.",
@@ -161,7 +158,7 @@ def page(outcome: Outcome, figures: Mapping[str, Figure]) -> str:
                 r2 = result.refitted[state].r2_test
                 body.append(f'<p class="published">thesis: {there}</p>')
                 body.append(f'<p class="published">its terms here: {here} (R2 {r2:.2f})</p>')
-    body += ["<h2>Integrated</h2>", table_html(comparison(outcome))]
+    body += ["<h2>Integrated</h2>", f"<p>Models {TITLE}.</p>", table_html(comparison(outcome))]
     body += [figure_html(n, CAPTIONS[n]) for n in CAPTIONS if n in figures]
     body.append("<h2>Pareto fronts</h2>")
     for name, result in outcome.results.items():

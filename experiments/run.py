@@ -20,6 +20,8 @@ def main(config: DictConfig) -> None:
     if config.experiment is None:
         known = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
         sys.exit(f"error: choose an experiment with +exp=NAME; there are {known}")
+    if config.study not in STUDIES:
+        sys.exit(f"error: study must be one of {sorted(STUDIES)}: {config.study!r} came")
     try:
         folder = STUDIES[config.study](config)
     except KeyboardInterrupt:

@@ -221,6 +221,13 @@ def test_the_last_line_names_the_run_folder(predator_prey: Path, tmp_path: Path)
         (["+exp=breathing", "data=file", "data.path=none.nc"], "error: no such file: "),
         (["+exp=breathing", "+libraries.simple.degre=3"], "libraries.simple may have"),
         (["+exp=discover"], "trajectory.states"),
+        (["+exp=breathing", "+seeds=1"], "error: unknown keys ['seeds']; there are "),
+        (["+exp=breathing", "seed=abc"], "error: seed must be a whole number"),
+        (["+exp=breathing", "rollout_s=-1"], "error: rollout_s must be a positive number"),
+        (
+            ["+exp=breathing", "prepare=[{_target_:ep2sindy.prepare.crop,start:1}]"],
+            "error: prepare[0], crop: got an unexpected keyword argument 'start'",
+        ),
         (["+exp=breathing", "output=Makefile"], "choose another with output=PATH"),
     ],
 )

@@ -171,11 +171,13 @@ def test_structs_and_groups_are_paths(tmp_path: Path) -> None:
         assert np.array_equal(field["n_i"].values, N_I[:, 0, 0])
 
 
+@pytest.mark.parametrize("given", [True, False], ids=["given", "told by lengths"])
 @pytest.mark.parametrize("dims", [("r", "z", "time"), ("z", "time", "r"), ("time", "r", "z")])
-def test_dimension_orders_are_undone(tmp_path: Path, dims: tuple[str, ...]) -> None:
+def test_dimension_orders_are_undone(tmp_path: Path, dims: tuple[str, ...], given: bool) -> None:
     order = [("time", "z", "r").index(d) for d in dims]
     np.savez(tmp_path / "a.npz", **{**ARRAYS, "ni": N_I.transpose(order)})
-    field = open_field(tmp_path / "a.npz", variables={"n_i": Variable("ni", "m^-3", dims)}, **AXES)
+    variable = Variable("ni", "m^-3", dims if given else None)
+    field = open_field(tmp_path / "a.npz", variables={"n_i": variable}, **AXES)
     assert field["n_i"].dims == ("time", "z", "r")
     assert np.array_equal(field["n_i"].values, N_I)
 
@@ -183,7 +185,7 @@ def test_dimension_orders_are_undone(tmp_path: Path, dims: tuple[str, ...]) -> N
 def test_equal_lengths_ask_for_dims_instead_of_guessing(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=TIME, z=Z, r=Z + 1, Te=T_E, ni=np.ones((NT, NZ, NZ)))
     settings = {"variables": {"T_e_eV": Variable("Te", "eV")}, **AXES}
-    with pytest.raises(ValueError, match=r"shape \(6, 4\) and the grid .*'z': 4, 'r': 4.*give its"):
+    with pytest.raises(ValueError, match=r"shape \(6, 4\) .*'z': 4, 'r': 4.*give data.variables"):
         open_field(tmp_path / "a.npz", **settings)
     settings["variables"] = {"T_e_eV": Variable("Te", "eV", ["time", "r"])}
     assert open_field(tmp_path / "a.npz", **settings)["T_e_eV"].dims == ("time", "r")
@@ -246,7 +248,9 @@ def test_conversion_factors(ours: str, unit: str, factor: float, target: str) ->
 @pytest.mark.parametrize(
     ("ours", "unit", "message"),
     [
-        ("n_i", "furlongg^-3", "the unit of n_i must be one that converts to SI: 'furlongg"),
+        ("p", "furlongg^-3", "the unit of p must be one that converts to SI: 'furlongg"),
+        ("n_i", "s", "the unit of n_i must be one that converts to m\\^-3: 's' came"),
+        ("n_n", "cm^3", "the unit of n_n must be one that converts to m\\^-3: 'cm\\^3' came"),
         ("n_i", "m(", r"'m\(' came"),
         ("n_i", "", "'' came"),
         ("T_e_eV", "m", "the unit of T_e_eV must be one that converts to eV: 'm' came"),
@@ -319,14 +323,14 @@ def npz(path: Path, **changes: np.ndarray) -> Path:
         ({}, {"variables": {"n_i": {"nmae": "ni", "unit": "m^-3"}}}, "n_i needs a name, a unit"),
         ({}, {"time": None}, "name the file's time or give its step dt_s; .* holds"),
         (
-            {"ni": N_I.T},
+            {"ni": N_I[:5]},
             {},
-            r"n_i must fit the grid: the file has shape \(3, 4, 6\) and the grid .*'time': 6",
+            r"n_i must fit the grid: the file has shape \(5, 4, 3\) and the grid .*'time': 6",
         ),
         (
             {},
             {"variables": {"n_i": Variable("ni", "m^-3", ["time", "r", "z"])}},
-            r"dims given: \['time', 'r', 'z'\]; give its dims in the order of the file",
+            r"dims given: \['time', 'r', 'z'\]; give data.variables.n_i.dims in the order",
         ),
         (
             {},

@@ -95,5 +95,5 @@ def test_libraries_over_other_variables_do_not_join() -> None:
 def test_repeated_variables_are_refused() -> None:
     with pytest.raises(ValueError, match="variables must be unique"):
         Library(["x", "x"], np.array([[1, 0]]))
-    with pytest.raises(ValueError, match="degree must be zero or more"):
+    with pytest.raises(ValueError, match="degree must be a whole number"):
         polynomial(["x"], degree=-1)

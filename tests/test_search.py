@@ -220,7 +220,7 @@ def test_culling_everything_is_refused() -> None:
         (lambda: AdaptiveLasso(max_terms=0), "max_terms must be at least 1"),
         (lambda: STLSQ(lowest=1.0, highest=0.5), "0 < lowest < highest"),
         (lambda: BestSubset(n_best=0), "n_best must be at least 1"),
-        (lambda: Bootstraps(n=-1), "must not be negative"),
+        (lambda: Bootstraps(n=-1), "n must be a whole number, zero or more: -1"),
         (lambda: Bootstraps(smallest=0.0), "0 < smallest <= largest"),
     ],
 )

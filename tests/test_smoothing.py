@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ep2sindy.smoothing import NoSmoothing, SavitzkyGolay, difference
-from ep2sindy.spectrum import dominant_frequency, power_spectrum
+from ep2sindy.spectrum import dominant_frequency, frequency_text, power_spectrum
 
 EQUAL = np.linspace(0.0, 2.0, 41)
 UNEQUAL = EQUAL + 0.02 * np.sin(9.0 * EQUAL)
@@ -74,3 +74,8 @@ def test_spectrum_integrates_to_the_variance() -> None:
     t = np.arange(2000) * 1e-3
     frequency, power = power_spectrum(t, 3.0 * np.sin(2 * np.pi * 50.0 * t))
     assert np.sum(power) * frequency[1] == pytest.approx(4.5, rel=1e-3)
+
+
+def test_frequencies_read_in_their_own_prefix() -> None:
+    texts = [frequency_text(f) for f in (14103.0, 0.0531, 2.5e6, 3.0, 0.0, float("nan"))]
+    assert texts == ["14.1 kHz", "53.1 mHz", "2.5 MHz", "3 Hz", "0 Hz", "-"]

@@ -66,3 +66,10 @@ def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     assert kept(tmp_path) == []
+
+
+def test_a_cache_that_cannot_be_written_costs_no_simulation(tmp_path, monkeypatch):
+    (tmp_path / "taken").write_text("a file")
+    monkeypatch.setattr(cache, "simulate", lambda *_, **__: pytest.fail("simulated in vain"))
+    with pytest.raises(OSError, match="a folder they can be kept in.*choose another cache"):
+        simulate_cached(Thruster(), POINT, cache=tmp_path / "taken", **BRIEF)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,15 +35,25 @@ class LibraryCase:
 class Integrated:
     """A model, its run from the first sample of the data, and how far it strays.
 
-    frequency_Hz: dominant frequency of each state of the rollout.
+    frequency_Hz: dominant frequency of each state of the rollout; NaN where it diverged, or where
+    the state died out: less than a tenth of the data's spread in the second half.
     nrmse: root mean square error over the rollout, in standard deviations of the data, RMS
-    over the states. Both are NaN for a diverged rollout.
+    over the states; NaN where it diverged. A constant at the mean scores 1.
     """
 
     model: SparseModel
     rollout: Rollout
     frequency_Hz: Mapping[str, float]
     nrmse: float
+
+    @property
+    def verdict(self) -> str:
+        """One word or two on the trajectory."""
+        if self.rollout.diverged:
+            return f"diverges at {self.rollout.t[-1]:.3g} s"
+        if np.isnan(list(self.frequency_Hz.values())).any():
+            return "dies out"
+        return "oscillates" if self.nrmse >= 1.0 else "follows the data"
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +112,7 @@ def compare_libraries(
 def integrate(model: SparseModel, run: Trajectory, n_samples: int) -> Integrated:
     """Run a model over the first samples of the data, and compare."""
     rollout = model.rollout(run, n_samples=n_samples)
-    return Integrated(model, rollout, _frequencies(rollout, model.states), _nrmse(rollout, run))
+    return Integrated(model, rollout, _frequencies(model, rollout, run), _nrmse(rollout, run))
 
 
 def _integrate_refitted(
@@ -132,13 +142,13 @@ def samples_in(run: Trajectory, duration_s: float) -> int:
     return n
 
 
-def _frequencies(rollout: Rollout, names: Sequence[str]) -> dict[str, float]:
-    if rollout.diverged:
-        return dict.fromkeys(names, float("nan"))
-    return {
-        name: dominant_frequency(rollout.t, column)
-        for name, column in zip(names, rollout.states.T, strict=True)
-    }
+def _frequencies(model: SparseModel, rollout: Rollout, run: Trajectory) -> dict[str, float]:
+    found = {}
+    for name, column in zip(model.states, rollout.states.T, strict=True):
+        alive = column[len(column) // 2 :].std() > 0.1 * run.columns([name]).std()
+        steady = alive and not rollout.diverged
+        found[name] = dominant_frequency(rollout.t, column) if steady else float("nan")
+    return found
 
 
 def _nrmse(rollout: Rollout, run: Trajectory) -> float:

@@ -41,6 +41,13 @@ def simulate_cached(
             return read(path)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             tqdm.write(f"{path} cannot be read ({error}); simulating it again")
+    try:  # now, not after the simulation
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(
+            f"simulations need a folder they can be kept in: {path.parent} failed with "
+            f"{error.strerror!r}; choose another cache"
+        ) from error
     field = simulate(
         thruster,
         operating_point,
