@@ -11,7 +11,6 @@ import json
 import math
 import platform
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -147,19 +146,19 @@ def write_tensorboard(
     folder: Path,
     *,
     figures: Mapping[str, Figure],
-    scalars: Mapping[str, float],
     texts: Mapping[str, str],
     hparams: Mapping[str, Any],
     metrics: Mapping[str, float],
 ) -> None:
-    """One event file; hyper-parameters and metrics are for comparing runs, so keep their keys."""
+    """Figures, equations, and the metrics of one run beside the settings that led to them.
+
+    Runs are compared by the keys of hparams and metrics: keep them fixed.
+    """
     from torch.utils.tensorboard import SummaryWriter  # PyTorch takes seconds to import
 
     with SummaryWriter(folder) as writer:
         for name, figure in figures.items():
             writer.add_figure(name, figure)
-        for name, value in scalars.items():
-            writer.add_scalar(name, value)
         for name, text in texts.items():
             writer.add_text(name, text)
         writer.add_hparams(dict(hparams), dict(metrics), run_name=".")
@@ -241,7 +240,3 @@ def _without_nan(content: Any) -> Any:
     if isinstance(content, float) and not math.isfinite(content):
         return None
     return content
-
-
-def command_line() -> list[str]:
-    return [Path(sys.argv[0]).stem, *sys.argv[1:]]

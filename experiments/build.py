@@ -1,6 +1,7 @@
 """From config to values: what several experiments share."""
 
 import inspect
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -11,7 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.library import Library, polynomial
-from ep2sindy.report import RunFolder, Screen, command_line
+from ep2sindy.report import RunFolder, Screen
 
 
 @contextmanager
@@ -20,7 +21,9 @@ def started_run(config: DictConfig) -> Iterator[tuple[RunFolder, Screen]]:
     check_config(config)
     folder = RunFolder.create(Path(config.output), config.experiment, now=datetime.now())
     folder.write_text("config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    folder.write_provenance(seed=config.seed, command=command_line())
+    folder.write_provenance(
+        seed=config.seed, command=["python", "-m", "experiments.run", *sys.argv[1:]]
+    )
     screen = Screen(folder.path / "run.log")
     try:
         yield folder, screen

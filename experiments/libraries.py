@@ -98,7 +98,6 @@ def _write(
     write_tensorboard(
         folder.path / "tensorboard",
         figures=figures,
-        scalars=_scalars(summary),
         texts={n: f"    {r.discovery.model.text()}" for n, r in outcome.results.items()},
         hparams=_hparams(config),
         metrics=_scalars(summary),

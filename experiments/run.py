@@ -27,11 +27,11 @@ def main(config: DictConfig) -> None:
     except KeyboardInterrupt:
         sys.exit("interrupted: files under their final names are whole")
     except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
-        sys.exit(f"error: {_innermost(error)}")
+        sys.exit(f"error: {innermost(error)}")
     print(folder)
 
 
-def _innermost(error: BaseException) -> BaseException:
+def innermost(error: BaseException) -> BaseException:
     """Hydra wraps what a constructor raised; the user needs the constructor's own words."""
     while isinstance(error, HydraException) and error.__cause__ is not None:
         error = error.__cause__

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 import xarray as xr
 from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from ep2sindy.io import write_field
 from ep2sindy.model import SparseModel
 from experiments import libraries
+from experiments.run import innermost
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"))
@@ -216,26 +219,51 @@ def test_the_last_line_names_the_run_folder(predator_prey: Path, tmp_path: Path)
     [
         ([], "error: choose an experiment with +exp=NAME; there are breathing"),
         (["+exp=breathing", "sede=1"], "Could not override 'sede'"),
-        (["+exp=breathing", "+search.max_term=3"], "unexpected keyword argument 'max_term'"),
-        (["+exp=breathing", "selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+exp=breathing", "data=file", "data.path=none.nc"], "error: no such file: "),
-        (["+exp=breathing", "+libraries.simple.degre=3"], "libraries.simple may have"),
-        (["+exp=discover"], "trajectory.states"),
-        (["+exp=breathing", "+seeds=1"], "error: unknown keys ['seeds']; there are "),
-        (["+exp=breathing", "seed=abc"], "error: seed must be a whole number"),
-        (["+exp=breathing", "rollout_s=-1"], "error: rollout_s must be a positive number"),
-        (
-            ["+exp=breathing", "prepare=[{_target_:ep2sindy.prepare.crop,start:1}]"],
-            "error: prepare[0], crop: got an unexpected keyword argument 'start'",
-        ),
-        (["+exp=breathing", "output=Makefile"], "choose another with output=PATH"),
     ],
 )
 def test_mistakes_end_in_one_clear_message(
     overrides: list[str], message: str, tmp_path: Path
 ) -> None:
-    output = [] if any(o.startswith("output=") for o in overrides) else [f"output={tmp_path}"]
-    result = run_program(*overrides, *output)
+    result = run_program(*overrides, f"output={tmp_path}")
     assert result.returncode != 0
     assert message in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+search.max_term=3"], "unexpected keyword argument 'max_term'"),
+        (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
+        (["+libraries.simple.degre=3"], "libraries.simple may have"),
+        (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
+        (["+seeds=1"], "unknown keys ['seeds']; there are "),
+        (["seed=abc"], "seed must be a whole number"),
+        (["rollout_s=-1"], "rollout_s must be a positive number"),
+        (["trajectory.zone.z=[0.5,0.6]"], "a zone must hold grid points"),
+        (["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this field has"),
+        (["bootstraps.n_culled=6"], "n_culled must leave a term: 6 of 6 would go"),
+        (
+            ["prepare=[{_target_:ep2sindy.prepare.crop,start:1}]"],
+            "prepare[0], crop: got an unexpected keyword argument 'start'",
+        ),
+        (["output=Makefile"], "choose another with output=PATH"),
+        (["~trajectory.states", "+trajectory.states=???"], "trajectory.states"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(
+    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
+) -> None:
+    config = composed(*breathing(predator_prey, tmp_path), *overrides)
+    with pytest.raises((ValueError, OSError, HydraException, OmegaConfBaseException)) as caught:
+        libraries.run(config)
+    assert message in str(innermost(caught.value))
+
+
+def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:
+    config = composed(*breathing(predator_prey, tmp_path), "bootstraps.n_culled=6")
+    with pytest.raises(ValueError, match="n_culled"):
+        libraries.run(config)
+    (folder,) = (tmp_path / "breathing").iterdir()
+    assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
