@@ -21,6 +21,7 @@ lint: .venv/installed
 test: lint
 	$(BIN)/python -m pytest -q -m "not slow"
 
+# EP2SINDY_DATA=folder adds the checks against files that are not shipped.
 test-slow: lint
 	$(BIN)/python -m pytest -q
 

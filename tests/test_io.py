@@ -1,4 +1,5 @@
 import json
+import os
 from pathlib import Path
 
 import h5py
@@ -481,7 +482,7 @@ def test_the_config_group_takes_a_step_instead_of_time(tmp_path: Path) -> None:
     assert field["time"].values[-1] == 1.5e-6 * (NT - 1)
 
 
-REAL = ROOT.parent / "shared" / "data" / "thruster_2d_300V_5mgs.npz"
+REAL = Path(os.environ.get("EP2SINDY_DATA", ".")) / "thruster_2d_300V_5mgs.npz"
 
 
 @pytest.mark.slow
