@@ -28,6 +28,7 @@ test-slow: lint
 benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.search
 	$(BIN)/python -m benchmarks.simulator
+	$(BIN)/python -m benchmarks.operating_points
 
 clean:
 	rm -rf .venv .cache .mypy_cache .ruff_cache .pytest_cache

@@ -121,10 +121,7 @@ def lasso_supports(xx, xy, max_terms):
     level = np.abs(xy).max() if n_terms else 0.0
     floor = 1e-13 * level
     while level > floor and n_masks < limit:
-        drift = np.zeros(n_terms)
-        for i in range(n_active):
-            for j in range(n_terms):
-                drift[j] += xx[j, active[i]] * slope[i]
+        drift = _drift(xx, slope, active, n_active)
         if left >= 0:
             barred[left] = True  # at this very knot it would come straight back
         step, term, joins = _next_event(
@@ -146,8 +143,7 @@ def lasso_supports(xx, xy, max_terms):
             n_active = _leave(active, n_active, term)
             coef[term] = 0.0
             left = term
-        for i in range(n_active):
-            signs[active[i]] = np.sign(correlation[active[i]])
+        signs[active[:n_active]] = np.sign(correlation[active[:n_active]])
         if not _solve(xx, signs, active, n_active, slope):
             barred[term] = True  # it repeats what is active: the path goes on without it
             n_active = _leave(active, n_active, term)
@@ -155,11 +151,19 @@ def lasso_supports(xx, xy, max_terms):
             continue
         if n_active > max_terms:
             break
-        masks[n_masks] = False
-        for i in range(n_active):
-            masks[n_masks, active[i]] = True
+        masks[n_masks, active[:n_active]] = True
         n_masks += 1
     return masks[:n_masks]
+
+
+@njit(cache=True)
+def _drift(xx, slope, active, n_active):
+    """How fast each term's correlation falls along the path."""
+    drift = np.zeros(len(xx))
+    for i in range(n_active):
+        for j in range(len(xx)):
+            drift[j] += xx[j, active[i]] * slope[i]
+    return drift
 
 
 @njit(cache=True)
@@ -258,8 +262,7 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
     depth = min(max_terms, n_terms)
     levels = np.zeros((depth + 1, size, size))
     levels[0, :n_terms, :n_terms] = xx
-    levels[0, :n_terms, n_terms] = xy
-    levels[0, n_terms, :n_terms] = xy
+    levels[0, :n_terms, n_terms], levels[0, n_terms, :n_terms] = xy, xy
     levels[0, n_terms, n_terms] = yy
     diagonal = np.diag(xx).copy()
     scratch = np.empty((size, size))

@@ -51,7 +51,7 @@ def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
 
 
 def frequency_text(frequency_Hz: float) -> str:
-    """`14.10 kHz`, `53.1 mHz`; a dash for none."""
+    """`14.1 kHz`, `53.1 mHz`; a dash for none."""
     if np.isnan(frequency_Hz):
         return "-"
     factor, prefix = prefixed(frequency_Hz)

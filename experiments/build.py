@@ -36,7 +36,7 @@ def started_run(config: DictConfig) -> Iterator[tuple[RunFolder, Screen]]:
 
 TOP_KEYS = {
     "data", "formulation", "search", "bootstraps", "selection", "experiment", "study", "seed",
-    "output", "prepare", "trajectory", "libraries", "rollout_s", "figures", "thesis", "thesis_knee",
+    "output", "prepare", "trajectory", "libraries", "rollout_s", "figures", "thesis",
 }  # fmt: skip
 
 

@@ -12,10 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy import plots
 from ep2sindy.model import equation_text
-from ep2sindy.report import (
-    RunFolder,
-    write_tensorboard,
-)
+from ep2sindy.report import RunFolder, write_tensorboard
+from ep2sindy.smoothing import Smoother
 from ep2sindy.spectrum import dominant_frequency
 from ep2sindy.studies.libraries import (
     Integrated,
@@ -46,7 +44,7 @@ def run(config: DictConfig) -> Path:
     """Discover, integrate, compare; everything lands in a new run folder."""
     with started_run(config) as (folder, screen):
         # Everything but the data is built first: a misspelt key must not cost a simulation.
-        settings = {
+        settings: dict[str, Any] = {
             "formulation": instantiate(config.formulation),
             "search": instantiate(config.search),
             "bootstraps": instantiate(config.bootstraps),
@@ -72,7 +70,7 @@ def run(config: DictConfig) -> Path:
         results = compare_libraries(data, cases, **settings)
         outcome = Outcome(config.experiment, data, results)
         print_outcome(screen, outcome)
-        figures = _figures(outcome, config)
+        figures = _figures(outcome, settings["formulation"].smoother, config.figures)
         _write(folder, config, outcome, figures)
     return folder.path
 
@@ -121,12 +119,11 @@ def _rollout_table(run: Trajectory, integrated: Integrated) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _figures(outcome: Outcome, config: DictConfig) -> dict[str, Figure]:
+def _figures(outcome: Outcome, smoother: Smoother, shown: DictConfig) -> dict[str, Figure]:
     run, results = outcome.run, outcome.results
     span_s = float(run.t[-1] - run.t[0])
-    duration_s = config.figures.duration_s or span_s
-    f_max_Hz = config.figures.f_max_Hz or 0.5 / run.dt_s
-    smoother = instantiate(config.formulation).smoother
+    duration_s = shown.duration_s or span_s
+    f_max_Hz = shown.f_max_Hz or 0.5 / run.dt_s
     models = {name: r.selected.model for name, r in results.items()}
     rollouts = {name: r.selected.rollout for name, r in results.items()}
     published = {n: r.published.rollout for n, r in results.items() if r.published is not None}

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import compress
 
 import numpy as np
 import pandas as pd
 
+from ep2sindy.ambiguity import usable_terms
 from ep2sindy.discover import Discovery, discover
 from ep2sindy.library import Library
 from ep2sindy.model import Rollout, SparseModel, assemble_model, equation_text
@@ -22,8 +24,8 @@ from ep2sindy.trajectory import Trajectory
 class LibraryCase:
     """One library, the rule that selects from its fronts, and published equations if any.
 
-    published: state -> term -> SI coefficient; where the library has its terms, they are fitted
-    to the data as well.
+    published: state -> term -> SI coefficient; where the library has its terms, and the data can
+    tell them from others, they are fitted as well.
     """
 
     library: Library
@@ -94,10 +96,11 @@ def compare_libraries(
             selection=case.selection,
             rng=stream,
         )
+        at_hand = set(compress(case.library.names, usable_terms(discovery.problem)))
         refitted = {
             state: fit_support(discovery.problem, state, list(terms))
             for state, terms in case.published.items()
-            if state in run.state_names and set(terms) <= set(case.library.names)
+            if state in run.state_names and set(terms) <= at_hand
         }
         results[name] = LibraryResult(
             case=case,
