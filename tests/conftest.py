@@ -7,14 +7,14 @@ from jaxtyping import install_import_hook
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 # Compiled by numba, which cannot look inside a checking wrapper.
-COMPILED = "kernels"
+COMPILED = ("kernels", "kalman_kernels")
 
 
 def checked_modules() -> list[str]:
     """Every module of the package but the compiled ones; hooking a package hooks all below it."""
     names = [m.name for m in pkgutil.walk_packages([str(PACKAGE)], prefix="ep2sindy.")]
     packages = {n for n in names if any(other.startswith(n + ".") for other in names)}
-    return [n for n in names if n not in packages and n.rsplit(".", 1)[-1] != COMPILED]
+    return [n for n in names if n not in packages and n.rsplit(".", 1)[-1] not in COMPILED]
 
 
 install_import_hook(checked_modules(), "beartype.beartype")

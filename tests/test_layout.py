@@ -20,6 +20,8 @@ ORDER = [
     "thruster",
     "prepare",
     "smoothing",
+    "kalman_kernels",
+    "kalman",
     "library",
     "regression",
     "ambiguity",

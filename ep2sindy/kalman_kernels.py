@@ -1,0 +1,257 @@
+"""Compiled Kalman smoother of the twice integrated Wiener process, exact from diffuse beginnings.
+
+In every kernel steps: (samples - 1,) are time steps of order one, values: (samples, columns).
+The state at a sample is (signal, slope, bend); its third derivative is white noise of density
+`ratio` where the measurement noise has variance one. All columns share one ratio, so the gains,
+which do not depend on the values, are worked out once.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+# Values scaled to unit range carry rounding of this variance: less noise cannot be told apart.
+ROUNDING = np.finfo(np.float64).eps ** 2
+
+
+class Gains(NamedTuple):
+    """What the filter weighs with, once for all columns.
+
+    parabola: (3, 3), from the first three samples to the state at the third.
+    gain: (samples, 3); variance: (samples,) of the innovations; both from the fourth sample on.
+    slope_cov: (samples, 3), covariance of the slope at a sample with the state there, given the
+    samples so far; at the first two samples with the state at the third.
+    """
+
+    parabola: np.ndarray
+    gain: np.ndarray
+    variance: np.ndarray
+    slope_cov: np.ndarray
+
+
+@njit(cache=True)
+def _parabola(h1, h2):
+    """State at the third sample of the parabola through the first three."""
+    both = h1 + h2
+    return np.array(
+        [
+            [0.0, 0.0, 1.0],
+            [h2 / (both * h1), -both / (h2 * h1), (both + h2) / (both * h2)],
+            [2.0 / (both * h1), -2.0 / (h2 * h1), 2.0 / (both * h2)],
+        ]
+    )
+
+
+@njit(cache=True)
+def _signal_cov(a, b):
+    """Covariance of a process of unit density, `a` and `b` after it left a known parabola."""
+    low, lag = min(a, b), abs(a - b)
+    return low**5 / 20.0 + lag * low**4 / 8.0 + lag**2 * low**3 / 12.0
+
+
+@njit(cache=True)
+def _slope_signal_cov(a, b):
+    """Derivative of `_signal_cov` by its first argument."""
+    if a <= b:
+        return a**4 / 8.0 + (b - a) * a**3 / 3.0 + (b - a) ** 2 * a**2 / 4.0
+    return b**4 / 8.0 + (a - b) * b**3 / 6.0
+
+
+@njit(cache=True)
+def _start(steps, ratio):
+    """Begin at the third sample, where three samples first determine the state.
+
+    Looking back from there, the signal leaves the state's own parabola as a process of the
+    same law; with the measurement noise that is all the three samples can err by. Returns the
+    parabola, the state's covariance as L D L', (3,) and (3,), and the first rows of slope_cov.
+    """
+    ages = np.array([steps[0] + steps[1], steps[1], 0.0])
+    parabola = _parabola(steps[0], steps[1])
+    # Errors of the first two samples, as two independent ones; the third errs by noise alone.
+    first = 1.0 + ratio * _signal_cov(ages[0], ages[0])
+    shared = ratio * _signal_cov(ages[0], ages[1]) / first
+    second = 1.0 + ratio * (_signal_cov(ages[1], ages[1]) - shared * _signal_cov(ages[0], ages[1]))
+    a1, b1 = parabola[1, 0] + shared * parabola[1, 1], parabola[1, 1]
+    a2, b2 = parabola[2, 0] + shared * parabola[2, 1], parabola[2, 1]
+    d1 = first * a1 * a1 + second * b1 * b1
+    l10, l20, l21 = parabola[1, 2], parabola[2, 2], (first * a1 * a2 + second * b1 * b2) / d1
+    a2, b2 = a2 - l21 * a1, b2 - l21 * b1
+    d2 = first * a2 * a2 + second * b2 * b2
+    slope_row = np.array([l10, l10 * l10 + d1, l10 * l20 + l21 * d1])
+    bend_row = np.array([l20, slope_row[2], l20 * l20 + l21 * l21 * d1 + d2])
+    slope_cov = np.empty((3, 3))
+    for k in range(3):
+        slope_cov[k] = slope_row - ages[k] * bend_row
+        for i in range(3):
+            slope_cov[k] += ratio * _slope_signal_cov(ages[k], ages[i]) * parabola[:, i]
+    return parabola, (l10, l20, l21), (1.0, d1, d2), slope_cov
+
+
+@njit(cache=True)
+def _predict(h, ratio, lower, diagonal):
+    """F P F' + Q over a step h, from and to P = L D L', by weighted Gram-Schmidt.
+
+    Nothing is subtracted but projections, so samples far closer together than the mean step
+    cost few digits; F P F' itself would lose them all (Bierman 1977, Factorization Methods for
+    Discrete Sequential Estimation).
+    """
+    (l10, l20, l21), (d0, d1, d2) = lower, diagonal
+    half, rate = 0.5 * h * h, 1.0 / h
+    # Entries 0, 1, 2 of the columns a, b, c of F L, and of the columns of Q = L D L' too:
+    # (1, e1, e2) of weight e, (0, 1, f2) of weight f, (0, 0, 1) of weight `last`.
+    a0, b0, c0 = 1.0 + h * l10 + half * l20, h + half * l21, half
+    a1, b1, c1, e1 = l10 + h * l20, 1.0 + h * l21, h, 2.5 * rate
+    a2, b2, c2, e2, f2 = l20, l21, 1.0, 10.0 / 3.0 * rate * rate, 4.0 * rate
+    last = ratio * h / 9.0
+    f = ratio * h * h * h / 48.0
+    e = f * h * h * 2.4
+    new0 = d0 * a0 * a0 + d1 * b0 * b0 + d2 * c0 * c0 + e
+    l10 = (d0 * a0 * a1 + d1 * b0 * b1 + d2 * c0 * c1 + e * e1) / new0
+    l20 = (d0 * a0 * a2 + d1 * b0 * b2 + d2 * c0 * c2 + e * e2) / new0
+    a1, b1, c1, e1 = a1 - l10 * a0, b1 - l10 * b0, c1 - l10 * c0, e1 - l10
+    a2, b2, c2, e2 = a2 - l20 * a0, b2 - l20 * b0, c2 - l20 * c0, e2 - l20
+    new1 = d0 * a1 * a1 + d1 * b1 * b1 + d2 * c1 * c1 + e * e1 * e1 + f
+    l21 = (d0 * a1 * a2 + d1 * b1 * b2 + d2 * c1 * c2 + e * e1 * e2 + f * f2) / new1
+    a2, b2, c2 = a2 - l21 * a1, b2 - l21 * b1, c2 - l21 * c1
+    e2, f2 = e2 - l21 * e1, f2 - l21
+    new2 = d0 * a2 * a2 + d1 * b2 * b2 + d2 * c2 * c2 + e * e2 * e2 + f * f2 * f2 + last
+    return (l10, l20, l21), (new0, new1, new2)
+
+
+@njit(cache=True)
+def gains(steps, ratio):
+    """Run the filter's covariances over all samples."""
+    n_samples = len(steps) + 1
+    gain, variance = np.zeros((n_samples, 3)), np.ones(n_samples)
+    slope_cov = np.empty((n_samples, 3))
+    parabola, lower, diagonal, slope_cov[:3] = _start(steps, ratio)
+    for k in range(3, n_samples):
+        lower, (d0, d1, d2) = _predict(steps[k - 1], ratio, lower, diagonal)
+        l10, l20, l21 = lower
+        variance[k] = d0 + 1.0
+        d0 /= variance[k]  # a measured signal changes nothing else of L D L'
+        diagonal = (d0, d1, d2)
+        gain[k, 0], gain[k, 1], gain[k, 2] = d0, l10 * d0, l20 * d0
+        slope_cov[k, 0] = l10 * d0
+        slope_cov[k, 1] = l10 * l10 * d0 + d1
+        slope_cov[k, 2] = l10 * l20 * d0 + l21 * d1
+    return Gains(parabola, gain, variance, slope_cov)
+
+
+@njit(cache=True)
+def _filtered(steps, values, known):
+    """Innovations, and the slopes as far as the samples up to each one tell."""
+    n_samples, n_columns = values.shape
+    innovation, slope = np.empty((n_samples, n_columns)), np.empty((n_samples, n_columns))
+    state = np.zeros((3, n_columns))
+    for a in range(3):
+        for i in range(3):
+            for j in range(n_columns):
+                state[a, j] += known.parabola[a, i] * values[i, j]
+    signals, slopes, bends = state[0], state[1], state[2]
+    for j in range(n_columns):
+        slope[0, j] = slopes[j] - (steps[0] + steps[1]) * bends[j]
+        slope[1, j] = slopes[j] - steps[1] * bends[j]
+        slope[2, j] = slopes[j]
+        innovation[0, j] = innovation[1, j] = innovation[2, j] = 0.0
+    for k in range(3, n_samples):
+        h = steps[k - 1]
+        g0, g1, g2 = known.gain[k, 0], known.gain[k, 1], known.gain[k, 2]
+        for j in range(n_columns):
+            turned = slopes[j] + h * bends[j]
+            predicted = signals[j] + 0.5 * h * (slopes[j] + turned)
+            missed = values[k, j] - predicted
+            innovation[k, j] = missed
+            signals[j] = predicted + g0 * missed
+            slopes[j] = turned + g1 * missed
+            bends[j] += g2 * missed
+            slope[k, j] = slopes[j]
+    return innovation, slope
+
+
+@njit(cache=True)
+def likelihood(steps, values, ratio):
+    """Log-likelihood (columns,) of the samples after the third, and the noise variance at it.
+
+    The variance (columns,) of the measurement noise is profiled out; a constant that depends on
+    neither values nor ratio is left out.
+    """
+    known = gains(steps, ratio)
+    innovation, _ = _filtered(steps, values, known)
+    n_samples, n_columns = values.shape
+    total, log_variance = np.zeros(n_columns), 0.0
+    for k in range(3, n_samples):
+        weight = 1.0 / known.variance[k]
+        log_variance += np.log(known.variance[k])
+        for j in range(n_columns):
+            total[j] += weight * innovation[k, j] ** 2
+    noise = np.maximum(total / (n_samples - 3), ROUNDING)
+    return -0.5 * ((n_samples - 3) * np.log(noise) + log_variance), noise
+
+
+@njit(cache=True)
+def smoothed(steps, values, ratio):
+    """Signal and slope per unit time, both (samples, columns), given all samples.
+
+    The signal is the values less the smoothed measurement noise, so no filtered state need be
+    kept (Durbin & Koopman 2012, section 4.5).
+    """
+    known = gains(steps, ratio)
+    innovation, slope = _filtered(steps, values, known)
+    n_samples, n_columns = values.shape
+    signal = innovation  # row k is read before it is written
+    later = np.zeros((3, n_columns))  # what later samples say about the state, as a gradient
+    r0, r1, r2 = later[0], later[1], later[2]
+    for k in range(n_samples - 1, 2, -1):
+        h, weight = steps[k - 1], 1.0 / known.variance[k]
+        g0, g1, g2 = known.gain[k, 0], known.gain[k, 1], known.gain[k, 2]
+        c0, c1, c2 = known.slope_cov[k, 0], known.slope_cov[k, 1], known.slope_cov[k, 2]
+        for j in range(n_columns):
+            slope[k, j] += c0 * r0[j] + c1 * r1[j] + c2 * r2[j]
+            noise = weight * innovation[k, j] - (g0 * r0[j] + g1 * r1[j] + g2 * r2[j])
+            signal[k, j] = values[k, j] - noise
+            r0[j] += noise
+            turned = r1[j] + 0.5 * h * r0[j]
+            r1[j] += h * r0[j]
+            r2[j] += h * turned
+    for k in range(3):
+        for j in range(n_columns):
+            signal[k, j] = values[k, j]
+            for a in range(3):
+                slope[k, j] += known.slope_cov[k, a] * later[a, j]
+                signal[k, j] += known.parabola[a, k] * later[a, j]
+    return signal, slope
+
+
+@njit(cache=True)
+def leverage(steps, ratio):
+    """Diagonal (samples,) of the smoother as a matrix: variance of the signal given all samples."""
+    known = gains(steps, ratio)
+    n_samples = len(steps) + 1
+    diagonal = np.ones(n_samples)
+    n00 = n01 = n02 = n11 = n12 = n22 = 0.0  # variance of `later` in `smoothed`
+    for k in range(n_samples - 1, 2, -1):
+        h = steps[k - 1]
+        half = 0.5 * h * h
+        g0, g1, g2 = known.gain[k, 0], known.gain[k, 1], known.gain[k, 2]
+        w0 = n00 * g0 + n01 * g1 + n02 * g2
+        w1 = n01 * g0 + n11 * g1 + n12 * g2
+        w2 = n02 * g0 + n12 * g1 + n22 * g2
+        noise = 1.0 / known.variance[k] + g0 * w0 + g1 * w1 + g2 * w2
+        diagonal[k] -= noise
+        n00 += noise - 2.0 * w0
+        n01 -= w1
+        n02 -= w2
+        # F' N F.
+        a01, a02 = n01 + h * n00, n02 + h * n01 + half * n00
+        b12 = n12 + h * n11 + half * n01
+        n22 += h * n12 + half * n02 + h * b12 + half * a02
+        n12, n11 = b12 + h * a02, n11 + h * n01 + h * a01
+        n01, n02 = a01, a02
+    later = np.array([[n00, n01, n02], [n01, n11, n12], [n02, n12, n22]])
+    for k in range(3):
+        for a in range(3):
+            for b in range(3):
+                diagonal[k] -= known.parabola[a, k] * later[a, b] * known.parabola[b, k]
+    return diagonal
