@@ -30,6 +30,7 @@ ORDER = [
     "model",
     "systems",
     "discover",
+    "estimators",
     "studies",
     "plots",
     "report",
