@@ -67,7 +67,7 @@ def coefficient_ratios(field: xr.Dataset, case: tuple[str, tuple[float, float]])
     )
     names = dict.fromkeys(name for _, terms in EQUATIONS for name in terms)
     every_row = Differential(split=RandomSplit(test_fraction=0.0))
-    problem = every_row.assemble(
+    (problem,) = every_row.assemble(
         [run], named_terms(run.names, list(names)), rng=np.random.default_rng(0)
     )
     ratios = []

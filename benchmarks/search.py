@@ -90,7 +90,8 @@ def main() -> None:
 
     def fresh() -> Regression:
         # A new value each time, so that no cached Gram matrix flatters us.
-        return Differential().assemble([data], library, rng=np.random.default_rng(1))
+        (problem,) = Differential().assemble([data], library, rng=np.random.default_rng(1))
+        return problem
 
     with threadpool_limits(limits=1):
         assembly_s = cpu_s(fresh, n_runs=9)

@@ -6,22 +6,30 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from ep2sindy.ambiguity import Ambiguity, ambiguities
+from ep2sindy.errors_in_variables import reweighted
 from ep2sindy.library import Library
 from ep2sindy.model import SparseModel, assemble_model
-from ep2sindy.pareto import Knee, ParetoFront, pareto_front
-from ep2sindy.regression import Differential, Regression
+from ep2sindy.pareto import Candidate, ParetoFront, pareto_front
+from ep2sindy.regression import Formulation
 from ep2sindy.search import Bootstraps, Search, pooled_supports
+from ep2sindy.selection import Selection, selected
 from ep2sindy.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """What a search leaves: its rows, a front per state, the selected model, what to beware of."""
+    """What a search leaves: per state a front, scores and the selected candidate; the model.
 
-    problem: Regression
+    scores: by state, one per candidate of its front, the lowest selected.
+    ambiguities: terms that these data cannot tell apart.
+    """
+
     fronts: Mapping[str, ParetoFront]
+    scores: Mapping[str, Float[np.ndarray, " candidates"]]
+    chosen: Mapping[str, Candidate]
     model: SparseModel
     ambiguities: Sequence[Ambiguity]
 
@@ -30,23 +38,34 @@ def discover(
     trajectories: Sequence[Trajectory],
     library: Library,
     *,
-    formulation: Differential,
+    formulation: Formulation,
     search: Search,
     bootstraps: Bootstraps,
-    selection: Knee,
+    selection: Selection,
+    depth: int = 1,
     rng: np.random.Generator,
 ) -> Discovery:
     """Find sparse equations for every state of the trajectories.
 
     Rows are assembled by `formulation`; `search` proposes supports in every bootstrap; each
-    support is fitted to all training rows; `selection` picks one per equation from the front.
+    support is fitted to all training rows, and the `depth` best of every size make the front;
+    `selection` picks one per equation. Where the formulation follows the noise of the samples
+    into the rows, the picked terms are fitted again with weights, and their covariance known.
     """
-    problem = formulation.assemble(trajectories, library, rng=rng)
-    supports = pooled_supports(problem, search, bootstraps, rng=rng)
-    fronts = {found.equation: pareto_front(problem, found) for found in supports}
+    problems = formulation.assemble(trajectories, library, rng=rng)
+    fronts = [
+        pareto_front(problem, found, depth=depth)
+        for problem in problems
+        for found in pooled_supports(problem, search, bootstraps, rng=rng)
+    ]
+    scores = selection.scores(fronts)
+    chosen = [selected(front, score) for front, score in zip(fronts, scores, strict=True)]
     model = assemble_model(
         library,
-        [selection.select(front) for front in fronts.values()],
+        [
+            candidate if front.problem.noisy is None else reweighted(front.problem, candidate)
+            for front, candidate in zip(fronts, chosen, strict=True)
+        ],
         units=trajectories[0].units,
         provenance={
             "formulation": repr(formulation),
@@ -56,4 +75,11 @@ def discover(
             "trajectories": ", ".join(run.label for run in trajectories),
         },
     )
-    return Discovery(problem, fronts, model, ambiguities(problem))
+    states = [front.equation for front in fronts]
+    return Discovery(
+        fronts=dict(zip(states, fronts, strict=True)),
+        scores=dict(zip(states, scores, strict=True)),
+        chosen=dict(zip(states, chosen, strict=True)),
+        model=model,
+        ambiguities=tuple(dict.fromkeys(a for problem in problems for a in ambiguities(problem))),
+    )

@@ -60,12 +60,7 @@ class Library:
     @cached_property
     def factors(self) -> Int[np.ndarray, "terms degree"]:
         """Indices of the variables multiplied in each term, padded with n_variables, meaning 1."""
-        degree = max(1, int(self.exponents.sum(axis=1).max()))
-        table = np.full((len(self), degree), len(self.variables))
-        for row, powers in zip(table, self.exponents, strict=True):
-            indices = np.repeat(np.arange(len(self.variables)), powers)
-            row[: len(indices)] = indices
-        return table
+        return _factor_table(self.exponents)
 
     def evaluate(self, values: Any) -> Any:
         """Evaluate every term at every sample.
@@ -73,12 +68,21 @@ class Library:
         values: (..., variables), a NumPy array or a torch tensor, in the order of `variables`.
         Returns (..., terms), of the same kind.
         """
+        return _products(values, self.factors)
+
+    def jacobian(self, values: Any) -> Any:
+        """Derivative of every term by every variable, at every sample.
+
+        values: as for `evaluate`. Returns (variables, ..., terms), of the same kind.
+        """
         xp = array_namespace(values)
-        padded = xp.concat([values, xp.ones_like(values[..., :1])], axis=-1)
-        theta = padded[..., self.factors[:, 0]]
-        for indices in self.factors.T[1:]:
-            theta = theta * padded[..., indices]
-        return theta
+        derivatives = []
+        for v in range(len(self.variables)):
+            powers = self.exponents[:, v]
+            lowered = self.exponents.copy()
+            lowered[:, v] = np.maximum(powers - 1, 0)
+            derivatives.append(_products(values, _factor_table(lowered)) * xp.asarray(1.0 * powers))
+        return xp.stack(derivatives)
 
     def index(self, name: str) -> int:
         """Position of a term; factors may come in any order. Raises ValueError if absent."""
@@ -97,6 +101,27 @@ class Library:
 
     def _factors_of(self, row: np.ndarray) -> list[str]:
         return [v if p == 1 else f"{v}^{p}" for v, p in zip(self.variables, row, strict=True) if p]
+
+
+def _factor_table(exponents: np.ndarray) -> np.ndarray:
+    """For every row of powers, the indices of its factors, padded with the number of variables."""
+    n_variables = exponents.shape[1]
+    degree = max(1, int(exponents.sum(axis=1).max()))
+    table = np.full((len(exponents), degree), n_variables)
+    for row, powers in zip(table, exponents, strict=True):
+        indices = np.repeat(np.arange(n_variables), powers)
+        row[: len(indices)] = indices
+    return table
+
+
+def _products(values: Any, factors: np.ndarray) -> Any:
+    """Multiply columns of `values` as a factor table says."""
+    xp = array_namespace(values)
+    padded = xp.concat([values, xp.ones_like(values[..., :1])], axis=-1)
+    theta = padded[..., factors[:, 0]]
+    for indices in factors.T[1:]:
+        theta = theta * padded[..., indices]
+    return theta
 
 
 def term_exponents(name: str, variables: Sequence[str]) -> Int[np.ndarray, " variables"]:

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
+from scipy.linalg import block_diag
+from scipy.special import ndtri
 
 from ep2sindy.files import write_text
 from ep2sindy.library import Library, named_terms
@@ -46,6 +48,8 @@ class SparseModel:
 
     coef: (terms, equations), zero outside the support. states: one name per equation.
     units: of the states and of the library's variables. provenance: where it came from.
+    covariance: (coefs, coefs) of the coefficients that are not zero, equation by equation and
+    within one in the order of the library, in SI; None where it is not known.
     """
 
     library: Library
@@ -53,6 +57,7 @@ class SparseModel:
     coef: Float[np.ndarray, "terms equations"]
     units: Mapping[str, str] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
+    covariance: Float[np.ndarray, "_ _"] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "states", tuple(self.states))
@@ -68,6 +73,14 @@ class SparseModel:
             )
         if not np.isfinite(self.coef).all():
             raise ValueError(f"coefficients must be finite: {self.coef.tolist()} came")
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", read_only(self.covariance))
+            n_coefs = int(np.count_nonzero(self.coef))
+            if self.covariance.shape != (n_coefs, n_coefs):
+                raise ValueError(
+                    "covariance must have a row and a column per coefficient that is not zero: "
+                    f"shape {self.covariance.shape} came for {n_coefs}"
+                )
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -78,6 +91,26 @@ class SparseModel:
         """Term name -> SI coefficient, of one equation, in the order of the library."""
         column = self.coef[:, self._equation(state)]
         return {n: float(c) for n, c in zip(self.library.names, column, strict=True) if c != 0.0}
+
+    def intervals(self, state: str, *, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Term name -> lower and upper bound of its coefficient, for Gaussian errors.
+
+        Raises ValueError for a model without covariance.
+        """
+        if self.covariance is None:
+            raise ValueError(
+                "intervals need a covariance: this model has none; discover it with the "
+                "formulation Weak"
+            )
+        used = self.coef.T != 0.0
+        std = np.zeros(used.shape)
+        std[used] = np.sqrt(np.diag(self.covariance))
+        row = self._equation(state)
+        reach = ndtri(0.5 + 0.5 * level) * std[row, used[row]]
+        return {
+            name: (value - r, value + r)
+            for (name, value), r in zip(self.terms(state).items(), reach.tolist(), strict=True)
+        }
 
     def derivative(
         self,
@@ -172,6 +205,7 @@ class SparseModel:
             "equations": {s: self.terms(s) for s in self.states},
             "units": dict(self.units),
             "provenance": dict(self.provenance),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
         }
         return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
@@ -184,9 +218,14 @@ class SparseModel:
                 raise ValueError(f"format {content['format']!r}")
             library = named_terms(content["variables"], content["library"])
             equations = content["equations"]
-            coef = coef_matrix(library, [equations[s] for s in content["states"]])
+            covariance = content.get("covariance")  # files of version 0.1 have none
             return SparseModel(
-                library, content["states"], coef, content["units"], content["provenance"]
+                library=library,
+                states=content["states"],
+                coef=coef_matrix(library, [equations[s] for s in content["states"]]),
+                units=content["units"],
+                provenance=content["provenance"],
+                covariance=None if covariance is None else _square(covariance),
             )
         except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
             raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
@@ -252,15 +291,21 @@ def assemble_model(
     units: Mapping[str, str],
     provenance: Mapping[str, str],
 ) -> SparseModel:
-    """Join one candidate per equation into a model."""
-    equations = [c.coef_by_term for c in candidates]
+    """Join one candidate per equation into a model, as if errors of equations were independent."""
+    blocks = [c.covariance for c in candidates if c.covariance is not None]
     return SparseModel(
         library=library,
         states=[c.equation for c in candidates],
-        coef=coef_matrix(library, equations),
+        coef=coef_matrix(library, [c.coef_by_term for c in candidates]),
         units=units,
         provenance=provenance,
+        covariance=block_diag(*blocks) if len(blocks) == len(candidates) else None,
     )
+
+
+def _square(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "_ _"]:
+    """Rows of a stored matrix, which may be empty."""
+    return np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
 
 
 def _ending(solution: object, blow_up: float) -> str:

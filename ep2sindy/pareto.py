@@ -1,9 +1,10 @@
-"""Selection: the Pareto front of error against number of terms, and its knee."""
+"""The Pareto front of error against number of terms."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,6 +21,7 @@ class Candidate:
     coef: (terms of the support,), in SI. r2_train, r2_test: 1 - SS_res/SS_tot with the data as
     truth. share: share of bootstraps that found this support. inclusion: for each of its
     terms, the share of bootstraps in which the term stood in a support of this size.
+    covariance: (support, support) of coef, in SI, where noise has been followed to it.
     """
 
     equation: str
@@ -29,6 +31,7 @@ class Candidate:
     r2_test: float
     share: float
     inclusion: Float[np.ndarray, " support"]
+    covariance: Float[np.ndarray, "support support"] | None = None
 
     @property
     def n_terms(self) -> int:
@@ -41,21 +44,22 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class ParetoFront:
-    """The best candidate of every size, the empty model first; the error falls with size.
+    """The best candidates of every size, the empty model first; the best error falls with size.
 
-    n_library: number of terms in the library.
+    Sorted by size, and within a size by error: the first of each size is the front proper, any
+    others are runners-up (see `pareto_front`). problem: the rows that they were fitted to.
     """
 
     equation: str
     candidates: Sequence[Candidate]
-    n_library: int
+    problem: Regression
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", tuple(self.candidates))
         assert self.candidates
         assert self.candidates[0].n_terms == 0
-        assert all(np.diff([c.n_terms for c in self.candidates]) > 0)
-        assert all(np.diff(self.errors) < 0)
+        assert all(np.diff([c.n_terms for c in self.candidates]) >= 0)
+        assert all(np.diff(self.errors[self.leading]) < 0)
 
     @property
     def errors(self) -> Float[np.ndarray, " candidates"]:
@@ -66,33 +70,14 @@ class ParetoFront:
     def sizes(self) -> Float[np.ndarray, " candidates"]:
         return np.array([float(c.n_terms) for c in self.candidates])
 
+    @property
+    def leading(self) -> Bool[np.ndarray, " candidates"]:
+        """Whether a candidate is the best of its size."""
+        return np.diff(self.sizes, prepend=-1.0) > 0
+
 
 def _score(candidate: Candidate) -> float:
     return candidate.r2_train if np.isnan(candidate.r2_test) else candidate.r2_test
-
-
-@dataclass(frozen=True)
-class Knee:
-    """Select the candidate closest to no error and no terms.
-
-    distance = sqrt((1 - R2)^2 + (n_terms / n_norm)^2), where n_norm is the number of terms in
-    the library (the thesis's Eq. 9), or for "max_terms" the largest candidate's plus one (what
-    the thesis's Tables II and III were made with). Any term that raises R2 by less than about
-    one step of n_terms / n_norm is dropped, by construction.
-    """
-
-    n_norm: str = "library"
-
-    def __post_init__(self) -> None:
-        if self.n_norm not in ("library", "max_terms"):
-            raise ValueError(f"n_norm must be 'library' or 'max_terms': {self.n_norm!r} came")
-
-    def distances(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
-        largest = front.n_library if self.n_norm == "library" else front.sizes.max() + 1
-        return np.hypot(front.errors, front.sizes / largest)
-
-    def select(self, front: ParetoFront) -> Candidate:
-        return front.candidates[int(np.argmin(self.distances(front)))]
 
 
 def fit_support(problem: Regression, equation: str, terms: Sequence[str]) -> Candidate:
@@ -109,15 +94,19 @@ def fit_support(problem: Regression, equation: str, terms: Sequence[str]) -> Can
     return candidate
 
 
-def pareto_front(problem: Regression, supports: Supports) -> ParetoFront:
-    """Fit every support on all training rows and keep the best of each size.
+def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> ParetoFront:
+    """Fit every support on all training rows and keep the `depth` best of each size.
 
-    "Best" is by held-out rows, as in the thesis. A size whose best does not beat a smaller
-    one is left out, and so are supports whose terms depend on each other.
+    "Best" is by held-out rows, as in the thesis, or by the training rows where none are held out.
+    A size whose best does not beat a smaller one is left out, and so are supports whose terms
+    depend on each other. With noise in the library a wrong support can lead the true one of its
+    size by a hair; a depth of 3 keeps both for a better judge.
     """
+    if depth < 1:
+        raise ValueError(f"depth must be at least 1: {depth} came")
     n_terms = len(problem.library)
     equation = problem.equations.index(supports.equation)
-    best = _best_of_each_size(problem, equation, supports.masks)
+    best = _best_of_each_size(problem, equation, supports.masks, depth)
     empty = np.zeros((1, n_terms), dtype=np.bool_)
     chosen = Supports(
         equation=supports.equation,
@@ -125,11 +114,15 @@ def pareto_front(problem: Regression, supports: Supports) -> ParetoFront:
         share=np.append(supports.share[~supports.masks.any(axis=1)].sum(), supports.share[best]),
         inclusion=supports.inclusion,
     )
+    by_size = groupby(_candidates(problem, chosen), key=lambda c: c.n_terms)
     front: list[Candidate] = []
-    for candidate in _candidates(problem, chosen):
-        if not front or _score(candidate) > _score(front[-1]):
-            front.append(candidate)
-    return ParetoFront(supports.equation, front, n_terms)
+    highest = -np.inf
+    for _, same_size in by_size:
+        ranked = sorted(same_size, key=_score, reverse=True)
+        if _score(ranked[0]) > highest:
+            highest = _score(ranked[0])
+            front += ranked
+    return ParetoFront(supports.equation, front, problem)
 
 
 def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
@@ -155,8 +148,8 @@ def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
 
 
 def _best_of_each_size(
-    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"]
-) -> Int[np.ndarray, " sizes"]:
+    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"], depth: int
+) -> Int[np.ndarray, " best"]:
     """Indices of the supports of least error, by number of terms, from Gram matrices alone."""
     train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
@@ -165,7 +158,9 @@ def _best_of_each_size(
     sizes = masks.sum(axis=1)
     order = np.lexsort((-explained, sizes))
     order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
-    return order[np.unique(sizes[order], return_index=True)[1]]
+    _, first, count = np.unique(sizes[order], return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(first, count)
+    return order[rank < depth]
 
 
 def _fit(

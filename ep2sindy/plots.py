@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from ep2sindy.model import Rollout, SparseModel
 from ep2sindy.names import latex_derivative, latex_name, latex_term_name
-from ep2sindy.pareto import Knee, ParetoFront
+from ep2sindy.pareto import ParetoFront
+from ep2sindy.selection import selected
 from ep2sindy.smoothing import Smoother
 from ep2sindy.spectrum import dominant_frequency, frequency_text, power_spectrum
 from ep2sindy.trajectory import Trajectory
@@ -33,7 +34,7 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figur
     per_Hz, hertz = prefixed(f_max_Hz)
     for k, name in enumerate(run.state_names):
         axes[k, 0].plot(per_s * (run.t[shown] - run.t[0]), run.states[shown, k], color=DATA, lw=1)
-        axes[k, 0].set_ylabel(_label(name, run.units[name]))
+        axes[k, 0].set_ylabel(axis_label(name, run.units[name]))
         frequency, power = power_spectrum(run.t, run.states[:, k])
         inside = (frequency > 0) & (frequency <= f_max_Hz)
         axes[k, 1].semilogy(per_Hz * frequency[inside], power[inside], color=COLOURS[0], lw=0.8)
@@ -41,36 +42,64 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figur
         label = frequency_text(peak)
         axes[k, 1].axvline(per_Hz * peak, color=COLOURS[1], lw=1, ls="--", label=label)
         axes[k, 1].legend(loc="upper right", frameon=False)
-        axes[k, 1].set_ylabel(f"power ({_unit(unit_product([(run.units[name], 2), ('Hz', -1)]))})")
+        axes[k, 1].set_ylabel(
+            f"power ({unit_text(unit_product([(run.units[name], 2), ('Hz', -1)]))})"
+        )
     axes[-1, 0].set_xlabel(f"time ({second}s)")
     axes[-1, 1].set_xlabel(f"frequency ({hertz}Hz)")
     return figure
 
 
-def front_figure(fronts: Mapping[str, ParetoFront], selection: Knee) -> Figure:
-    """Error against number of terms for every equation, the selected candidate marked."""
+def front_figure(
+    fronts: Mapping[str, ParetoFront],
+    scores: Mapping[str, Float[np.ndarray, " candidates"]],
+    *,
+    label: str,
+) -> Figure:
+    """Error against number of terms for every equation, the selected candidate marked.
+
+    scores: by state, one per candidate, the lowest selected; label: what they are called.
+    """
     figure = Figure(figsize=(4.4 * len(fronts), 3.4), layout="constrained")
     axes = figure.subplots(1, len(fronts), squeeze=False)[0]
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
-        ax.plot(front.sizes, front.errors, "o-", color=COLOURS[0], ms=5, lw=1, label="best of size")
-        knee = selection.select(front)
-        index = front.candidates.index(knee)
+        _front(ax, front)
+        chosen = selected(front, scores[state])
+        index = front.candidates.index(chosen)
         ax.plot(
             front.sizes[index],
             front.errors[index],
             "*",
             ms=15,
             color=COLOURS[1],
-            label=rf"knee, $d$ = {selection.distances(front)[index]:.2f}",
+            label=f"selected, {_score_label(label)} = {scores[state][index]:.4g}",
         )
-        terms = ", ".join(f"${latex_term_name(name)}$" for name in knee.terms)
+        terms = ", ".join(f"${latex_term_name(name)}$" for name in chosen.terms)
         ax.set_title(f"${latex_derivative(state)}$: {terms or '0'}", fontsize=9)
-        ax.set_xlabel("number of terms")
-        ax.set_ylabel(r"error, $1 - R^2$ (held-out rows)")
-        ax.set_xticks(front.sizes.astype(int))
-        ax.set_ylim(0.0, 1.05 * max(1.0, min(front.errors.max(), 1.5)))
         ax.legend(frameon=False, fontsize=8)
     return figure
+
+
+def _front(ax: Axes, front: ParetoFront) -> None:
+    """The best of every size as a line, runners-up as small dots."""
+    best = front.leading
+    ax.plot(
+        front.sizes[best], front.errors[best], "o-", c=COLOURS[0], ms=5, lw=1, label="best of size"
+    )
+    if not best.all():
+        others = front.sizes[~best], front.errors[~best]
+        ax.plot(*others, ".", color="#999999", ms=4, zorder=1, label="runners-up")
+    rows = "held-out" if front.problem.test.any() else "training"
+    ax.set_xlabel("number of terms")
+    ax.set_ylabel(f"error, $1 - R^2$ ({rows} rows)")
+    ax.set_xticks(front.sizes[best].astype(int))
+    ax.set_ylim(0.0, 1.05 * max(1.0, min(front.errors[best].max(), 1.5)))
+
+
+def _score_label(label: str) -> str:
+    """`d_pareto` as a symbol with an index; `AICc` as it is."""
+    stem, _, index = label.partition("_")
+    return rf"${stem}_\mathrm{{{index}}}$" if index else label
 
 
 def trajectory_figure(
@@ -98,8 +127,8 @@ def trajectory_figure(
                 ls=(0, (5, 1)),
                 label=label + ending,
             )
-        ax.set_ylim(_framing(run.states[shown, k]))
-        ax.set_ylabel(_label(name, run.units[name]))
+        ax.set_ylim(framing(run.states[shown, k]))
+        ax.set_ylabel(axis_label(name, run.units[name]))
     axes[-1].set_xlabel(f"time since start of integration ({second}s)")
     _legend_above(figure, axes[0])
     return figure
@@ -123,7 +152,7 @@ def derivative_figure(
             column = predicted[shown, model.states.index(name)]
             ax.plot(t, column, color=colour, lw=1.1, ls=(0, (5, 1)), label=label)
         slope_unit = unit_product([(run.units[name], 1), ("s", -1)])
-        ax.set_ylabel(f"${latex_derivative(name)}$ ({_unit(slope_unit)})")
+        ax.set_ylabel(f"${latex_derivative(name)}$ ({unit_text(slope_unit)})")
     axes[-1].set_xlabel(f"time ({second}s)")
     _legend_above(figure, axes[0])
     return figure
@@ -144,11 +173,11 @@ def phase_figure(
         inside = rollout.t <= start + duration_s
         ending = " (diverged)" if rollout.diverged else ""
         _orbit(ax, rollout.states[inside], x, y, colour, label + ending)
-    axes[0].set_xlim(_framing(run.states[shown, x]))
-    axes[0].set_ylim(_framing(run.states[shown, y]))
+    axes[0].set_xlim(framing(run.states[shown, x]))
+    axes[0].set_ylim(framing(run.states[shown, y]))
     for ax in axes:
-        ax.set_xlabel(_label(plane[0], run.units[plane[0]]))
-    axes[0].set_ylabel(_label(plane[1], run.units[plane[1]]))
+        ax.set_xlabel(axis_label(plane[0], run.units[plane[0]]))
+    axes[0].set_ylabel(axis_label(plane[1], run.units[plane[1]]))
     return figure
 
 
@@ -160,7 +189,7 @@ def _orbit(
     ax.set_title(label, fontsize=10)
 
 
-def _framing(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
+def framing(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
     """Limits of twice the data's range: a model that runs away must not shrink the rest."""
     low, high = float(values.min()), float(values.max())
     margin = 0.5 * (high - low)
@@ -172,10 +201,10 @@ def _legend_above(figure: Figure, ax: Axes) -> None:
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
 
 
-def _label(name: str, unit: str) -> str:
-    return f"${latex_name(name)}$ ({_unit(unit)})"
+def axis_label(name: str, unit: str) -> str:
+    return f"${latex_name(name)}$ ({unit_text(unit)})"
 
 
-def _unit(unit: str) -> str:
+def unit_text(unit: str) -> str:
     """`m^-3 s^-1` as mathtext."""
     return re.sub(r"\^(-?[\d.]+)", r"$^{\1}$", unit)

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 
 from ep2sindy.library import Library
 from ep2sindy.smoothing import SavitzkyGolay, Smoother
@@ -31,12 +32,31 @@ class Grams:
 
 
 @dataclass(frozen=True, eq=False)
+class NoisyRows:
+    """How the training rows of one equation follow from noisy samples x.
+
+    Targets are slope @ x[state], terms are mean @ library(x); both sparse, (rows, samples).
+    values: (samples, variables), the library's variables and then states that it lacks;
+    smoothed: an estimate of their true values; noise_std: of their independent noise.
+    """
+
+    mean: csr_array
+    slope: csr_array
+    state: int
+    values: Float[np.ndarray, "samples variables"]
+    smoothed: Float[np.ndarray, "samples variables"]
+    noise_std: Float[np.ndarray, "samples variables"]
+
+
+@dataclass(frozen=True, eq=False)
 class Regression:
     """Rows of library terms and targets, in SI units, ready for a search.
 
     theta: (rows, terms). target: (rows, equations).
     groups: (rows,), rows that share samples share a number, and stay together in a split or a
     bootstrap. test: (rows,), true for held-out rows.
+    trajectories: what the rows were made from, for judges that integrate. noisy: where the noise
+    of the samples can be followed into the training rows, how; then there is one equation.
     Raises ValueError for values that are not finite or fewer training rows than terms.
     """
 
@@ -46,6 +66,8 @@ class Regression:
     equations: Sequence[str]
     groups: Int[np.ndarray, " rows"]
     test: Bool[np.ndarray, " rows"]
+    trajectories: Sequence[Trajectory] = ()
+    noisy: NoisyRows | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", read_only(self.theta))
@@ -177,6 +199,19 @@ def _check_fraction(fraction: float) -> None:
         raise ValueError(f"test_fraction must lie in [0, 1): {fraction} came")
 
 
+@runtime_checkable
+class Formulation(Protocol):
+    """Turns trajectories into regressions: one, or one per equation where rows differ."""
+
+    def assemble(
+        self,
+        trajectories: Sequence[Trajectory],
+        library: Library,
+        *,
+        rng: np.random.Generator,
+    ) -> tuple[Regression, ...]: ...
+
+
 @dataclass(frozen=True)
 class Differential:
     """Regress the derivative at every sample on the library at that sample.
@@ -195,24 +230,27 @@ class Differential:
         library: Library,
         *,
         rng: np.random.Generator,
-    ) -> Regression:
+    ) -> tuple[Regression, ...]:
         """Rows of all trajectories below one another; every row uses one trajectory alone.
 
+        All equations share their rows, so there is one regression.
         Raises ValueError for no trajectory, trajectories with other states, or a variable of
         the library that a trajectory lacks.
         """
-        _check_agreement(trajectories, library.variables)
+        check_agreement(trajectories, library.variables)
         parts = [self._rows(run, library) for run in trajectories]
         test = [self.split.held_out(run.n_samples, rng) for run in trajectories]
         n_rows = sum(run.n_samples for run in trajectories)
-        return Regression(
+        problem = Regression(
             theta=np.concatenate([theta for theta, _ in parts]),
             target=np.concatenate([target for _, target in parts]),
             library=library,
             equations=trajectories[0].state_names,
             groups=np.arange(n_rows),
             test=np.concatenate(test),
+            trajectories=tuple(trajectories),
         )
+        return (problem,)
 
     def _rows(self, run: Trajectory, library: Library) -> tuple[np.ndarray, np.ndarray]:
         values = run.columns(library.variables)
@@ -222,7 +260,7 @@ class Differential:
             return library.evaluate(values), self.smoother.derivative(run.t, run.states)
 
 
-def _check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
+def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
     """One regression has one meaning per column: the same states, and units, everywhere."""
     if not trajectories:
         raise ValueError("a regression needs at least one trajectory: none came")

@@ -27,7 +27,10 @@ from ep2sindy.model import SparseModel
 from ep2sindy.names import split_factors
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
-VERSIONED = ("ep2sindy", "numpy", "scipy", "numba", "scikit-learn", "xarray", "torch", "hydra-core")
+VERSIONED = (
+    "ep2sindy", "numpy", "scipy", "numba", "scikit-learn", "xarray", "torch", "hydra-core",
+    "pysindy",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

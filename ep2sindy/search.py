@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -186,7 +186,7 @@ class Supports:
 
     masks: (supports, terms), each once. share: (supports,), share of bootstraps that found it.
     inclusion: (terms + 1, terms), row k: of the bootstraps that had a term at hand, the share
-    in which it stood in a support of k terms.
+    in which it stood in a support of k terms. Without bootstraps both are NaN.
     """
 
     equation: str
@@ -215,9 +215,19 @@ def pooled_supports(
     scale = at_hand / np.sqrt(np.where(at_hand, diagonal, 1.0))
     xx = grams.xx * scale[:, :, None] * scale[:, None, :]
     xy = grams.xy * scale[:, None, :]
-    return tuple(
+    pooled = tuple(
         _pool(name, [search.supports(*draw) for draw in zip(xx, xy[:, k], yy, strict=True)], kept)
         for k, (name, yy) in enumerate(zip(problem.equations, grams.yy.T.tolist(), strict=True))
+    )
+    return pooled if bootstraps.n else tuple(map(_without_shares, pooled))
+
+
+def _without_shares(found: Supports) -> Supports:
+    """One search on all rows says nothing of how often another would agree."""
+    return replace(
+        found,
+        share=np.full_like(found.share, np.nan),
+        inclusion=np.full_like(found.inclusion, np.nan),
     )
 
 

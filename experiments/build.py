@@ -2,10 +2,11 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import cast
 
 import xarray as xr
 from hydra.utils import instantiate
@@ -14,11 +15,20 @@ from omegaconf import DictConfig, OmegaConf
 from ep2sindy.library import Library, polynomial
 from ep2sindy.report import RunFolder, Screen
 
+# The keys of conf/config.yaml, which every study meets; each study names those it adds.
+BASE_KEYS = {
+    "data", "formulation", "search", "bootstraps", "selection", "depth", "experiment", "study",
+    "seed", "output", "prepare", "trajectory",
+}  # fmt: skip
+
 
 @contextmanager
-def started_run(config: DictConfig) -> Iterator[tuple[RunFolder, Screen]]:
-    """A new run folder that already holds its config and provenance, and its screen."""
-    check_config(config)
+def started_run(config: DictConfig, *, keys: Collection[str]) -> Iterator[tuple[RunFolder, Screen]]:
+    """A new run folder that already holds its config and provenance, and its screen.
+
+    keys: top-level keys that the study takes, beside those of conf/config.yaml.
+    """
+    check_config(config, keys=keys)
     folder = RunFolder.create(Path(config.output), config.experiment, now=datetime.now())
     folder.write_text("config.yaml", OmegaConf.to_yaml(config, resolve=True))
     folder.write_provenance(
@@ -34,23 +44,24 @@ def started_run(config: DictConfig) -> Iterator[tuple[RunFolder, Screen]]:
         screen.close()
 
 
-TOP_KEYS = {
-    "data", "formulation", "search", "bootstraps", "selection", "experiment", "study", "seed",
-    "output", "prepare", "trajectory", "libraries", "rollout_s", "figures", "thesis",
-}  # fmt: skip
-
-
-def check_config(config: DictConfig) -> None:
+def check_config(config: DictConfig, *, keys: Collection[str]) -> None:
     """Raise ValueError for a key that would do nothing, or a setting of the wrong kind."""
-    unknown = set(config) - TOP_KEYS
+    known = BASE_KEYS | set(keys)
+    unknown = set(config) - known
     if unknown:
-        raise ValueError(f"unknown keys {sorted(map(str, unknown))}; there are {sorted(TOP_KEYS)}")
+        raise ValueError(f"unknown keys {sorted(map(str, unknown))}; there are {sorted(known)}")
     if not isinstance(config.seed, int) or config.seed < 0:
         raise ValueError(f"seed must be a whole number, zero or more: {config.seed!r} came")
+    if not isinstance(config.depth, int) or config.depth < 1:
+        raise ValueError(f"depth must be a whole number, one or more: {config.depth!r} came")
     if not str(config.experiment).isidentifier():
         raise ValueError(
             f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
         )
+
+
+def check_durations(config: DictConfig) -> None:
+    """Raise ValueError unless `rollout_s` and all of `figures` are positive, or null."""
     durations = {
         "rollout_s": config.rollout_s,
         **{f"figures.{k}": v for k, v in config.figures.items()},
@@ -95,7 +106,7 @@ def inputs_of(config: DictConfig, libraries: Iterable[Library]) -> list[str]:
     return [name for name in variables if name not in known]
 
 
-LIBRARY_KEYS = {"variables", "variables_if_present", "degree", "products", "selection"}
+LIBRARY_KEYS = {"variables", "variables_if_present", "degree", "products", "n_norm"}
 
 
 def check_library(name: str, case: DictConfig) -> None:
@@ -107,6 +118,13 @@ def check_library(name: str, case: DictConfig) -> None:
             f"libraries.{name} may have {sorted(LIBRARY_KEYS)} and needs variables and degree: "
             f"{sorted(map(str, case))} came"
         )
+
+
+def selection_of(case: DictConfig, selection: DictConfig) -> DictConfig:
+    """The rule that all libraries share; where it has an n_norm, a library may set its own."""
+    if "n_norm" in case and "n_norm" in selection:
+        return cast(DictConfig, OmegaConf.merge(selection, {"n_norm": case.n_norm}))
+    return selection
 
 
 def library_of(case: DictConfig, field: xr.Dataset) -> Library:

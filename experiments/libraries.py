@@ -24,10 +24,12 @@ from ep2sindy.studies.libraries import (
 )
 from ep2sindy.trajectory import Trajectory
 from experiments.build import (
+    check_durations,
     check_library,
     inputs_of,
     library_of,
     open_prepared_field,
+    selection_of,
     started_run,
 )
 from experiments.libraries_view import (
@@ -39,23 +41,27 @@ from experiments.libraries_view import (
     print_outcome,
 )
 
+KEYS = ("libraries", "rollout_s", "figures", "thesis")
+
 
 def run(config: DictConfig) -> Path:
     """Discover, integrate, compare; everything lands in a new run folder."""
-    with started_run(config) as (folder, screen):
+    with started_run(config, keys=KEYS) as (folder, screen):
+        check_durations(config)
         # Everything but the data is built first: a misspelt key must not cost a simulation.
         settings: dict[str, Any] = {
             "formulation": instantiate(config.formulation),
             "search": instantiate(config.search),
             "bootstraps": instantiate(config.bootstraps),
             "rollout_s": config.rollout_s,
+            "depth": config.depth,
             "rng": np.random.default_rng(config.seed),
         }
         to_trajectory = instantiate(config.trajectory, _convert_="all")
         selections = {}
         for name, case in config.libraries.items():
             check_library(name, case)
-            selections[name] = instantiate(case.get("selection", config.selection))
+            selections[name] = instantiate(selection_of(case, config.selection))
         field = open_prepared_field(config)
         libraries = {name: library_of(case, field) for name, case in config.libraries.items()}
         inputs = inputs_of(config, libraries.values())
@@ -89,7 +95,7 @@ def _write(
             ),
         )
     for name, integrated in outcome.models.items():
-        folder.write_table(f"rollout_{_slug(name)}", _rollout_table(outcome.run, integrated))
+        folder.write_table(f"rollout_{_slug(name)}", rollout_table(outcome.run, integrated))
     folder.write_table("comparison", comparison(outcome))
     folder.write_figures(figures)
     summary = _summary(config, outcome)
@@ -98,7 +104,7 @@ def _write(
         figures=figures,
         texts={n: f"    {r.discovery.model.text()}" for n, r in outcome.results.items()},
         hparams=_hparams(config),
-        metrics=_scalars(summary),
+        metrics=_scalars(summary, outcome.results),
     )
     folder.write_text("report.html", page(outcome, figures))
     folder.write_json("summary.json", summary)
@@ -109,7 +115,7 @@ def _slug(name: str) -> str:
     return name.replace(", ", "_").replace("'s ", "_").replace(" ", "_")
 
 
-def _rollout_table(run: Trajectory, integrated: Integrated) -> pd.DataFrame:
+def rollout_table(run: Trajectory, integrated: Integrated) -> pd.DataFrame:
     """Model and data, sample by sample, so that the figure can be drawn again."""
     rollout, states = integrated.rollout, integrated.model.states
     data = run.columns(states)[: len(rollout.t)]
@@ -130,7 +136,9 @@ def _figures(outcome: Outcome, smoother: Smoother, shown: DictConfig) -> dict[st
     figures = {
         "data": plots.data_figure(run, duration_s=duration_s, f_max_Hz=f_max_Hz),
         **{
-            f"front_{name}": plots.front_figure(r.discovery.fronts, r.case.selection)
+            f"front_{name}": plots.front_figure(
+                r.discovery.fronts, r.discovery.scores, label=r.case.selection.label
+            )
             for name, r in results.items()
         },
         "trajectories": plots.trajectory_figure(run, rollouts, duration_s=duration_s),
@@ -198,28 +206,27 @@ def _published_summary(result: LibraryResult, state: str) -> dict[str, Any] | No
 
 
 def _equation_summary(result: LibraryResult, state: str) -> dict[str, Any]:
-    front, selection = result.discovery.fronts[state], result.case.selection
-    chosen = selection.select(front)
+    chosen, scores = result.discovery.chosen[state], result.discovery.scores[state]
     terms = result.discovery.model.terms(state)
     return {
         "terms": terms,
         "n_terms": chosen.n_terms,
         "r2_test": chosen.r2_test,
         "r2_train": chosen.r2_train,
-        "d_pareto": float(selection.distances(front)[front.candidates.index(chosen)]),
+        result.case.selection.label: float(scores.min()),
         "share": chosen.share,
         "inclusion": dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True)),
         "text": equation_text(state, terms),
     }
 
 
-def _scalars(summary: Mapping[str, Any]) -> dict[str, float]:
+def _scalars(summary: Mapping[str, Any], results: Mapping[str, LibraryResult]) -> dict[str, float]:
     scalars = {"data/f_kHz": summary["data"]["f_kHz"]}
     for name, model in summary["models"].items():
         scalars[f"{name}/f_kHz"] = model["trajectory"]["f_kHz"]
         scalars[f"{name}/nrmse"] = model["trajectory"]["nrmse"]
         for state, equation in model["equations"].items():
-            for key in ("r2_test", "n_terms", "d_pareto"):
+            for key in ("r2_test", "n_terms", results[name].case.selection.label):
                 scalars[f"{name}/{state}/{key}"] = equation[key]
     return scalars
 
@@ -231,6 +238,7 @@ def _hparams(config: DictConfig) -> dict[str, Any]:
         "formulation": str(OmegaConf.to_container(config.formulation)),
         "search": str(OmegaConf.to_container(config.search)),
         "selection": str(OmegaConf.to_container(config.selection)),
+        "depth": config.depth,
         "n_bootstraps": config.bootstraps.n,
         "n_culled": config.bootstraps.n_culled,
     }

@@ -37,8 +37,12 @@ class Outcome:
 
 
 def front_tables(result: LibraryResult) -> pd.DataFrame:
-    fronts = result.discovery.fronts.values()
-    return pd.concat([front_table(front, result.case.selection) for front in fronts])
+    return pd.concat([_front_table(result, state) for state in result.discovery.fronts])
+
+
+def _front_table(result: LibraryResult, state: str) -> pd.DataFrame:
+    found = result.discovery
+    return front_table(found.fronts[state], found.scores[state], label=result.case.selection.label)
 
 
 def comparison(outcome: Outcome) -> pd.DataFrame:
@@ -77,7 +81,7 @@ def print_outcome(screen: Screen, outcome: Outcome) -> None:
         library = result.case.library
         screen.print(
             f"\n[bold]{name}[/bold]: {len(library)} terms in {', '.join(library.variables)}; "
-            f"n_norm: {result.case.selection.n_norm}"
+            f"selection: {result.case.selection}"
         )
         for ambiguity in result.discovery.ambiguities:
             if ambiguity.exact:
@@ -93,24 +97,29 @@ def print_outcome(screen: Screen, outcome: Outcome) -> None:
 
 
 def _rich_front(result: LibraryResult, state: str) -> Table:
-    frame = front_table(result.discovery.fronts[state], result.case.selection)
-    table = Table("terms", "R2 test", "d_pareto", "share", "model", show_edge=False)
-    for row in frame.itertuples():
+    label = result.case.selection.label
+    held_out = result.discovery.fronts[state].problem.test.any()
+    r2, r2_header = ("r2_test", "R2 test") if held_out else ("r2_train", "R2 train")
+    table = Table("terms", r2_header, label, "share", "model", show_edge=False)
+    for row in _front_table(result, state).to_dict("records"):
         table.add_row(
-            str(row.n_terms),
-            f"{row.r2_test:.3f}",
-            f"{row.d_pareto:.3f}",
-            f"{row.share:.2f}",
-            str(row.text),
-            style="bold green" if row.selected else None,
+            str(row["n_terms"]),
+            f"{row[r2]:.3f}",
+            f"{row[label]:.3f}",
+            "-" if np.isnan(row["share"]) else f"{row['share']:.2f}",
+            row["text"],
+            style="bold green" if row["selected"] else None,
         )
+    terms = result.discovery.model.terms(state)
+    if terms != result.discovery.chosen[state].coef_by_term:
+        table.add_row("", "", "", "", f"weighted: {equation_text(state, terms)}", style="green")
     if state in result.refitted:
         published = equation_text(state, result.case.published[state])
         here = result.refitted[state]
         table.add_row("", "", "", "", f"thesis: {published}", style="italic")
         table.add_row(
             str(here.n_terms),
-            f"{here.r2_test:.3f}",
+            f"{here.r2_test if held_out else here.r2_train:.3f}",
             "",
             "",
             f"its terms here: {candidate_text(here)}",

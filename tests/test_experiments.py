@@ -4,16 +4,21 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from ep2sindy.discover import discover
 from ep2sindy.io import write_field
+from ep2sindy.library import polynomial
 from ep2sindy.model import SparseModel
 from experiments import libraries
+from experiments.build import open_prepared_field, selection_of
 from experiments.run import innermost
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -180,6 +185,83 @@ def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> 
     assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
 
 
+@pytest.mark.parametrize(
+    ("formulation", "selection"),
+    [
+        ("differential", "knee"),
+        ("kalman", "log_knee"),
+        ("kalman", "ebic"),
+        ("weak", "knee"),
+        ("weak", "bic"),
+        ("weak", "ebic"),
+        ("weak_boxes", "knee"),
+    ],
+)
+def test_every_formulation_and_selection_finds_predator_and_prey(
+    formulation: str, selection: str, predator_prey: Path, tmp_path: Path
+) -> None:
+    config = composed(
+        *breathing(predator_prey, tmp_path), f"formulation={formulation}", f"selection={selection}"
+    )
+    to_trajectory = instantiate(config.trajectory, _convert_="all")
+    run = to_trajectory(open_prepared_field(config), inputs=[], label="")
+    found = discover(
+        [run],
+        polynomial(["n_i", "n_n"], degree=2),
+        **{k: instantiate(config[k]) for k in ("formulation", "search", "bootstraps", "selection")},
+        rng=np.random.default_rng(0),
+    )
+    # Least exact are the differential form, as above, and boxes of a hundred samples, over which
+    # the trapezoidal rule leaves 0.1 %.
+    truth = {"n_i": -1.64e5, "n_i*n_n": 4.66e-14}
+    assert found.model.terms("n_i") == pytest.approx(truth, rel=0.02)
+    truth = {"n_n": 4.39e4, "n_i*n_n": -4.66e-14}
+    assert found.model.terms("n_n") == pytest.approx(truth, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "rule", sorted(p.stem for p in (ROOT / "conf" / "selection").glob("*.yaml"))
+)
+def test_a_selection_on_the_command_line_is_every_librarys(rule: str, tmp_path: Path) -> None:
+    config = composed(*breathing(tmp_path, tmp_path), f"selection={rule}")
+    expected = instantiate(config.selection)
+    for case in config.libraries.values():
+        assert type(instantiate(selection_of(case, config.selection))) is type(expected)
+
+
+def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
+    predator_prey: Path, tmp_path: Path
+) -> None:
+    folder = libraries.run(
+        composed(
+            *breathing(predator_prey, tmp_path),
+            "formulation=weak",
+            "selection=ebic",
+            "depth=2",
+            "~libraries.ionization",
+            "~libraries.velocity",
+        )
+    )
+    found = summary_of(folder)["models"]["simple"]["equations"]
+    # The field was integrated to 1e-8; bumps add no error of their own.
+    assert found["n_i"]["terms"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=1e-6)
+    assert found["n_i"]["r2_test"] is None
+    front = pd.read_csv(folder / "tables" / "front_simple.csv")
+    for state, rows in front.groupby("equation"):
+        assert rows.loc[rows["selected"], "EBIC"].item() == rows["EBIC"].min()
+        assert found[state]["EBIC"] == pytest.approx(rows["EBIC"].min())
+        assert rows["n_terms"].value_counts().max() == 2
+    log = (folder / "run.log").read_text()
+    for words in ("selection: EBIC(gamma=1.0", "R2 train", "weighted: n_i' = -1.64e+05 n_i"):
+        assert words in log
+
+
+def test_a_library_may_have_a_knee_norm_of_its_own(breathing_run: Path) -> None:
+    log = (breathing_run / "run.log").read_text()
+    assert "simple: 6 terms in n_i, n_n; selection: Knee(n_norm='library')" in log
+    assert log.count("selection: Knee(n_norm='max_terms')") == 2
+
+
 def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
     config = composed(
         "+exp=breathing",
@@ -217,7 +299,7 @@ def test_the_last_line_names_the_run_folder(predator_prey: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ([], "error: choose an experiment with +exp=NAME; there are breathing"),
+        ([], f"error: choose an experiment with +exp=NAME; there are {', '.join(EXPERIMENTS)}"),
         (["+exp=breathing", "sede=1"], "Could not override 'sede'"),
         (["+exp=breathing", "data=file", "data.path=none.nc"], "error: no such file: "),
     ],
@@ -240,6 +322,9 @@ def test_mistakes_end_in_one_clear_message(
         (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
         (["+seeds=1"], "unknown keys ['seeds']; there are "),
         (["seed=abc"], "seed must be a whole number"),
+        (["depth=0"], "depth must be a whole number, one or more: 0 came"),
+        (["depth=1.5"], "depth must be a whole number, one or more: 1.5 came"),
+        (["libraries.simple.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["rollout_s=-1"], "rollout_s must be a positive number"),
         (["trajectory.zone.z=[0.5,0.6]"], "a zone must hold grid points"),
         (["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this field has"),

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -158,3 +159,32 @@ def test_bad_coefficients_are_refused() -> None:
         SparseModel(library, ["x"], np.full((2, 1), np.nan))
     with pytest.raises(ValueError, match=r"unknown state 'y'; this model has \['x'\]"):
         SparseModel(library, ["x"], np.zeros((2, 1))).terms("y")
+
+
+def test_intervals_come_from_the_covariance_of_their_own_equation() -> None:
+    plain = breathing()
+    variances = np.array([1e6, 1e-32, 1e42, 1e-4])
+    model = replace(plain, covariance=np.diag(variances))
+    low, high = model.intervals("n_n")["n_i*n_n*R_ion"]
+    assert (low, high) == pytest.approx((-0.77 - 0.0195996, -0.77 + 0.0195996), rel=1e-6)
+    low, high = model.intervals("n_i", level=0.6826894921)["n_i"]
+    assert (low, high) == pytest.approx((-2.63e5, -2.61e5), rel=1e-9)
+
+
+def test_covariance_survives_the_file_exactly() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((4, 4)) / 3.0
+    model = replace(breathing(), covariance=root @ root.T)
+    again = SparseModel.from_json(model.to_json())
+    assert again.covariance is not None
+    np.testing.assert_array_equal(again.covariance, model.covariance)
+
+
+def test_a_model_without_covariance_has_no_intervals() -> None:
+    with pytest.raises(ValueError, match="intervals need a covariance: this model has none"):
+        breathing().intervals("n_i")
+
+
+def test_covariance_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"shape \(3, 3\) came for 4"):
+        replace(breathing(), covariance=np.eye(3))

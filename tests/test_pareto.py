@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from ep2sindy.library import named_terms
-from ep2sindy.pareto import Candidate, Knee, ParetoFront, pareto_front, r2
-from ep2sindy.regression import RandomSplit, Regression
+from ep2sindy.pareto import pareto_front, r2
+from ep2sindy.regression import Differential, RandomSplit, Regression
 from ep2sindy.search import (
     STLSQ,
     AdaptiveLasso,
@@ -48,50 +48,29 @@ def test_known_systems_come_back_from_exact_derivatives(system: System, search: 
         assert hit.r2_test == pytest.approx(1.0, abs=1e-14)
 
 
-def front_of(errors: list[float], n_library: int) -> ParetoFront:
-    candidates = [
-        Candidate(
-            equation="x",
-            terms=tuple(f"t{i}" for i in range(k)),
-            coef=np.ones(k),
-            r2_train=1.0 - error,
-            r2_test=1.0 - error,
-            share=1.0,
-            inclusion=np.ones(k),
-        )
-        for k, error in enumerate(errors)
-    ]
-    return ParetoFront("x", candidates, n_library)
+def test_depth_keeps_runners_up_behind_the_best_of_each_size() -> None:
+    system = lorenz()
+    run = system.trajectory(noise=0.05, rng=np.random.default_rng(0))
+    (problem,) = Differential().assemble([run], system.model.library, rng=np.random.default_rng(1))
+    search = BestSubset(max_terms=3, n_best=4)
+    supports = pooled_supports(problem, search, Bootstraps(n=0), rng=np.random.default_rng(2))[1]
+    front, deep = pareto_front(problem, supports), pareto_front(problem, supports, depth=3)
+    assert front.leading.all()
+    assert deep.sizes.tolist() == [0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert np.flatnonzero(deep.leading).tolist() == [0, 1, 4, 7]
+    for start in (1, 4, 7):
+        assert np.all(np.diff(deep.errors[start : start + 3]) > 0)
+    best = [c for c, leads in zip(deep.candidates, deep.leading, strict=True) if leads]
+    assert [c.terms for c in best] == [c.terms for c in front.candidates]
+    assert np.array_equal(deep.errors[deep.leading], front.errors)
+    assert len({c.terms for c in deep.candidates}) == len(deep.candidates)
 
 
-def test_knee_distance_is_equation_9_of_the_thesis() -> None:
-    # Table I: R2 0.63 with two of six terms has d = 0.49 (0.498), 0.69 with three 0.59.
-    front = front_of([1.0, 0.9, 0.37, 0.31], 6)
-    distances = Knee("library").distances(front)
-    assert distances[2:] == pytest.approx([0.498, 0.588], abs=1e-3)
-    assert Knee("library").select(front).n_terms == 2
-
-
-def test_knee_can_be_normalised_by_the_largest_candidate() -> None:
-    # Table II: R2 0.92 with two terms has d = 0.41, 0.95 with three 0.60: n_norm is 5.
-    front = front_of([1.0, 0.9, 0.08, 0.05, 0.04], 20)
-    assert Knee("max_terms").distances(front)[2:4] == pytest.approx([0.41, 0.60], abs=5e-3)
-    assert Knee("library").select(front).n_terms == 2
-
-
-def test_normalisations_disagree_where_a_term_costs_less() -> None:
-    front = front_of([1.0, 0.30, 0.10, 0.02], 40)
-    assert Knee("library").select(front).n_terms == 3
-    assert Knee("max_terms").select(front).n_terms == 1
-
-
-def test_nothing_is_selected_when_nothing_helps() -> None:
-    assert Knee().select(front_of([1.0, 0.999], 2)).terms == ()
-
-
-def test_unknown_normalisation_is_refused() -> None:
-    with pytest.raises(ValueError, match="'library' or 'max_terms': 'libary' came"):
-        Knee("libary")
+def test_a_front_without_depth_is_refused() -> None:
+    problem = exact_problem(damped_oscillator())
+    supports = pooled_supports(problem, BestSubset(), Bootstraps(n=0), rng=np.random.default_rng(0))
+    with pytest.raises(ValueError, match="depth must be at least 1: 0 came"):
+        pareto_front(problem, supports[0], depth=0)
 
 
 def test_r2_takes_the_data_as_truth() -> None:

@@ -30,8 +30,8 @@ def cubic(t: np.ndarray, label: str) -> Trajectory:
 def test_rows_of_one_trajectory_do_not_depend_on_the_other() -> None:
     runs = [cubic(np.linspace(0, 1, 40), "a"), cubic(np.linspace(5, 9, 60), "b")]
     library = polynomial(["x"], degree=2)
-    both = Differential().assemble(runs, library, rng=np.random.default_rng(0))
-    alone = [Differential().assemble([r], library, rng=np.random.default_rng(0)) for r in runs]
+    (both,) = Differential().assemble(runs, library, rng=np.random.default_rng(0))
+    alone = [Differential().assemble([r], library, rng=np.random.default_rng(0))[0] for r in runs]
     assert np.array_equal(both.theta, np.concatenate([a.theta for a in alone]))
     assert np.array_equal(both.target, np.concatenate([a.target for a in alone]))
     assert both.target[:, 0] == pytest.approx(2 * np.concatenate([r.t for r in runs]), abs=1e-9)
@@ -41,8 +41,9 @@ def test_raw_and_smoothed_libraries_differ_only_in_theta() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=np.random.default_rng(1))
     library = polynomial(["x", "y"], degree=2)
     form = Differential(smoother=SavitzkyGolay())
-    smooth = form.assemble([run], library, rng=np.random.default_rng(0))
-    raw = replace(form, smooth_library=False).assemble([run], library, rng=np.random.default_rng(0))
+    raw_form = replace(form, smooth_library=False)
+    (smooth,) = form.assemble([run], library, rng=np.random.default_rng(0))
+    (raw,) = raw_form.assemble([run], library, rng=np.random.default_rng(0))
     assert np.array_equal(raw.theta, library.evaluate(run.states))
     assert np.array_equal(raw.target, smooth.target)
     assert np.abs(raw.theta - smooth.theta).max() > 1e-3
@@ -116,7 +117,7 @@ def test_trajectories_must_agree() -> None:
 def test_without_smoothing_the_derivative_is_the_plain_difference() -> None:
     run = cubic(np.linspace(0, 1, 40), "a")
     form = Differential(smoother=NoSmoothing())
-    problem = form.assemble([run], polynomial(["x"], degree=1), rng=np.random.default_rng(0))
+    (problem,) = form.assemble([run], polynomial(["x"], degree=1), rng=np.random.default_rng(0))
     assert problem.target[:, 0] == pytest.approx(2 * run.t, abs=1e-12)
 
 

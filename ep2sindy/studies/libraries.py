@@ -8,14 +8,16 @@ from itertools import compress
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
 from ep2sindy.ambiguity import usable_terms
 from ep2sindy.discover import Discovery, discover
 from ep2sindy.library import Library
 from ep2sindy.model import Rollout, SparseModel, assemble_model, equation_text
-from ep2sindy.pareto import Candidate, Knee, ParetoFront, fit_support
-from ep2sindy.regression import Differential
+from ep2sindy.pareto import Candidate, ParetoFront, fit_support
+from ep2sindy.regression import Formulation
 from ep2sindy.search import Bootstraps, Search
+from ep2sindy.selection import Selection, selected
 from ep2sindy.spectrum import dominant_frequency
 from ep2sindy.trajectory import Trajectory
 
@@ -29,7 +31,7 @@ class LibraryCase:
     """
 
     library: Library
-    selection: Knee
+    selection: Selection
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
@@ -73,16 +75,18 @@ def compare_libraries(
     run: Trajectory,
     cases: Mapping[str, LibraryCase],
     *,
-    formulation: Differential,
+    formulation: Formulation,
     search: Search,
     bootstraps: Bootstraps,
     rollout_s: float | None,
+    depth: int = 1,
     rng: np.random.Generator,
 ) -> dict[str, LibraryResult]:
     """Discover a model with every library and integrate it from the first sample.
 
     Each case draws from its own stream, so that adding a case changes no other.
     rollout_s: how far to integrate; None, or more than there is, means to the data's end.
+    depth: candidates kept per size.
     """
     n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
     results = {}
@@ -94,14 +98,10 @@ def compare_libraries(
             search=search,
             bootstraps=bootstraps,
             selection=case.selection,
+            depth=depth,
             rng=stream,
         )
-        at_hand = set(compress(case.library.names, usable_terms(discovery.problem)))
-        refitted = {
-            state: fit_support(discovery.problem, state, list(terms))
-            for state, terms in case.published.items()
-            if state in run.state_names and set(terms) <= at_hand
-        }
+        refitted = _refitted(discovery, case.published)
         results[name] = LibraryResult(
             case=case,
             discovery=discovery,
@@ -110,6 +110,20 @@ def compare_libraries(
             published=_integrate_refitted(discovery, refitted, run, n_samples),
         )
     return results
+
+
+def _refitted(
+    discovery: Discovery, published: Mapping[str, Mapping[str, float]]
+) -> dict[str, Candidate]:
+    """Published terms fitted to our rows, where the data can tell them from others."""
+    found = {}
+    for state, terms in published.items():
+        if state in discovery.fronts:
+            problem = discovery.fronts[state].problem
+            at_hand = set(compress(problem.term_names, usable_terms(problem)))
+            if set(terms) <= at_hand:
+                found[state] = fit_support(problem, state, list(terms))
+    return found
 
 
 def integrate(model: SparseModel, run: Trajectory, n_samples: int) -> Integrated:
@@ -161,18 +175,23 @@ def _nrmse(rollout: Rollout, run: Trajectory) -> float:
     return float(np.sqrt(np.mean(np.square((rollout.states - data) / data.std(axis=0)))))
 
 
-def front_table(front: ParetoFront, selection: Knee) -> pd.DataFrame:
-    """A front as the thesis's Tables I-III: one row per candidate, with its equation."""
-    selected = selection.select(front)
+def front_table(
+    front: ParetoFront, scores: Float[np.ndarray, " candidates"], *, label: str
+) -> pd.DataFrame:
+    """A front as the thesis's Tables I-III: one row per candidate, with its equation.
+
+    scores: one per candidate, the lowest selected, in a column called `label`.
+    """
+    chosen = selected(front, scores)
     return pd.DataFrame(
         {
             "equation": front.equation,
             "n_terms": [c.n_terms for c in front.candidates],
             "r2_test": [c.r2_test for c in front.candidates],
             "r2_train": [c.r2_train for c in front.candidates],
-            "d_pareto": selection.distances(front),
+            label: scores,
             "share": [c.share for c in front.candidates],
-            "selected": [c is selected for c in front.candidates],
+            "selected": [c is chosen for c in front.candidates],
             "text": [candidate_text(c) for c in front.candidates],
         }
     )

@@ -1,0 +1,221 @@
+"""Selection rules: which candidate of each front becomes the model's equation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import comb, log
+from typing import ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.errors_in_variables import whitened_rows
+from ep2sindy.library import Library
+from ep2sindy.pareto import Candidate, ParetoFront
+
+# What no noise-free fit can fall below, as a share of the target's squares: beneath it a
+# criterion would select terms that explain the discretisation.
+FLOOR = 1e-6
+# Rounds of weighting the rows by the covariance under the candidate that leads.
+MAX_ROUNDS = 5
+
+
+@runtime_checkable
+class Selection(Protocol):
+    """Gives every candidate of every front a score; the lowest of a front is selected.
+
+    label: what the score is called in tables.
+    """
+
+    label: ClassVar[str]
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]: ...
+
+
+def selected(front: ParetoFront, scores: Float[np.ndarray, " candidates"]) -> Candidate:
+    """The candidate of least score; of several, the smallest."""
+    return front.candidates[int(np.argmin(scores))]
+
+
+@dataclass(frozen=True)
+class Knee:
+    """Select the candidate closest to no error and no terms: the thesis's rule.
+
+    score = sqrt((1 - R2)^2 + (n_terms / n_norm)^2), where n_norm is the number of terms in
+    the library (the thesis's Eq. 9), or for "max_terms" the largest candidate's plus one (what
+    the thesis's Tables II and III were made with). Assumes that a term worth having raises R2 by
+    about one step of n_terms / n_norm: any other is dropped, by construction.
+    """
+
+    n_norm: str = "library"
+    label: ClassVar[str] = "d_pareto"
+
+    def __post_init__(self) -> None:
+        if self.n_norm not in ("library", "max_terms"):
+            raise ValueError(f"n_norm must be 'library' or 'max_terms': {self.n_norm!r} came")
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        return [np.hypot(f.errors, f.sizes / _norm_of_sizes(f, self.n_norm)) for f in fronts]
+
+
+@dataclass(frozen=True)
+class LogKnee:
+    """The knee of the logarithm of the error, so that a small term of an exact law counts.
+
+    score = sqrt(((log e - log e_min) / (log e_max - log e_min))^2 + (n_terms / n_norm)^2).
+    Assumes that errors span orders of magnitude: the largest fall sets the scale, and a true
+    term that lowers the error by less than one step of it is dropped.
+    """
+
+    n_norm: str = "library"
+    label: ClassVar[str] = "d_log"
+
+    def __post_init__(self) -> None:
+        Knee(self.n_norm)
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        found = []
+        for front in fronts:
+            height = np.log(np.maximum(front.errors, FLOOR))
+            height = (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
+            found.append(np.hypot(height, front.sizes / _norm_of_sizes(front, self.n_norm)))
+        return found
+
+
+def _norm_of_sizes(front: ParetoFront, n_norm: str) -> float:
+    if n_norm == "library":
+        return float(len(front.problem.library))
+    return float(front.sizes.max()) + 1.0
+
+
+@dataclass(frozen=True)
+class AICc:
+    """Akaike's criterion for small samples: which model will predict best.
+
+    Assumes Gaussian residuals, white after weighting by the rows' covariance where it is known
+    (`Weak`), and independent from row to row where it is not (`Differential`: neighbours of a
+    smoothed series are not, so it keeps too many terms). Not consistent: even with endless data
+    it keeps a needless term now and then.
+    Source: Hurvich & Tsai 1989, doi:10.1093/biomet/76.2.297.
+    """
+
+    label: ClassVar[str] = "AICc"
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        return [_criterion(front, self._penalty) for front in fronts]
+
+    def _penalty(self, candidate: Candidate, n_rows: float) -> float:
+        k = candidate.n_terms
+        return 2.0 * k + 2.0 * k * (k + 1) / (n_rows - k - 1) if n_rows > k + 1 else np.inf
+
+
+@dataclass(frozen=True)
+class BIC:
+    """Schwarz's criterion: which model is most likely, all being equally likely before.
+
+    Assumes what `AICc` does of the residuals. There are many more models of middle size than
+    small ones, so with a library of any size it keeps too many terms.
+    Source: Schwarz 1978, doi:10.1214/aos/1176344136.
+    """
+
+    label: ClassVar[str] = "BIC"
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        return [_criterion(front, self._penalty) for front in fronts]
+
+    def _penalty(self, candidate: Candidate, n_rows: float) -> float:
+        return candidate.n_terms * log(n_rows)
+
+
+@dataclass(frozen=True)
+class EBIC:
+    """The extended criterion: sizes are equally likely before, not models.
+
+    score = n log(RSS / n) + k log n + 2 gamma log(number of supports of k terms). Libraries are
+    nested by degree, and the supports are counted in the smallest that holds this one: simple
+    terms need not pay for the many of high degree.
+    Assumes what `AICc` does of the residuals. coarsening: no model is exact, and with n rows any
+    discrepancy becomes significant; the likelihood is raised to the power 1 / (1 + n/coarsening),
+    so that evidence stops growing at about that many rows. None: trust the residuals to the end.
+    Source: Chen & Chen 2008, doi:10.1093/biomet/asn034; Miller & Dunson 2019,
+    doi:10.1080/01621459.2018.1469995.
+    """
+
+    gamma: float = 1.0
+    coarsening: float | None = 60.0
+    label: ClassVar[str] = "EBIC"
+
+    def __post_init__(self) -> None:
+        if not self.gamma >= 0.0:
+            raise ValueError(f"gamma must be zero or more: {self.gamma} came")
+        if self.coarsening is not None and not self.coarsening > 1.0:
+            raise ValueError(
+                f"coarsening counts rows, and must be above 1: {self.coarsening} came; None "
+                "trusts the residuals to the end"
+            )
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        found = []
+        for front in fronts:
+            library = front.problem.library
+
+            def penalty(candidate: Candidate, n_rows: float, library: Library = library) -> float:
+                ways = log_supports(library, candidate.terms)
+                return candidate.n_terms * log(n_rows) + 2.0 * self.gamma * ways
+
+            found.append(_criterion(front, penalty, coarsening=self.coarsening))
+        return found
+
+
+def log_supports(library: Library, terms: Sequence[str]) -> float:
+    """Log of the number of supports of this size among terms of no higher degree than these."""
+    degrees = library.exponents.sum(axis=1)
+    highest = max((degrees[library.index(name)] for name in terms), default=0)
+    return log(comb(int((degrees <= highest).sum()), len(terms)))
+
+
+def _criterion(
+    front: ParetoFront,
+    penalty: Callable[[Candidate, float], float],
+    *,
+    coarsening: float | None = None,
+) -> Float[np.ndarray, " candidates"]:
+    """n log(RSS / n) + penalty of every candidate, its rows weighted where noise is known.
+
+    The weights depend on the model: those of the leading candidate serve all, in rounds, until
+    the leader stays.
+    """
+    problem = front.problem
+    n_rows, n_terms = len(problem.train_rows), len(problem.library)
+    n_effective = float(n_rows if coarsening is None else n_rows / (1.0 + n_rows / coarsening))
+    penalties = np.array([penalty(c, n_effective) for c in front.candidates])
+    masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
+    equation = problem.equations.index(front.equation)
+    theta, target = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms + equation]
+    leader = -1
+    for _ in range(MAX_ROUNDS):
+        squares, coef = _fits(theta, target, masks)
+        scores = n_effective * np.log(squares / n_rows) + penalties
+        if problem.noisy is None or int(np.argmin(scores)) == leader:
+            break
+        leader = int(np.argmin(scores))
+        white = whitened_rows(problem, masks[leader], coef[leader])
+        theta, target = white.theta, white.target
+    return scores
+
+
+def _fits(
+    theta: Float[np.ndarray, "rows terms"],
+    target: Float[np.ndarray, " rows"],
+    masks: Bool[np.ndarray, "candidates terms"],
+) -> tuple[Float[np.ndarray, " candidates"], Float[np.ndarray, "candidates terms"]]:
+    """Least squares of every support: residual squares, no lower than the floor, and coef."""
+    # The triangle keeps all that least squares needs of the rows, at the rows' own condition.
+    triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
+    columns, right = triangle[:, :-1], triangle[:, -1]
+    coef = np.zeros(masks.shape)
+    for fit, mask in zip(coef, masks, strict=True):
+        fit[mask] = np.linalg.lstsq(columns[:, mask], right)[0]
+    squares = np.square(right - coef @ columns.T).sum(axis=1)
+    return np.maximum(squares, FLOOR * (right @ right)), coef

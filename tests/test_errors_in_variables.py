@@ -1,0 +1,227 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ep2sindy.discover import discover
+from ep2sindy.errors_in_variables import WeightedWeak, reweighted, whitened_rows
+from ep2sindy.library import named_terms, polynomial
+from ep2sindy.pareto import Candidate, fit_support, pareto_front
+from ep2sindy.regression import RandomSplit, Regression
+from ep2sindy.search import BestSubset, Bootstraps, pooled_supports
+from ep2sindy.selection import EBIC
+from ep2sindy.studies.benchmark import realization
+from ep2sindy.systems import System, lorenz, lotka_volterra
+from ep2sindy.trajectory import Trajectory
+from ep2sindy.weak import Weak
+from ep2sindy.windows import Bumps
+
+EVERY_ROW = Weak(split=RandomSplit(0.0))
+
+
+def problems_of(system: System, runs: list[Trajectory]) -> tuple[Regression, ...]:
+    return EVERY_ROW.assemble(runs, system.model.library, rng=np.random.default_rng(0))
+
+
+def noisy_runs(system: System, noise: float, n: int = 1) -> list[Trajectory]:
+    return [system.trajectory(noise=noise, rng=np.random.default_rng(k)) for k in range(n)]
+
+
+def fitted(system: System, problem: Regression) -> Candidate:
+    (state,) = problem.equations
+    return reweighted(problem, fit_support(problem, state, list(system.model.terms(state))))
+
+
+def mask_and_coef(problem: Regression, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
+    """A candidate as whitened_rows takes it."""
+    mask = np.isin(problem.term_names, candidate.terms)
+    coef = np.zeros(len(mask))
+    scale = problem.target_scale[0] / problem.theta_scale
+    coef[mask] = candidate.coef / scale[mask]
+    return mask, coef
+
+
+def test_whitened_residuals_of_the_truth_are_white_with_unit_variance() -> None:
+    system = lotka_volterra()
+    squares, products = [], []
+    for problem in problems_of(system, noisy_runs(system, 0.02, n=12)):
+        (state,) = problem.equations
+        truth = fit_support(problem, state, list(system.model.terms(state)))
+        truth = replace(truth, coef=np.array(list(system.model.terms(state).values())))
+        mask, coef = mask_and_coef(problem, truth)
+        rows = whitened_rows(problem, mask, coef, n_steps=0)
+        residual = rows.target - rows.theta @ coef
+        squares.append(np.square(residual).mean())
+        products.append((residual[1:] * residual[:-1]).mean())
+    # About 4000 rows each: five standard errors of the mean square and of the product.
+    assert squares == pytest.approx([1.0, 1.0], abs=5 * np.sqrt(2 / 4000))
+    assert products == pytest.approx([0.0, 0.0], abs=5 / np.sqrt(4000))
+
+
+def test_noise_in_a_linear_term_does_not_shrink_its_coefficient() -> None:
+    """Plain least squares on raw samples attenuates; following the noise does not."""
+    rng = np.random.default_rng(1)
+    t = np.arange(3000) * 0.01
+    exact = np.stack([np.sin(3 * t), 3 * np.cos(3 * t)], axis=1)  # x' = v, v' = -9 x
+    ratios = {"plain": [], "followed": []}
+    raw = Weak(Bumps(half_width_s=0.06), smooth_library=False, split=RandomSplit(0.0))
+    for _ in range(8):
+        states = exact + rng.standard_normal(exact.shape) * [0.3, 0.9]
+        run = Trajectory(t=t, states=states, state_names=["x", "v"])
+        problem = raw.assemble([run], polynomial(["x", "v"], degree=1), rng=rng)[1]
+        plain = fit_support(problem, "v", ["x"])
+        ratios["plain"].append(plain.coef[0] / -9.0)
+        ratios["followed"].append(reweighted(problem, plain).coef[0] / -9.0)
+    assert np.mean(ratios["plain"]) < 0.97
+    assert np.mean(ratios["followed"]) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("system", [lotka_volterra(), lorenz()], ids=lambda s: s.name)
+def test_errors_are_of_the_size_that_the_covariance_says(system: System) -> None:
+    scores = []
+    for k in range(10):
+        rng = np.random.default_rng(100 + k)
+        run = system.trajectory(noise=0.05, rng=rng)
+        for problem in problems_of(system, [run]):
+            candidate = fitted(system, problem)
+            truth = system.model.terms(candidate.equation)
+            error = candidate.coef - [truth[name] for name in candidate.terms]
+            scores.append(error @ np.linalg.solve(candidate.covariance, error) / len(error))
+    # Mean of chi-square per coefficient: standard error sqrt(2 / n), n = 10 x 4 or 10 x 7.
+    assert np.mean(scores) == pytest.approx(1.0, abs=3 * np.sqrt(2 / (10 * 4)))
+
+
+def test_units_change_nothing_but_units() -> None:
+    system = lotka_volterra()
+    (run,) = noisy_runs(system, 0.05)
+    big = replace(run, t=run.t * 1e-6, states=run.states * [1e18, 1e-3])
+    plain, scaled = problems_of(system, [run])[0], problems_of(system, [big])[0]
+    before, after = fitted(system, plain), fitted(system, scaled)
+    unit = 1e6 * np.array([1.0, 1e3])  # of x and x*y in x' = a x - b x y
+    assert after.coef == pytest.approx(before.coef * unit, rel=1e-6)
+    expected = before.covariance * np.outer(unit, unit)
+    np.testing.assert_allclose(after.covariance, expected, rtol=1e-4)
+
+
+def test_two_trajectories_narrow_the_intervals_like_independent_data() -> None:
+    system = lotka_volterra()
+    runs = noisy_runs(system, 0.05, n=4)
+    one = fitted(system, problems_of(system, runs[:1])[0]).covariance
+    four = fitted(system, problems_of(system, runs)[0]).covariance
+    assert np.sqrt(np.diag(one) / np.diag(four)) == pytest.approx([2.0, 2.0], rel=0.1)
+
+
+def test_a_noise_free_signal_keeps_its_exact_coefficients() -> None:
+    system = lotka_volterra()
+    problem = problems_of(system, [system.trajectory()])[0]
+    candidate = fitted(system, problem)
+    assert candidate.coef == pytest.approx([2 / 3, -1.0], rel=1e-5)
+
+
+def test_terms_that_cannot_explain_the_data_still_give_finite_rows() -> None:
+    system = lorenz()
+    problem = problems_of(system, noisy_runs(system, 0.2))[1]
+    candidate = reweighted(problem, fit_support(problem, "y", ["1", "z^2"]))
+    assert np.isfinite(candidate.coef).all()
+    assert np.isfinite(candidate.covariance).all()
+
+
+def test_weighted_rows_leave_exact_data_their_exact_coefficients() -> None:
+    system = lorenz()
+    rng = np.random.default_rng(0)
+    for problem in WeightedWeak().assemble([system.trajectory()], system.model.library, rng=rng):
+        (state,) = problem.equations
+        truth = system.model.terms(state)
+        fit = fit_support(problem, state, list(truth))
+        assert fit.coef_by_term == pytest.approx(truth, rel=1e-5)
+
+
+def test_weighted_rows_let_the_truth_lead_its_size_in_noise() -> None:
+    """A fast jump under 20 % noise: plain rows lose the truth, see docs/benchmark.md."""
+    led = {"plain": 0, "weighted": 0}
+    for number in range(6):
+        system, runs = realization("van_der_pol", 0.2, number)
+        for name, formulation in (("plain", EVERY_ROW), ("weighted", WeightedWeak())):
+            rng = np.random.default_rng(0)
+            problem = formulation.assemble(runs, system.model.library, rng=rng)[0]
+            (found,) = pooled_supports(problem, BestSubset(), Bootstraps(n=0), rng=rng)
+            front = pareto_front(problem, found)
+            led[name] += any(set(c.terms) == set(system.model.terms("x")) for c in front.candidates)
+    assert led["plain"] <= 4
+    assert led["weighted"] == 6
+
+
+def test_weighted_rows_may_be_searched_again_with_weights_of_their_own() -> None:
+    """The last fit goes back to the samples: it does not weigh weighted rows once more."""
+    system = lotka_volterra()
+    runs = noisy_runs(system, 0.05)
+    rng = np.random.default_rng(0)
+    plain = problems_of(system, runs)[0]
+    weighted = WeightedWeak().assemble(runs, system.model.library, rng=rng)[0]
+    first, second = fitted(system, plain), fitted(system, weighted)
+    assert second.coef == pytest.approx(first.coef, rel=1e-6)
+    np.testing.assert_allclose(second.covariance, first.covariance, rtol=1e-4)
+
+
+def test_weighted_rows_cannot_be_held_out() -> None:
+    system = lotka_volterra()
+    formulation = WeightedWeak(weak=Weak(split=RandomSplit(0.25)))
+    with pytest.raises(ValueError, match="set weak.split.test_fraction to 0"):
+        formulation.assemble(
+            [system.trajectory()], system.model.library, rng=np.random.default_rng(0)
+        )
+    with pytest.raises(ValueError, match="weak.errors_in_variables"):
+        WeightedWeak(weak=Weak(errors_in_variables=False))
+
+
+def test_a_discovered_model_knows_its_intervals() -> None:
+    system = lotka_volterra()
+    found = discover(
+        noisy_runs(system, 0.05),
+        system.model.library,
+        formulation=EVERY_ROW,
+        search=BestSubset(),
+        bootstraps=Bootstraps(n=0),
+        selection=EBIC(),
+        rng=np.random.default_rng(0),
+    )
+    assert set(found.model.terms("x")) == {"x", "x*y"}
+    low, high = found.model.intervals("x")["x*y"]
+    assert low < found.model.terms("x")["x*y"] < high
+    assert 0.0 < high - low < 0.1
+
+
+def test_an_input_may_be_noisy_too() -> None:
+    """x' = -x + u, with noise on both; u is no state, and its noise is followed all the same."""
+    rng = np.random.default_rng(2)
+    t = np.arange(4000) * 0.005
+    u = np.sin(2 * t)
+    x = 0.2 * np.sin(2 * t) - 0.4 * np.cos(2 * t) + 0.4 * np.exp(-t)
+    noise = 0.05 * rng.standard_normal((2, len(t)))
+    run = Trajectory(
+        t=t,
+        states=(x + noise[0])[:, None],
+        state_names=["x"],
+        inputs=(u + noise[1])[:, None],
+        input_names=["u"],
+    )
+    library = named_terms(["x", "u"], ["x", "u"])
+    (problem,) = EVERY_ROW.assemble([run], library, rng=rng)
+    candidate = reweighted(problem, fit_support(problem, "x", ["x", "u"]))
+    error = np.abs(candidate.coef - [-1.0, 1.0]) / np.sqrt(np.diag(candidate.covariance))
+    assert error.max() < 3.5
+    assert np.sqrt(np.diag(candidate.covariance)).max() < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lotka_volterra", "lorenz"])
+def test_intervals_of_95_percent_hold_the_truth_in_90_to_98_of_100(name: str) -> None:
+    inside = []
+    for number in range(200):
+        system, runs = realization(name, 0.05, number, seed=1)
+        for problem in problems_of(system, runs):
+            candidate = fitted(system, problem)
+            truth = system.model.terms(candidate.equation)
+            error = candidate.coef - [truth[term] for term in candidate.terms]
+            inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(candidate.covariance)))
+    assert 0.90 <= np.concatenate(inside).mean() <= 0.98

@@ -1,0 +1,264 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ep2sindy.discover import Discovery, discover
+from ep2sindy.library import Library, polynomial
+from ep2sindy.names import split_factors
+from ep2sindy.regression import BlockSplit, RandomSplit, Regression
+from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.selection import EBIC
+from ep2sindy.smoothing import NoSmoothing
+from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
+from ep2sindy.trajectory import Trajectory
+from ep2sindy.weak import Weak
+from ep2sindy.windows import Boxes, Bumps
+
+SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
+EVERY_ROW = Weak(split=RandomSplit(test_fraction=0.0))
+# The thesis's: no smoothing, no weights.
+RAW_BOXES = Weak(
+    test_functions=Boxes(n_windows=300, n_points=20),
+    smoother=NoSmoothing(),
+    smooth_library=False,
+    errors_in_variables=False,
+)
+
+
+def assembled(
+    form: Weak, runs: list[Trajectory], library: Library | None = None
+) -> tuple[Regression, ...]:
+    library = polynomial(list(runs[0].state_names), degree=2) if library is None else library
+    return form.assemble(runs, library, rng=np.random.default_rng(0))
+
+
+def found_in(run: Trajectory, library: Library, form: Weak = EVERY_ROW) -> Discovery:
+    return discover(
+        [run],
+        library,
+        formulation=form,
+        search=BestSubset(),
+        bootstraps=Bootstraps(n=0),
+        selection=EBIC(),
+        rng=np.random.default_rng(1),
+    )
+
+
+def noisy(system: System, noise: float = 0.01) -> Trajectory:
+    return system.trajectory(noise=noise, rng=np.random.default_rng(0))
+
+
+def dense(problem: Regression) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the training rows on the samples: of the terms, and of the state."""
+    assert problem.noisy is not None
+    return problem.noisy.mean.toarray(), problem.noisy.slope.toarray()
+
+
+@pytest.mark.parametrize("form", [Weak(), EVERY_ROW], ids=["held out", "every row"])
+@pytest.mark.parametrize("system", SYSTEMS, ids=lambda s: s.name)
+def test_known_systems_come_back_from_samples_without_noise(system: System, form: Weak) -> None:
+    found = found_in(system.trajectory(), system.model.library, form)
+    for state in system.model.states:
+        truth = system.model.terms(state)
+        # Integrated to 1e-10, and bumps end at 1e-10 of their height; nothing else is lost.
+        assert found.model.terms(state) == pytest.approx(truth, rel=2e-9)
+
+
+def test_every_state_has_a_regression_of_its_own() -> None:
+    problems = assembled(EVERY_ROW, [noisy(lotka_volterra())])
+    assert [p.equations for p in problems] == [("x",), ("y",)]
+    assert len(problems[0].theta) != len(problems[1].theta)  # x is faster than y
+
+
+def test_rows_are_means_of_terms_and_slopes_over_windows() -> None:
+    run = noisy(lotka_volterra())
+    form = replace(EVERY_ROW, smooth_library=False)
+    for state, problem in enumerate(assembled(form, [run])):
+        mean, slope = dense(problem)
+        assert problem.theta == pytest.approx(mean @ problem.library.evaluate(run.states))
+        assert problem.target[:, 0] == pytest.approx(slope @ run.states[:, state])
+
+
+def test_windows_of_two_points_are_the_differential_form() -> None:
+    t = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, size=120)) * 1e-2
+    run = Trajectory(t=t, states=np.sin(7 * t)[:, None], state_names=["x"])
+    functions = Boxes(n_windows=100, n_points=2)
+    form = replace(RAW_BOXES, test_functions=functions, split=RandomSplit(test_fraction=0.0))
+    (problem,) = assembled(form, [run])
+    k = functions.windows(run.t, run.states[:, 0], rng=np.random.default_rng(0)).first
+    terms, x = problem.library.evaluate(run.states), run.states[:, 0]
+    assert problem.theta == pytest.approx(0.5 * (terms[k] + terms[k + 1]), rel=1e-12)
+    quotient = (x[k + 1] - x[k]) / (t[k + 1] - t[k])
+    assert problem.target[:, 0] == pytest.approx(quotient, rel=1e-12)
+    # Second-order about the middle of the step: (7 h)^2 / 24 at steps of up to 15 ms.
+    middle = 0.5 * (t[k] + t[k + 1])
+    assert problem.target[:, 0] == pytest.approx(7 * np.cos(7 * middle), abs=7 * 5e-4)
+
+
+@pytest.mark.parametrize("smooth_library", [True, False])
+def test_windows_never_cross_trajectories(smooth_library: bool) -> None:
+    first = noisy(lotka_volterra())
+    second = noisy(replace(lotka_volterra(), rate_Hz=25.0, initial=np.array([0.3, 1.2])))
+    second = second.window(0, 700)
+    form = replace(EVERY_ROW, smooth_library=smooth_library)
+    together = assembled(form, [first, second])
+    apart = [assembled(form, [run]) for run in (first, second)]
+    for both, a, b in zip(together, *apart, strict=True):
+        assert both.theta == pytest.approx(np.concatenate([a.theta, b.theta]), rel=1e-12)
+        assert both.target == pytest.approx(np.concatenate([a.target, b.target]), rel=1e-12)
+        assert np.array_equal(both.groups[: len(a.groups)], a.groups)
+        assert np.array_equal(both.groups[len(a.groups) :], b.groups + a.groups.max() + 1)
+        for joined, left, right in zip(dense(both), dense(a), dense(b), strict=True):
+            assert np.array_equal(joined[: len(left), : left.shape[1]], left)
+            assert np.array_equal(joined[len(left) :, left.shape[1] :], right)
+            assert not joined[: len(left), left.shape[1] :].any()
+            assert not joined[len(left) :, : left.shape[1]].any()
+        for name in ("values", "smoothed", "noise_std"):
+            parts = [getattr(p.noisy, name) for p in (a, b)]
+            assert np.array_equal(getattr(both.noisy, name), np.concatenate(parts))
+
+
+@pytest.mark.parametrize("split", [RandomSplit(0.25), BlockSplit(0.3, n_blocks=5)])
+@pytest.mark.parametrize(
+    "form", [replace(Weak(), smooth_library=False), RAW_BOXES], ids=["bumps", "boxes"]
+)
+def test_no_training_row_shares_a_sample_with_a_held_out_row(
+    form: Weak, split: RandomSplit | BlockSplit
+) -> None:
+    run = noisy(lotka_volterra())
+    rng = np.random.default_rng(0)
+    windows = [form.test_functions.windows(run.t, x, rng=rng) for x in run.states.T]
+    for state, problem in enumerate(assembled(replace(form, split=split), [run])):
+        touched = np.zeros((2, run.n_samples), dtype=bool)
+        every_target = windows[state].slope @ run.states[:, state]
+        for target, test in zip(problem.target[:, 0], problem.test, strict=True):
+            k = int(np.argmin(np.abs(every_target - target)))
+            assert every_target[k] == pytest.approx(target, rel=1e-12)
+            touched[int(test), windows[state].first[k] : windows[state].last[k] + 1] = True
+        assert touched.any(axis=1).all()
+        assert not touched.all(axis=0).any()
+        # Nor do they share a group, and time runs along the groups.
+        assert not set(problem.groups[problem.test]) & set(problem.groups[~problem.test])
+        assert np.all(np.diff(problem.groups) >= 0)
+
+
+def test_noise_is_followed_into_the_training_rows_alone() -> None:
+    run = noisy(lotka_volterra())
+    problem = assembled(replace(Weak(), smooth_library=False), [run])[0]
+    assert problem.test.any()
+    mean, slope = dense(problem)
+    train = ~problem.test
+    assert problem.theta[train] == pytest.approx(mean @ problem.library.evaluate(run.states))
+    assert problem.target[train, 0] == pytest.approx(slope @ run.states[:, 0])
+
+
+def test_a_record_of_a_few_windows_holds_nothing_out() -> None:
+    run = noisy(lotka_volterra()).window(0, 60)
+    for problem in assembled(replace(Weak(), test_functions=Bumps(half_width_s=1.0)), [run]):
+        assert not problem.test.any()
+
+
+def test_raw_and_smoothed_libraries_differ_only_in_theta() -> None:
+    run = noisy(lotka_volterra(), 0.05)
+    raw_form = replace(EVERY_ROW, smooth_library=False)
+    for smooth, raw in zip(assembled(EVERY_ROW, [run]), assembled(raw_form, [run]), strict=True):
+        assert np.array_equal(raw.target, smooth.target)
+        assert np.abs(raw.theta - smooth.theta).max() > 1e-3
+        assert raw.noisy is not None
+        assert smooth.noisy is not None
+        assert np.array_equal(raw.noisy.smoothed, smooth.noisy.smoothed)
+        assert np.array_equal(raw.noisy.values, run.states)
+
+
+def test_without_errors_in_variables_no_noise_is_estimated() -> None:
+    for problem in assembled(replace(Weak(), errors_in_variables=False), [noisy(van_der_pol())]):
+        assert problem.noisy is None
+
+
+def test_rescaling_units_rescales_coefficients_and_nothing_else() -> None:
+    run = noisy(lotka_volterra())
+    scale, tempo = np.array([1e18, 3e-14]), 1e-5
+    rescaled = Trajectory(t=run.t * tempo, states=run.states * scale, state_names=["x", "y"])
+    library = polynomial(["x", "y"], degree=2)
+    plain, other = (found_in(r, library) for r in (run, rescaled))
+    unit = (scale**library.exponents).prod(axis=1)[:, None]
+    # The smoother's ratio is found to 0.01 of a decade, and rounding may stop it elsewhere.
+    assert other.model.coef * unit * tempo / scale == pytest.approx(plain.model.coef, rel=1e-6)
+    for state, front in plain.fronts.items():
+        assert len(plain.model.terms(state)) == 2
+        terms = [c.terms for c in front.candidates]
+        assert [c.terms for c in other.fronts[state].candidates] == terms
+        assert other.scores[state] == pytest.approx(plain.scores[state], abs=1e-3)
+
+
+def test_permuting_the_library_changes_nothing() -> None:
+    run = noisy(lotka_volterra())
+    forth, back = (found_in(run, polynomial(v, degree=2)) for v in (["x", "y"], ["y", "x"]))
+    for state in ("x", "y"):
+        terms = {frozenset(split_factors(t)): c for t, c in forth.model.terms(state).items()}
+        permuted = {frozenset(split_factors(t)): c for t, c in back.model.terms(state).items()}
+        assert len(terms) == 2
+        assert permuted == pytest.approx(terms, rel=1e-9)
+
+
+def driven(u: np.ndarray, t: np.ndarray) -> Trajectory:
+    """x' = -x + 2 u, exact for inputs that are straight between samples."""
+    x, h = np.zeros_like(t), t[1] - t[0]
+    decay = np.exp(-h)
+    for k in range(len(t) - 1):
+        a, b = u[k], (u[k + 1] - u[k]) / h
+        x[k + 1] = decay * x[k] + 2 * (a * (1 - decay) + b * (h - 1 + decay))
+    return Trajectory(
+        t=t, states=x[:, None], state_names=["x"], inputs=u[:, None], input_names=["u"]
+    )
+
+
+def test_the_model_may_use_inputs() -> None:
+    t = np.linspace(0.0, 30.0, 1501)
+    found = found_in(driven(np.sin(t) + 0.5 * np.sin(2.3 * t), t), polynomial(["x", "u"], degree=2))
+    # The input's corners: its curvature of 3.6 times h^2 / 12 = 3e-5.
+    assert found.model.terms("x") == pytest.approx({"x": -1.0, "u": 2.0}, rel=2e-4)
+
+
+def test_an_input_that_never_changes_is_no_obstacle() -> None:
+    t = np.linspace(0.0, 8.0, 801)
+    found = found_in(driven(np.full(801, 1.5), t), polynomial(["x", "u"], degree=1))
+    assert found.model.terms("x") == pytest.approx({"1": 3.0, "x": -1.0}, rel=1e-7)
+    messages = [a.message for a in found.ambiguities]
+    assert "'u' is a multiple of '1' on every row and is left out" in messages
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (np.full(50, 2.5), "'x' stays at 2.5 over all 50 samples; leave it out"),
+        (np.where(np.arange(50) == 12, np.nan, np.arange(50.0)), r"x\[12\] = nan at t = 12 s"),
+    ],
+)
+def test_states_without_change_or_samples_never_reach_the_rows(
+    state: np.ndarray, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        Trajectory(t=np.arange(50.0), states=state[:, None], state_names=["x"])
+
+
+def test_overlapping_boxes_have_no_errors_in_variables() -> None:
+    with pytest.raises(ValueError, match="needs smooth test functions: Boxes came; use Bumps, or"):
+        Weak(test_functions=Boxes())
+
+
+def test_trajectories_must_agree() -> None:
+    run = noisy(lotka_volterra())
+    other = Trajectory(t=run.t, states=run.states, state_names=["x", "z"])
+    with pytest.raises(ValueError, match=r"trajectory 1 has states \['x', 'z'\]"):
+        assembled(Weak(), [run, other])
+    with pytest.raises(ValueError, match="at least one trajectory"):
+        Weak().assemble([], polynomial(["x"], degree=1), rng=np.random.default_rng(0))
+
+
+def test_fewer_windows_than_terms_are_refused() -> None:
+    run = noisy(lotka_volterra())
+    form = replace(EVERY_ROW, test_functions=Bumps(half_width_s=45.0))
+    with pytest.raises(ValueError, match="library of 6 terms needs at least as many training rows"):
+        assembled(form, [run])
