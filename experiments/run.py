@@ -8,10 +8,16 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments import libraries
+from experiments import benchmark, frontier, libraries, weak, weak_windows
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-STUDIES = {"libraries": libraries.run}
+STUDIES = {
+    "libraries": libraries.run,
+    "benchmark": benchmark.run,
+    "weak": weak.run,
+    "weak_windows": weak_windows.run,
+    "frontier": frontier.run,
+}
 
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")

@@ -39,6 +39,8 @@ ORDER = [
     "estimators",
     "studies",
     "plots",
+    "weak_plots",
+    "study_plots",
     "report",
 ]
 # PyTorch is slow to import and of no use to the search; `report` needs its TensorBoard writer.
@@ -46,7 +48,7 @@ ALLOWED = {
     "torch": {"ode", "refine", "report"},
     "hydra": set(),
     "omegaconf": set(),
-    "matplotlib": {"plots", "report"},
+    "matplotlib": {"plots", "study_plots", "report", "weak_plots"},
 }
 
 

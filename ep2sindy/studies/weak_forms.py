@@ -1,0 +1,167 @@
+"""Known terms fitted in several forms of the regression: what each makes of the same samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ep2sindy.errors_in_variables import reweighted
+from ep2sindy.library import Library
+from ep2sindy.model import assemble_model
+from ep2sindy.pareto import Candidate, fit_support, r2
+from ep2sindy.regression import Formulation, Regression
+from ep2sindy.studies.libraries import Integrated, integrate, samples_in
+from ep2sindy.trajectory import Trajectory
+from ep2sindy.weak import Weak
+from ep2sindy.windows import Boxes, Bumps
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A form of the regression; weighted: its fit follows the noise of the samples to the rows."""
+
+    formulation: Formulation
+    weighted: bool = False
+
+    def __post_init__(self) -> None:
+        can = isinstance(self.formulation, Weak) and self.formulation.errors_in_variables
+        if self.weighted and not can:
+            raise ValueError(
+                "a weighted fit needs the formulation Weak with errors_in_variables: "
+                f"{self.formulation} came"
+            )
+
+    @property
+    def boxes(self) -> Boxes | None:
+        """The random windows of this form, if it has any."""
+        functions = self.formulation.test_functions if isinstance(self.formulation, Weak) else None
+        return functions if isinstance(functions, Boxes) else None
+
+    @property
+    def bumps(self) -> Bumps | None:
+        """The smooth windows of this form, if it has any."""
+        functions = self.formulation.test_functions if isinstance(self.formulation, Weak) else None
+        return functions if isinstance(functions, Bumps) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What one setting makes of a trajectory.
+
+    r2: by state, on the setting's own rows, which differ from setting to setting.
+    half_width: by state, in samples, for smooth windows; empty for others.
+    f_error: dominant frequency of the first state against the data's, minus one; NaN where the
+    integrated model diverges or dies out.
+    """
+
+    setting: Setting
+    r2: Mapping[str, float]
+    half_width: Mapping[str, int]
+    integrated: Integrated
+    f_error: float
+
+
+def boxes_grid(
+    form: Weak, *, n_windows: Sequence[int], n_points: Sequence[int]
+) -> dict[str, Setting]:
+    """One form with every number and length of windows, named by those that vary."""
+    grid = {}
+    for windows in n_windows:
+        for points in n_points:
+            varying = [("n_windows", windows, n_windows), ("n_points", points, n_points)]
+            name = "_".join(f"{key}_{value}" for key, value, all in varying if len(all) > 1)
+            boxes = Boxes(n_windows=windows, n_points=points)
+            grid[name or f"n_points_{points}"] = Setting(replace(form, test_functions=boxes))
+    return grid
+
+
+def check_windows(settings: Mapping[str, Setting], n_samples: int) -> None:
+    """Raise ValueError for boxes that are longer than a trajectory of `n_samples`."""
+    longest = max((s.boxes.n_points for s in settings.values() if s.boxes), default=0)
+    if longest > n_samples:
+        raise ValueError(
+            f"windows must fit the data: n_points={longest} was asked of {n_samples} samples; "
+            "lower n_points or use more data"
+        )
+
+
+def fitted_terms(
+    trajectories: Sequence[Trajectory],
+    library: Library,
+    terms: Mapping[str, Sequence[str]],
+    setting: Setting,
+    *,
+    rng: np.random.Generator,
+) -> dict[str, tuple[Candidate, Regression]]:
+    """Fit given terms, state by state, and keep the rows that they were fitted to.
+
+    Raises ValueError as the form's `assemble` and `fit_support` do.
+    """
+    problems = setting.formulation.assemble(trajectories, library, rng=rng)
+    found = {}
+    for problem in problems:
+        for state in problem.equations:
+            candidate = fit_support(problem, state, terms[state])
+            if setting.weighted:
+                candidate = reweighted(problem, candidate)
+            found[state] = (candidate, problem)
+    return found
+
+
+def fit_settings(
+    run: Trajectory,
+    library: Library,
+    terms: Mapping[str, Sequence[str]],
+    settings: Mapping[str, Setting],
+    *,
+    f_data_Hz: float,
+    rollout_s: float | None,
+    rng: np.random.Generator,
+) -> dict[str, Fitted]:
+    """Fit the same terms in every setting and integrate each model from the first sample.
+
+    terms: state -> its terms. f_data_Hz: the frequency that models are held against. rollout_s:
+    how far to integrate; None, or more than there is, means to the data's end.
+    Each setting draws its windows from a stream of its own.
+    Raises ValueError, before any fit, for windows longer than the data.
+    """
+    check_windows(settings, run.n_samples)
+    widths = {name: _half_widths(run, setting.bumps, rng) for name, setting in settings.items()}
+    n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
+    results = {}
+    for (name, setting), stream in zip(settings.items(), rng.spawn(len(settings)), strict=True):
+        found = fitted_terms([run], library, terms, setting, rng=stream)
+        model = assemble_model(
+            library,
+            [candidate for candidate, _ in found.values()],
+            units=run.units,
+            provenance={"formulation": repr(setting.formulation), "trajectories": run.label},
+        )
+        integrated = integrate(model, run, n_samples)
+        results[name] = Fitted(
+            setting=setting,
+            r2={state: _r2_own_rows(*pair) for state, pair in found.items()},
+            half_width=widths[name],
+            integrated=integrated,
+            f_error=integrated.frequency_Hz[run.state_names[0]] / f_data_Hz - 1.0,
+        )
+    return results
+
+
+def _half_widths(run: Trajectory, bumps: Bumps | None, rng: np.random.Generator) -> dict[str, int]:
+    if bumps is None:
+        return {}
+    windows = [bumps.windows(run.t, x, rng=rng) for x in run.states.T]
+    return {
+        state: int(w.last[0] - w.first[0]) // 2
+        for state, w in zip(run.state_names, windows, strict=True)
+    }
+
+
+def _r2_own_rows(candidate: Candidate, problem: Regression) -> float:
+    columns = [problem.library.index(name) for name in candidate.terms]
+    prediction = candidate.coef[None] @ problem.theta[:, columns].T
+    truth = problem.target[:, problem.equations.index(candidate.equation)]
+    return float(r2(truth=truth, prediction=prediction)[0])

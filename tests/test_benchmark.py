@@ -1,0 +1,209 @@
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ep2sindy.library import Library
+from ep2sindy.regression import Differential
+from ep2sindy.search import STLSQ, AdaptiveLasso, Bootstraps
+from ep2sindy.selection import Knee
+from ep2sindy.studies.benchmark import (
+    Finding,
+    SearchVariant,
+    Variant,
+    cells,
+    judged,
+    merit_table,
+    realization,
+    run_benchmark,
+)
+from ep2sindy.study_plots import benchmark_figure
+from ep2sindy.trajectory import Trajectory
+
+TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
+# Draws random bootstraps and a random split: its outcome hangs on its stream.
+BALASSO = SearchVariant(Differential(), AdaptiveLasso(), Bootstraps(n=4), Knee())
+STLSQ_ = SearchVariant(Differential(), STLSQ(), Bootstraps(n=0), Knee())
+
+
+@dataclass
+class Scripted:
+    """Gives the findings it was told to give, and keeps the random numbers it was given."""
+
+    findings: list[Finding]
+    drawn: list[float] = field(default_factory=list)
+
+    def find(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> Finding:
+        self.drawn.append(rng.random())
+        return self.findings.pop(0)
+
+
+def outcomes_of(**settings) -> pd.DataFrame:
+    """Without the time, which no seed fixes."""
+    defaults = {"systems": ["lotka_volterra"], "noises": [0.2], "n_realizations": 2}
+    return run_benchmark(**(defaults | settings)).drop(columns="cpu_s")
+
+
+@pytest.mark.parametrize("name", ["oscillator", "lotka_volterra"])
+def test_a_seed_fixes_every_realization(name: str) -> None:
+    (first, (run,)), (again, (same,)) = (realization(name, 0.05, 3, seed=1) for _ in range(2))
+    np.testing.assert_array_equal(run.states, same.states)
+    np.testing.assert_array_equal(first.model.coef, again.model.coef)
+    for number, seed in ((4, 1), (3, 2)):
+        _, (other,) = realization(name, 0.05, number, seed=seed)
+        assert not np.array_equal(run.states, other.states)
+
+
+@pytest.mark.parametrize("name", ["oscillator", "van_der_pol"])
+def test_noise_levels_share_the_draw_and_scale_the_same_noise(name: str) -> None:
+    systems, runs = zip(*(realization(name, noise, 0) for noise in (0.0, 0.05, 0.2)), strict=True)
+    for system in systems:
+        np.testing.assert_array_equal(system.model.coef, systems[0].model.coef)
+    clean, low, high = (run.states for (run,) in runs)
+    np.testing.assert_allclose(high - clean, 4.0 * (low - clean), atol=1e-11)
+    rms = np.sqrt(np.square(clean).mean(axis=0))
+    # Standard deviation of n normal numbers: to 1 / sqrt(2 n), five times over.
+    np.testing.assert_allclose((low - clean).std(axis=0), 0.05 * rms, rtol=5 / np.sqrt(2e3))
+
+
+def test_further_trajectories_leave_the_first_as_it_was() -> None:
+    _, (alone,) = realization("van_der_pol", 0.05, 0)
+    _, (first, second) = realization("van_der_pol", 0.05, 0, n_trajectories=2)
+    np.testing.assert_array_equal(first.states, alone.states)
+    assert not np.allclose(first.states[0], second.states[0], atol=0.5)
+
+
+def test_leaving_a_variant_out_changes_no_other() -> None:
+    nothing = Finding(kept={"x": [], "y": []}, selected=None)
+    alone, beside = Scripted([nothing] * 2), Scripted([nothing] * 2)
+    outcomes_of(variants={"scripted": alone})
+    both = outcomes_of(variants={"STLSQ": STLSQ_, "scripted": beside, "BALASSO": BALASSO})
+    assert alone.drawn == beside.drawn
+    assert len(set(alone.drawn)) == 2
+    kept = both[both["variant"] == "BALASSO"].reset_index(drop=True)
+    pd.testing.assert_frame_equal(kept, outcomes_of(variants={"BALASSO": BALASSO}))
+
+
+def test_the_number_of_processes_changes_nothing() -> None:
+    settings = {"variants": {"BALASSO": BALASSO, "STLSQ": STLSQ_}}
+    pd.testing.assert_frame_equal(
+        outcomes_of(**settings, n_jobs=2), outcomes_of(**settings, n_jobs=1)
+    )
+
+
+def test_known_findings_give_exact_counts() -> None:
+    wrong = {"x": frozenset({"x"}), "v": frozenset({"v"})}
+    half = TRUTH | {"v": frozenset({"v"})}
+    whole = {state: [frozenset(), terms] for state, terms in TRUTH.items()}
+    scripted = Scripted(
+        [
+            Finding(whole, TRUTH),
+            Finding(whole, half),  # one equation right is not the system right
+            Finding(whole | {"v": [frozenset({"x"})]}, wrong),
+            Finding(whole, wrong),
+        ]
+    )
+    n_done: list[int] = []
+    outcomes = run_benchmark(
+        {"scripted": scripted},
+        systems=["oscillator"],
+        noises=[0.0],
+        n_realizations=4,
+        progress=n_done.append,
+    )
+    assert n_done == [1, 2, 3, 4]
+    assert outcomes["number"].tolist() == [0, 1, 2, 3]
+    assert outcomes["on_front"].tolist() == [1, 1, 0, 1]
+    assert outcomes["selected"].tolist() == [1, 0, 0, 0]
+    assert outcomes["correct_terms"].tolist() == [3, 2, 1, 1]
+    (cell,) = cells(outcomes).to_dict("records")
+    assert {k: cell[k] for k in ("on_front", "selected", "mean_correct_terms", "n")} == {
+        "on_front": 3,
+        "selected": 1,
+        "mean_correct_terms": 7 / 4,
+        "n": 4,
+    }
+
+
+def test_a_variant_that_selects_nothing_has_no_number_there() -> None:
+    found = judged(Finding({s: [t] for s, t in TRUTH.items()}, None), TRUTH)
+    assert found["on_front"] == 1.0
+    assert np.isnan([found["selected"], found["correct_terms"]]).all()
+    finding = Finding({s: [t] for s, t in TRUTH.items()}, None)
+    table = cells(
+        run_benchmark(
+            {"free": Scripted([finding] * 2)},
+            systems=["oscillator"],
+            noises=[0.0],
+            n_realizations=2,
+        )
+    )
+    assert table["on_front"].item() == 2
+    assert table[["selected", "mean_correct_terms"]].isna().to_numpy().all()
+
+
+def test_this_packages_path_is_a_variant_and_keeps_the_empty_support() -> None:
+    assert isinstance(BALASSO, Variant)
+    system, runs = realization("lotka_volterra", 0.0, 0)
+    found = BALASSO.find(runs, system.model.library, rng=np.random.default_rng(0))
+    truth = {state: frozenset(system.model.terms(state)) for state in ("x", "y")}
+    assert judged(found, truth) == {"on_front": 1.0, "selected": 1.0, "correct_terms": 4.0}
+    assert all(kept[0] == frozenset() for kept in found.kept.values())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"systems": ["pendulum"]}, "unknown systems ['pendulum']; there are ['oscillator', "),
+        ({"n_realizations": 0}, "a benchmark needs a realization, a system, a noise level"),
+        ({"noises": []}, "a benchmark needs a realization, a system, a noise level"),
+        ({"variants": {}}, "a benchmark needs a realization, a system, a noise level"),
+    ],
+)
+def test_a_benchmark_of_nothing_is_refused(settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        outcomes_of(**({"variants": {"STLSQ": STLSQ_}} | settings))
+
+
+def made_up_cells() -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Ours: two variants, two systems, two noise levels; published: one of them, and more."""
+    place = [(s, noise) for s in ("oscillator", "lorenz") for noise in (0.0, 0.2)]
+    rows = [(*p, v) for p in place for v in ("ours", "STLSQ")]
+    ours = pd.DataFrame(rows, columns=["system", "noise", "variant"]).assign(
+        on_front=np.arange(8.0), selected=np.nan, mean_correct_terms=2.5, n=10, cpu_s_per_search=1.0
+    )
+    published = ours[ours["variant"] == "STLSQ"].drop(columns="cpu_s_per_search")
+    published = published.assign(on_front=25.0, selected=5.0, n=50)
+    strangers = published.assign(variant="wALASSO"), published.assign(noise=0.7)
+    return ours, pd.concat([published, *strangers])
+
+
+def test_a_table_puts_the_published_row_below_its_variant() -> None:
+    ours, published = made_up_cells()
+    table = merit_table(ours, published, "on_front")
+    assert table.index.tolist() == [("ours", False), ("STLSQ", False), ("STLSQ", True)]
+    systems = ["oscillator", "oscillator", "lorenz", "lorenz"]
+    assert table.columns.tolist() == list(zip(systems, [0.0, 0.2, 0.0, 0.2], strict=True))
+    assert table.to_numpy().tolist() == [[0, 20, 40, 60], [10, 30, 50, 70], [50, 50, 50, 50]]
+    terms = merit_table(ours, published, "mean_correct_terms")
+    assert (terms.to_numpy() == 2.5).all()
+    alone = merit_table(ours, published.iloc[:0], "on_front")
+    assert alone.index.tolist() == [("ours", False), ("STLSQ", False)]
+
+
+def test_the_figure_writes_every_percentage_and_marks_what_is_missing() -> None:
+    ours, published = made_up_cells()
+    figure = benchmark_figure(ours, thesis=published)
+    on_front, selected = (
+        [text.get_text() for text in ax.texts if text.get_text()[0] in "–0123456789"]
+        for ax in figure.axes
+    )
+    assert on_front == ["0", "20", "40", "60", "10", "30", "50", "70", *4 * ["50"]]
+    assert selected == ["–"] * 8 + ["10"] * 4
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert names == ["ours", "STLSQ", "thesis"]

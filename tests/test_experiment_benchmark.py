@@ -1,0 +1,170 @@
+import json
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from ep2sindy.studies.benchmark import SearchVariant, Variant
+from experiments import benchmark, libraries
+from experiments.run import innermost
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=["+exp=benchmark", *overrides])
+
+
+def toy(output: Path) -> list[str]:
+    return [
+        f"output={output}",
+        "n_realizations=1",
+        "n_jobs=1",
+        "systems=[lotka_volterra,oscillator]",
+        "noises=[0,0.05]",
+        "variants=[ALASSO,ours]",
+    ]
+
+
+@pytest.fixture(scope="module")
+def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return benchmark.run(composed(*toy(tmp_path_factory.mktemp("outputs"))))
+
+
+def test_every_cell_is_counted(toy_run: Path) -> None:
+    summary = json.loads((toy_run / "summary.json").read_text())
+    assert list(summary) == ["experiment", "seed", "cells"]
+    assert (summary["experiment"], summary["seed"]) == ("benchmark", 0)
+    places = [(c["system"], c["noise"], c["variant"]) for c in summary["cells"]]
+    assert places == [
+        (system, noise, variant)
+        for system in ("lotka_volterra", "oscillator")
+        for noise in (0.0, 0.05)
+        for variant in ("ALASSO", "ours")
+    ]
+    for cell in summary["cells"]:
+        assert list(cell)[3:] == [
+            "on_front", "selected", "mean_correct_terms", "n", "cpu_s_per_search",
+        ]  # fmt: skip
+        assert type(cell["on_front"]) is type(cell["selected"]) is int
+        assert cell["n"] == 1
+    ours = [c for c in summary["cells"] if c["variant"] == "ours"]
+    assert all(c["on_front"] == c["selected"] == 1 for c in ours)
+    assert [c["mean_correct_terms"] for c in ours] == [4, 4, 3, 3]
+
+
+def test_the_thesis_stands_beside_our_cells(toy_run: Path) -> None:
+    table = pd.read_csv(toy_run / "tables" / "cells.csv")
+    columns = ["thesis_on_front", "thesis_selected", "thesis_mean_correct_terms"]
+    assert list(table.columns[-3:]) == columns
+    assert table[table["variant"] == "ours"][columns].isna().to_numpy().all()
+    alasso = table[table["variant"] == "ALASSO"][columns]
+    assert alasso.to_numpy().tolist() == [
+        [100, 92, 3.92],
+        [92, 91, 3.88],
+        [100, 0, 2],
+        [100, 47, 2],
+    ]
+    outcomes = pd.read_csv(toy_run / "tables" / "outcomes.csv")
+    assert len(outcomes) == 8
+    assert (outcomes["number"] == 0).all()
+
+
+def test_terminal_and_page_show_both(toy_run: Path) -> None:
+    log = (toy_run / "run.log").read_text()
+    page = (toy_run / "report.html").read_text()
+    for title in ("true equations on the front, %", "true equations selected, %", "true terms"):
+        assert title in log
+        assert title[1:] in page
+    assert max(map(len, log.splitlines())) <= 120
+    assert log.count("ALASSO, thesis") == 3
+    assert "<i>100/92</i>" in page
+    assert "EBIC(gamma=1.0, coarsening=60.0)" in page
+    assert 'src="figures/benchmark.png"' in page
+    for name in ("benchmark.png", "benchmark.pdf"):
+        assert (toy_run / "figures" / name).stat().st_size > 0
+    assert list((toy_run / "tensorboard").glob("events*"))
+
+
+def test_the_published_tables_are_those_of_the_thesis() -> None:
+    thesis = OmegaConf.to_container(composed().thesis)
+    table = benchmark.published_cells(thesis).set_index(["variant", "system", "noise"])
+    assert len(table) == 4 * 4 * 3
+    assert table.loc[("STLSQ", "oscillator", 0.2), "selected"] == 55.0  # 57.9 % of 95
+    assert table.loc[("BALASSO", "oscillator", 0.05), "selected"] == 0.1  # 0.11 % as printed
+    assert table.loc[("wALASSO", "van_der_pol", 0.05), "selected"] == 9.0  # 22.0 % of 41
+    # Sums over the printed tables.
+    assert table["on_front"].sum() == 3367
+    assert table["selected"].isna().sum() == 7
+    assert table["mean_correct_terms"].sum() == pytest.approx(171.42)
+
+
+def test_every_definition_makes_a_variant() -> None:
+    config = composed()
+    assert set(config.variants) == set(config.definitions)
+    for name, definition in config.definitions.items():
+        if not name.startswith("PySINDy"):
+            assert isinstance(instantiate(definition), SearchVariant)
+    made = {n: instantiate(config.definitions[n]) for n in ("ALASSO", "BALASSO", "BALASSO_depth3")}
+    assert (made["ALASSO"].bootstraps.n, made["BALASSO"].bootstraps.n) == (0, 32)
+    assert (made["BALASSO"].depth, made["BALASSO_depth3"].depth) == (1, 3)
+    assert made["BALASSO"].search == made["ALASSO"].search
+    assert not made["ALASSO"].formulation.smooth_library
+
+
+def test_every_rival_makes_a_variant() -> None:
+    pytest.importorskip("pysindy")
+    for name, definition in composed().definitions.items():
+        if name.startswith("PySINDy"):
+            assert isinstance(instantiate(definition), Variant)
+
+
+def test_a_rival_without_pysindy_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pysindy", None)
+    config = composed(*toy(tmp_path), "variants=[ours,PySINDy_SSR]")
+    message = r"'PySINDy_SSR' needs PySINDy: pip install \"ep2sindy\[benchmark\]\".*variants=\[ours"
+    with pytest.raises(ValueError, match=message):
+        benchmark.run(config)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("n_realizations=0", "n_realizations must be a whole number, one or more: 0 came"),
+        ("n_realizations=1.5", "n_realizations must be a whole number, one or more: 1.5 came"),
+        ("n_trajectories=true", "n_trajectories must be a whole number, one or more: True came"),
+        ("n_jobs=0", "n_jobs must be a number of processes"),
+        ("noises=[0.1,-0.1]", "noises must be numbers, zero or more: -0.1 came"),
+        ("noises=[nan]", "noises must be numbers, zero or more: nan came"),
+        ("noises=0.1", "noises must be a list"),
+        ("noises=[0,0.0]", "noises must be a list such as [a,b], each once"),
+        ("systems=[]", "systems must be a list"),
+        ("systems=[pendulum]", "unknown systems ['pendulum']; there are"),
+        ("variants=[our]", "unknown variants ['our']; there are "),
+        ("definitions.ours.selection.gamma=-1.0", "gamma must be zero or more"),
+        ("+definitions.ours.selection.gama=1", "unexpected keyword argument 'gama'"),
+        ("definitions.ours={_target_:builtins.dict}", "definitions.ours must name a _target_"),
+        ("+rollout_s=1", "unknown keys ['rollout_s']; there are "),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(override: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises((ValueError, HydraException)) as caught:
+        benchmark.run(composed(*toy(tmp_path), override))
+    assert message in str(innermost(caught.value))
+
+
+def test_a_key_of_this_study_does_nothing_in_another(tmp_path: Path) -> None:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = compose(
+            "config", overrides=["+exp=breathing", "+n_realizations=3", f"output={tmp_path}"]
+        )
+    with pytest.raises(ValueError, match="unknown keys \\['n_realizations'\\]"):
+        libraries.run(config)

@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+
+pytest.importorskip("pysindy")
+
+from benchmarks.pysindy_variants import (
+    Ensemble,
+    Rival,
+    Rows,
+    Smoothing,
+    Ssr,
+    Stlsq,
+    WeakForm,
+    best_of_each_size,
+    pysindy_library,
+)
+from ep2sindy.library import named_terms
+from ep2sindy.systems import lotka_volterra, van_der_pol
+
+METHODS = [Stlsq(), Ssr(), Ensemble(), WeakForm()]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+def test_every_method_has_the_truth_on_the_front_without_noise(method) -> None:
+    system = lotka_volterra()
+    run = system.trajectory()
+    rng = np.random.default_rng(0)
+    truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
+    found = method.candidates([run], system.model.library, rng=rng)
+    for candidates in found.values():
+        supports = [terms for terms, _ in candidates]
+        assert len(set(supports)) == len(supports)
+        assert all(r2 <= 1.0 for _, r2 in candidates)
+    # Two runs give the same names, their rows put one after the other.
+    halves = [run.window(0, 500), run.window(500, 1000)]
+    for runs in ([run], halves):
+        finding = Rival(method).find(runs, system.model.library, rng=rng)
+        assert finding.selected is None
+        assert all(truth[state] in finding.kept[state] for state in truth)
+
+
+def test_a_front_holds_the_best_of_each_size_and_the_empty_support() -> None:
+    candidates = [(("x",), 0.1), (("y",), 0.5), (("x", "y"), 0.9), (("x", "1"), 0.6)]
+    assert best_of_each_size(candidates) == [
+        frozenset(),
+        frozenset({"y"}),
+        frozenset({"x", "y"}),
+    ]
+    assert best_of_each_size([]) == [frozenset()]
+
+
+def test_pysindy_columns_are_put_in_our_order() -> None:
+    states = ("x", "y")
+    names = ("y^3", "x*y^2", "1", "x^3", "x^2*y", "y", "x*y", "x^2", "x", "y^2")
+    library = named_terms(states, names)
+    values = np.random.default_rng(1).normal(size=(7, 2))
+    features, order = pysindy_library(library, states)
+    theta = np.asarray(features.transform(values))[:, order]
+    np.testing.assert_allclose(theta, library.evaluate(values), rtol=1e-14)
+
+
+@pytest.mark.parametrize("variant", [Ssr(), WeakForm()])
+def test_cubic_terms_carry_our_names(variant) -> None:
+    system = van_der_pol()
+    rng = np.random.default_rng(0)
+    found = variant.candidates([system.trajectory()], system.model.library, rng=rng)
+    assert ("x", "y", "x^3") in [terms for terms, _ in found["x"]]
+    assert ("x",) in [terms for terms, _ in found["y"]]
+
+
+def test_a_library_that_pysindy_cannot_hold_is_refused() -> None:
+    with pytest.raises(ValueError, match="whole polynomial library"):
+        pysindy_library(named_terms(("x", "y"), ("x", "x*y")), ("x", "y"))
+
+
+def test_r2_is_that_of_a_least_squares_refit() -> None:
+    system = lotka_volterra()
+    rng = np.random.default_rng(3)
+    run = system.trajectory(noise=0.05, rng=rng)
+    library = system.model.library
+    rows = Smoothing().rows([run], library)
+    for terms, r2 in Stlsq().candidates([run], library, rng=rng)["x"]:
+        columns = rows.theta[:, [library.index(name) for name in terms]]
+        coef = np.linalg.lstsq(columns, rows.x_dot[:, 0], rcond=None)[0]
+        residual = rows.x_dot[:, 0] - columns @ coef
+        assert r2 == pytest.approx(1.0 - residual.var() / rows.x_dot[:, 0].var(), abs=1e-3)
+        total = np.square(rows.x_dot[:, 0] - rows.x_dot[:, 0].mean()).sum()
+        assert r2 == pytest.approx(1.0 - residual @ residual / total, abs=1e-12)
+
+
+def test_the_triangle_keeps_the_gram_matrix() -> None:
+    rng = np.random.default_rng(4)
+    rows = Rows(rng.normal(size=(50, 4)), rng.normal(size=(50, 2)))
+    theta, x_dot = rows.triangle
+    np.testing.assert_allclose(theta.T @ theta, rows.theta.T @ rows.theta, atol=1e-12)
+    np.testing.assert_allclose(theta.T @ x_dot, rows.theta.T @ rows.x_dot, atol=1e-12)
+
+
+@pytest.mark.parametrize("variant", [Ensemble(n_thresholds=2), WeakForm(n_domains=60)])
+def test_draws_come_from_the_rng_and_leave_the_global_state_alone(variant) -> None:
+    system = lotka_volterra()
+    run = system.trajectory(noise=0.05, rng=np.random.default_rng(5))
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    first, second = (
+        variant.candidates([run], system.model.library, rng=np.random.default_rng(6))
+        for _ in range(2)
+    )
+    assert first == second
+    assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
