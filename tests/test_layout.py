@@ -32,6 +32,8 @@ ORDER = [
     "errors_in_variables",
     "selection",
     "model",
+    "constraints",
+    "constrained",
     "ensemble",
     "validation",
     "systems",
