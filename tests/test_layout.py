@@ -38,6 +38,9 @@ ORDER = [
     "validation",
     "systems",
     "discover",
+    "ode",
+    "integral",
+    "refine",
     "estimators",
     "studies",
     "plots",
@@ -47,7 +50,7 @@ ORDER = [
 ]
 # PyTorch is slow to import and of no use to the search; `report` needs its TensorBoard writer.
 ALLOWED = {
-    "torch": {"ode", "refine", "report"},
+    "torch": {"ode", "integral", "refine", "report"},
     "hydra": set(),
     "omegaconf": set(),
     "matplotlib": {"plots", "study_plots", "report", "weak_plots"},

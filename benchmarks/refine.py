@@ -1,0 +1,274 @@
+"""Refinement against trajectories: multiple shooting against the plain ways, in CPU time.
+
+Synthetic breathing data, 12001 samples every 1.5 us, 2 % noise and 3 % lines at 100-180 kHz, and
+a model driven by two inputs. 30 windows of 100 samples that start at the data, one thread: the
+CPU time until the loss is within 1e-4 of its optimum; ours is that of a whole call, from windows
+to covariance, with a tolerance just enough for that. The simplex is the thesis's, with scipy's
+odeint window by window: on the model's own right-hand side, which serves any library; on the
+leanest one that still does; and on one written by hand for this model.
+
+    python -m benchmarks.refine
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+from scipy.integrate import odeint, solve_ivp
+from scipy.optimize import minimize
+from threadpoolctl import threadpool_limits
+
+from ep2sindy.integral.batch import WindowBatch, cut_windows
+from ep2sindy.integral.descent import GradientDescent, window_paths
+from ep2sindy.integral.multiple_shooting import MultipleShooting
+from ep2sindy.integral.problem import Iteration, Problem
+from ep2sindy.integral.single_shooting import SingleShooting
+from ep2sindy.integral.steps import HermiteSimpson
+from ep2sindy.library import named_terms
+from ep2sindy.model import SparseModel, coef_matrix
+from ep2sindy.ode import ODE
+from ep2sindy.refine import refine, refine_many
+from ep2sindy.trajectory import Trajectory
+
+DT_S, N_SAMPLES, N_WINDOWS, WINDOW = 1.5e-6, 12001, 30, 100
+CLOSE = 1e-4  # of the optimal loss
+STATES = ("n_i", "n_n")
+SOLVER = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-11}
+
+
+@dataclass(frozen=True)
+class Case:
+    """Data, and the model to start from."""
+
+    name: str
+    data: Trajectory
+    start: SparseModel
+
+
+def predator_prey(n_i: dict[str, float], n_n: dict[str, float]) -> SparseModel:
+    library = named_terms(STATES, ["n_i", "n_n", "n_i*n_n"])
+    return SparseModel(library, STATES, coef_matrix(library, [n_i, n_n]))
+
+
+TRUTH = predator_prey({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, {"n_n": 4.39e4, "n_i*n_n": -4.66e-14})
+START = predator_prey({"n_i": -1.45e5, "n_i*n_n": 4.12e-14}, {"n_n": 4.58e4, "n_i*n_n": -4.89e-14})
+
+
+def contaminated(states: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """2 % white noise, and 3 % lines between 100 and 180 kHz, of each state's std."""
+    std = states.std(axis=0)
+    frequency_Hz = rng.uniform(1e5, 1.8e5, (6, 2))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (6, 2))
+    lines = np.sin(2.0 * np.pi * frequency_Hz * t[:, None, None] + phase).sum(axis=1) / np.sqrt(3)
+    return states + std * (0.02 * rng.standard_normal(states.shape) + 0.03 * lines)
+
+
+def breathing_states(n_samples: int) -> tuple[np.ndarray, np.ndarray]:
+    t = np.arange(n_samples) * DT_S
+    scale = np.array([4e17, 3.5e18])
+    solution = solve_ivp(
+        lambda _, y: TRUTH.derivative(y * scale, np.empty(0)) / scale,
+        (0.0, t[-1]),
+        [1.0, 1.0],
+        t_eval=t,
+        **SOLVER,
+    )
+    return t, solution.y.T * scale
+
+
+def breathing(rng: np.random.Generator) -> Case:
+    t, states = breathing_states(N_SAMPLES)
+    return Case("predator-prey", Trajectory(t, contaminated(states, t, rng), STATES), START)
+
+
+def forced(rng: np.random.Generator) -> Case:
+    """n_i' = -41.2 n_i u + 0.82 n_i n_n R, n_n' = 1.83e23 - 0.77 n_i n_n R."""
+    t = np.arange(N_SAMPLES) * DT_S
+    variables = [*STATES, "u", "R"]
+    library = named_terms(variables, ["1", "n_i*u", "n_i*n_n*R"])
+    equations: list[Mapping[str, float]] = [
+        {"n_i*u": -41.2, "n_i*n_n*R": 0.82},
+        {"1": 1.83e23, "n_i*n_n*R": -0.77},
+    ]
+    truth = SparseModel(library, STATES, coef_matrix(library, equations))
+
+    def inputs(now: np.ndarray | float) -> np.ndarray:
+        turn = 2.0 * np.pi * np.asarray(now)
+        u = 4.0e3 * (1.0 + 0.1 * np.sin(9.0e3 * turn))
+        R = 5.7e-14 * (1.0 + 0.15 * np.sin(1.3e4 * turn + 1.0) + 0.05 * np.sin(2.9e4 * turn))
+        return np.stack([u, R], axis=-1)
+
+    scale = np.array([1.2e18, 3.5e18])
+    solution = solve_ivp(
+        lambda now, y: truth.derivative(y * scale, inputs(now)) / scale,
+        (0.0, t[-1]),
+        [0.5, 1.0],
+        t_eval=t,
+        **SOLVER,
+    )
+    states = contaminated(solution.y.T * scale, t, rng)
+    start = replace(truth, coef=truth.coef * np.array([[1.0, 0.95], [0.9, 1.0], [1.12, 1.08]]))
+    return Case("forced", Trajectory(t, states, STATES, inputs(t), ["u", "R"]), start)
+
+
+def problem(case: Case) -> Problem:
+    batch = cut_windows(
+        [case.data],
+        states=STATES,
+        inputs=case.start.inputs,
+        n_windows=N_WINDOWS,
+        window=WINDOW,
+        rng=np.random.default_rng(0),
+    )
+    ode = ODE(case.start, scale=batch.scale, step_s=batch.step_s)
+    return Problem((ode,), (batch,), free_start=False, n_reweights=0, observe=lambda _: None)
+
+
+def by_hand(batch: WindowBatch, coef: np.ndarray, scaling: np.ndarray) -> np.ndarray:
+    """Predator-prey trajectories by scipy's odeint on plain numbers."""
+    a, b, c, d = (float(value) for value in coef * scaling)
+
+    def rhs(x: np.ndarray, _: float) -> tuple[float, float]:
+        n_i, n_n = float(x[0]), float(x[1])
+        return a * n_i + b * n_i * n_n, c * n_n + d * n_i * n_n
+
+    t = np.arange(batch.data.shape[1], dtype=np.float64)
+    return np.stack([odeint(rhs, data[0], t) for data in batch.data])
+
+
+def by_model(work: Problem, model: SparseModel, scaling: np.ndarray) -> np.ndarray:
+    """Trajectories by scipy's odeint on the model's own right-hand side, without inputs."""
+    batch = work.batches[0]
+    coef = np.zeros_like(model.coef.T)
+    coef[model.coef.T != 0.0] = model.coef.T[model.coef.T != 0.0] * scaling
+    scaled = replace(model, coef=coef.T)
+    scale, none = batch.scale, np.empty(0)
+
+    def rhs(x: np.ndarray, _: float) -> np.ndarray:
+        return batch.step_s * scaled.derivative(x * scale, none) / scale
+
+    t = np.arange(batch.data.shape[1], dtype=np.float64)
+    return np.stack([odeint(rhs, data[0], t) for data in batch.data])
+
+
+def simplex_s(
+    paths: Callable[[np.ndarray], np.ndarray], data: np.ndarray, *, n_free: int, goal: float
+) -> float:
+    """CPU time until Nelder-Mead first meets the goal."""
+    begin = time.process_time()
+    reached = []
+
+    def loss(scaling: np.ndarray) -> float:
+        value = float(np.square(paths(scaling) - data).mean())
+        if value <= goal and not reached:
+            reached.append(time.process_time() - begin)
+        return value
+
+    def stop(_: np.ndarray) -> None:
+        if reached:
+            raise StopIteration
+
+    options = {"xatol": 1e-9, "fatol": 0.0, "maxiter": 5000}
+    minimize(loss, np.ones(n_free), method="Nelder-Mead", callback=stop, options=options)
+    return reached[0] if reached else float("nan")
+
+
+def descent_s(work: Problem, method: GradientDescent, *, goal: float) -> float:
+    """CPU time until the step that met the goal was done: its loss is reported by the next."""
+    times, losses = [time.process_time()], [np.inf]
+
+    def observe(iteration: Iteration) -> None:
+        times.append(time.process_time())
+        losses.append(iteration.loss)
+
+    method.fit(replace(work, observe=observe))
+    below = [k for k, loss in enumerate(losses) if loss <= goal]
+    return times[below[0] - 1] - times[0] if below else float("nan")
+
+
+def cpu_s(run: Callable[[], object], *, n_runs: int) -> float:
+    """Median CPU time of a few runs, after one that warms caches."""
+    run()
+    times = []
+    for _ in range(n_runs):
+        start = time.process_time()
+        run()
+        times.append(time.process_time() - start)
+    return float(np.median(times))
+
+
+def ours(case: Case, method: MultipleShooting | SingleShooting, *, free_start: bool) -> float:
+    """Loss of the whole call."""
+    found = refine(
+        case.start,
+        [case.data],
+        n_windows=N_WINDOWS,
+        window=WINDOW,
+        method=method,
+        free_start=free_start,
+        n_reweights=0,
+        rng=np.random.default_rng(0),
+    )
+    return found.loss
+
+
+def compare(case: Case) -> None:
+    shooting, brief = MultipleShooting(), MultipleShooting(tolerance=1e-2)
+    work = problem(case)
+    goal = (1.0 + CLOSE) * ours(case, MultipleShooting(tolerance=1e-10), free_start=False)
+    assert ours(case, brief, free_start=False) <= goal
+    base = cpu_s(partial(ours, case, brief, free_start=False), n_runs=9)
+    print(f"{case.name}: {N_WINDOWS} windows x {WINDOW} samples, to {CLOSE:g} of the optimum")
+    print(f"  multiple shooting                      {base:9.4f} s")
+    whole = cpu_s(partial(ours, case, shooting, free_start=False), n_runs=9)
+    print(f"  the same, to its usual tolerance       {whole:9.4f} s")
+    free = cpu_s(partial(ours, case, shooting, free_start=True), n_runs=9)
+    print(f"  the same, starts fitted too            {free:9.4f} s")
+    implicit = MultipleShooting(step=HermiteSimpson())
+    timed = cpu_s(partial(ours, case, implicit, free_start=False), n_runs=9)
+    print(f"  the same, Hermite-Simpson              {timed:9.4f} s")
+    others: dict[str, float] = {
+        "forward sensitivities, least_squares": cpu_s(
+            partial(ours, case, SingleShooting(), free_start=False), n_runs=3
+        ),
+        "torchdiffeq, L-BFGS": descent_s(work, GradientDescent(), goal=goal),
+    }
+    data, n_free = work.data[0], work.n_free
+    if case.name == "predator-prey":
+        unit = (work.odes[0].free0 * work.odes[0].unit).numpy()
+        paths = partial(by_hand, work.batches[0], unit)
+        others["simplex, odeint, by hand"] = simplex_s(paths, data, n_free=n_free, goal=goal)
+        paths = partial(by_model, work, case.start)
+        others["simplex, odeint, model.derivative"] = simplex_s(
+            paths, data, n_free=n_free, goal=goal
+        )
+    generic = partial(window_paths, work)
+    others["simplex, odeint, lean library"] = simplex_s(generic, data, n_free=n_free, goal=goal)
+    for name, value in others.items():
+        print(f"  {name:<38} {value:9.4f} s, {value / base:.0f} times")
+
+
+def many(n_points: int, rng: np.random.Generator) -> None:
+    """A grid of points with 10 windows each, all from the same start."""
+    t, states = breathing_states(1500)
+    data = [[Trajectory(t, contaminated(states, t, rng), STATES)] for _ in range(n_points)]
+    begin = time.process_time()
+    found = refine_many([START] * n_points, data, n_windows=10, window=WINDOW, rng=rng)
+    each_ms = 1e3 * (time.process_time() - begin) / n_points
+    n_converged = sum(each.status == "converged" for each in found)
+    print(f"{n_points} points x 10 windows: {each_ms:.2f} ms each, {n_converged} converged")
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    with threadpool_limits(limits=1):
+        compare(breathing(np.random.default_rng(0)))
+        many(2009, np.random.default_rng(1))
+        compare(forced(np.random.default_rng(2)))
+
+
+if __name__ == "__main__":
+    main()

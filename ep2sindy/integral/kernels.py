@@ -1,0 +1,151 @@
+"""Compiled recurrences over windows: condense linearised trajectories, propagate their changes.
+
+maps: (points, n, 1 + n + p, windows, steps): the end of each step started at its node, and the
+derivatives of that end by the node and by the p scalings. nodes: (points, windows, samples, n).
+A block is a stretch of `block` samples with a start of its own; n_start is n where starts are
+free, 0 where they are fixed to the data. Columns of a condensed system: the block's start, the
+scalings, the right-hand side.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
+    """R of a QR decomposition by Householder reflections; columns: (columns, rows), destroyed."""
+    n_columns = len(columns)
+    for i in range(min(n_columns, n_rows)):
+        pivot = columns[i]
+        square = 0.0
+        for r in range(i, n_rows):
+            square += pivot[r] * pivot[r]
+        norm = np.sqrt(square)
+        if norm != 0.0:  # NaN must spread
+            alpha = -norm if pivot[i] > 0.0 else norm
+            beta = 1.0 / (norm * (norm + abs(pivot[i])))
+            pivot[i] -= alpha
+            for j in range(i + 1, n_columns):
+                other = columns[j]
+                product = 0.0
+                for r in range(i, n_rows):
+                    product += pivot[r] * other[r]
+                product *= beta
+                for r in range(i, n_rows):
+                    other[r] -= product * pivot[r]
+            out[i, i] = alpha
+        for j in range(i + 1, n_columns):
+            out[i, j] = columns[j, i]
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _advance(
+    maps: np.ndarray, nodes: np.ndarray, p: int, w: int, k: int, x: np.ndarray, new: np.ndarray
+) -> None:
+    """Carry the columns of `x` (n, columns), the last being the defect's, over step k."""
+    n, n_columns = x.shape
+    n_start = n_columns - 1 - (maps.shape[2] - 1 - n)
+    for j in range(n):
+        for c in range(n_columns):
+            total = 0.0
+            for v in range(n):
+                total += maps[p, j, 1 + v, w, k] * x[v, c]
+            new[j, c] = total
+        for c in range(n_start, n_columns - 1):
+            new[j, c] += maps[p, j, 1 + n + c - n_start, w, k]
+        new[j, n_columns - 1] += maps[p, j, 0, w, k] - nodes[p, w, k + 1, j]
+    x[:] = new
+
+
+@njit(cache=True)
+def condense(
+    maps: np.ndarray,
+    nodes: np.ndarray,
+    data: np.ndarray,
+    weights: np.ndarray,
+    block: int,
+    n_start: int,
+) -> np.ndarray:
+    """R of weights * (linearised trajectory - data), block by block.
+
+    data: (points, windows, samples, n); weights: (points, n).
+    Returns (points, windows, blocks, columns, columns).
+    """
+    n_points, n, width, n_windows, n_steps = maps.shape
+    n_columns = n_start + width - n
+    n_blocks = (n_steps + block) // block
+    out = np.zeros((n_points, n_windows, n_blocks, n_columns, n_columns))
+    columns = np.empty((n_columns, block * n))
+    x = np.empty((n, n_columns))
+    new = np.empty((n, n_columns))
+    for p in range(n_points):
+        for w in range(n_windows):
+            for b in range(n_blocks):
+                first = b * block
+                last = min(first + block, n_steps + 1)
+                x[:] = 0.0
+                for j in range(n):
+                    if n_start:
+                        x[j, j] = 1.0
+                    else:
+                        x[j, n_columns - 1] = data[p, w, first, j] - nodes[p, w, first, j]
+                for k in range(first, last):
+                    for j in range(n):
+                        row = (k - first) * n + j
+                        for c in range(n_columns):
+                            columns[c, row] = weights[p, j] * x[j, c]
+                        columns[n_columns - 1, row] += weights[p, j] * (
+                            nodes[p, w, k, j] - data[p, w, k, j]
+                        )
+                    if k + 1 < last:
+                        _advance(maps, nodes, p, w, k, x, new)
+                _triangle(columns, (last - first) * n, out[p, w, b])
+    return out
+
+
+@njit(cache=True)
+def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
+    """Best change of each block's free start, given that of the scalings (points, p).
+
+    Returns (points, windows, blocks, n).
+    """
+    n_points, n_windows, n_blocks, n_columns, _ = condensed.shape
+    out = np.empty((n_points, n_windows, n_blocks, n))
+    for p in range(n_points):
+        for w in range(n_windows):
+            for b in range(n_blocks):
+                r = condensed[p, w, b]
+                for i in range(n - 1, -1, -1):
+                    total = -r[i, n_columns - 1]
+                    for c in range(n, n_columns - 1):
+                        total -= r[i, c] * change[p, c - n]
+                    for c in range(i + 1, n):
+                        total -= r[i, c] * out[p, w, b, c]
+                    out[p, w, b, i] = total / r[i, i]
+    return out
+
+
+@njit(cache=True)
+def propagate(
+    maps: np.ndarray, nodes: np.ndarray, start: np.ndarray, change: np.ndarray, block: int
+) -> np.ndarray:
+    """Change of every node that closes the linearised defects inside each block.
+
+    start: (points, windows, blocks, n), change of each block's first node; change: (points, p).
+    """
+    n_points, n, _, n_windows, n_steps = maps.shape
+    out = np.empty(nodes.shape)
+    for p in range(n_points):
+        for w in range(n_windows):
+            for k in range(n_steps + 1):
+                if k % block == 0:
+                    out[p, w, k] = start[p, w, k // block]
+                    continue
+                for j in range(n):
+                    total = maps[p, j, 0, w, k - 1] - nodes[p, w, k, j]
+                    for v in range(n):
+                        total += maps[p, j, 1 + v, w, k - 1] * out[p, w, k - 1, v]
+                    for i in range(change.shape[1]):
+                        total += maps[p, j, 1 + n + i, w, k - 1] * change[p, i]
+                    out[p, w, k, j] = total
+    return out

@@ -1,0 +1,140 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torchdiffeq import odeint
+
+from ep2sindy.constraints import constraint
+from ep2sindy.integral.steps import HermiteSimpson, RungeKutta
+from ep2sindy.integral.tangents import augmented
+from ep2sindy.library import named_terms
+from ep2sindy.model import SparseModel, coef_matrix
+from ep2sindy.ode import ODE, Drive
+from ep2sindy.systems import lotka_volterra
+
+SCALE = np.array([2.0, 3.0])
+
+
+def driven_model() -> SparseModel:
+    """x' = -x u + 3, y' = x^2 y - y: powers, a constant and an input."""
+    library = named_terms(["u", "x", "y"], ["1", "y", "u*x", "x^2*y"])
+    equations = [{"1": 3.0, "u*x": -1.0}, {"y": -1.0, "x^2*y": 0.4}]
+    return SparseModel(library, ["x", "y"], coef_matrix(library, equations))
+
+
+def constant_drive(value: float, n_batch: int, *, step: float = 1.0) -> Drive:
+    inputs = torch.zeros((1, 4, 1, 1, n_batch), dtype=torch.float64)
+    inputs[:, 3] = value
+    return Drive(torch.full((1, 1, n_batch), step, dtype=torch.float64), inputs)
+
+
+def test_rate_is_the_models_in_scaled_states_and_time() -> None:
+    model = driven_model()
+    ode = ODE(model, scale=np.array([2.0, 3.0, 5.0]), step_s=0.1)
+    ode.drive = constant_drive(0.7, 4, step=2.0)
+    x = np.random.default_rng(0).standard_normal((4, 2))
+    rate = ode(torch.tensor(0.3), torch.tensor(x)).detach().numpy()
+    inputs = np.full((4, 1), 0.7 * 5.0)
+    expected = model.derivative(x * SCALE, inputs) / SCALE * 0.1 * 2.0
+    np.testing.assert_allclose(rate, expected, rtol=1e-13)
+
+
+def test_relations_hold_to_rounding_for_any_scaling() -> None:
+    model = lotka_volterra().model
+    relations = constraint(
+        model.library,
+        {s: tuple(model.terms(s)) for s in model.states},
+        ["x: x*y == -1 * y: x*y", "y: y == -0.5"],
+    )
+    ode = ODE(model, scale=SCALE, step_s=0.1, constraint=relations)
+    assert len(ode.scaling) == 2
+    with torch.no_grad():
+        ode.scaling.copy_(torch.tensor([0.3, -7.0]))
+    coef = dict(zip(relations.coefficients, ode.coef.tolist(), strict=True))
+    assert coef["x", "x*y"] == -coef["y", "x*y"]
+    assert coef["y", "y"] == -0.5
+
+
+def test_tangents_agree_with_autograd() -> None:
+    ode = ODE(driven_model(), scale=np.array([2.0, 3.0, 5.0]), step_s=0.1)
+    x = torch.randn((3, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    ode.drive = constant_drive(0.7, 3)
+    system = augmented([ode])
+    scaling = torch.tensor([[1.1, 0.8, -0.5, 2.0]], dtype=torch.float64)
+    _, inputs = ode.drive.at(0.0)
+    out = system.fields(system.weights(scaling), x.T[None], inputs)[0].permute(2, 0, 1)
+
+    def rate(state: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
+        at = {"scaling": factors}
+        return torch.func.functional_call(ode, at, (torch.tensor(0.0), state))
+
+    by_state, by_scaling = torch.autograd.functional.jacobian(rate, (x, scaling[0]))
+    torch.testing.assert_close(out[:, :, 0], rate(x, scaling[0]).detach())
+    torch.testing.assert_close(out[:, :, 1:3], torch.einsum("bibj->bij", by_state))
+    torch.testing.assert_close(out[:, :, 3:], by_scaling)
+
+
+@pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(2), HermiteSimpson()])
+def test_steps_are_of_order_four(step: RungeKutta | HermiteSimpson) -> None:
+    """x' = -x from one: the end of a step against exp(-h)."""
+    library = named_terms(["x"], ["x"])
+    model = SparseModel(library, ["x"], np.array([[-1.0]]))
+    errors = []
+    for h in (0.2, 0.1):
+        ode = ODE(model, scale=np.ones(1), step_s=h)
+        drive = Drive(torch.ones((1, 1, 1), dtype=torch.float64), torch.zeros((1, 4, 1, 0, 1)))
+        nodes = np.array([1.0, np.exp(-h)]).reshape(1, 1, 2, 1)
+        maps = step.maps(augmented([ode]), drive, np.ones((1, 1)), nodes)
+        errors.append(abs(maps[0, 0, 0, 0, 0] - np.exp(-h)))
+        np.testing.assert_allclose(maps[0, 0, 1:, 0, 0], [np.exp(-h), -h * np.exp(-h)], rtol=2e-4)
+    # One step's error falls with the fifth power.
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(5.0, abs=0.2)
+
+
+def test_input_beyond_its_last_sample_is_refused() -> None:
+    with pytest.raises(ValueError, match="inputs must cover the window: t = 1.5 was asked of 1"):
+        constant_drive(1.0, 2).at(1.5)
+
+
+def test_cubic_inputs_drive_torchdiffeq_exactly() -> None:
+    """x' = u with u a cubic: rk4 integrates it exactly, over two segments."""
+    library = named_terms(["x", "u"], ["u"])
+    ode = ODE(SparseModel(library, ["x"], np.array([[1.0]])), scale=np.ones(2), step_s=1.0)
+    shifted = [[1.0, -2.0, 0.5, 3.0], [1.0, 1.0, -0.5, 2.5]]  # t^3 - 2 t^2 + t/2 + 3, about 0 and 1
+    inputs = torch.tensor(shifted, dtype=torch.float64).view(2, 4, 1, 1, 1)
+    ode.drive = Drive(torch.ones((2, 1, 1), dtype=torch.float64), inputs)
+    t = torch.arange(3, dtype=torch.float64)
+    path = odeint(ode, torch.zeros((1, 1), dtype=torch.float64), t, method="rk4")
+    exact = t**4 / 4 - 2 * t**3 / 3 + t**2 / 4 + 3 * t
+    torch.testing.assert_close(path[:, 0, 0].detach(), exact)
+
+
+class Constant(nn.Module):
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(values)
+
+
+def test_correction_adds_to_the_rate_and_has_no_tangents() -> None:
+    model = lotka_volterra().model
+    plain = ODE(model, scale=SCALE, step_s=0.1)
+    extended = ODE(model, scale=SCALE, step_s=0.1, correction=Constant())
+    x = torch.ones((1, 2), dtype=torch.float64)
+    t = torch.tensor(0.0)
+    torch.testing.assert_close(extended(t, x), plain(t, x) + 1.0)
+    with pytest.raises(ValueError, match="learned correction has no tangents"):
+        augmented([extended])
+
+
+def test_bad_models_are_refused() -> None:
+    model = lotka_volterra().model
+    empty = replace(model, coef=np.zeros_like(model.coef))
+    with pytest.raises(ValueError, match="at least one term"):
+        ODE(empty, scale=SCALE, step_s=0.1)
+    narrow = constraint(model.library, {"x": ("x",), "y": ("y", "x*y")})
+    with pytest.raises(ValueError, match=r"must cover every term .*\('x', 'x\*y'\)"):
+        ODE(model, scale=SCALE, step_s=0.1, constraint=narrow)
+    wide = constraint(model.library, {"x": ("x", "x^2", "x*y"), "y": ("y", "x*y")})
+    with pytest.raises(ValueError, match=r"free coefficient must start away from zero.*x\^2"):
+        ODE(model, scale=SCALE, step_s=0.1, constraint=wide)

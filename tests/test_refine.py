@@ -1,0 +1,424 @@
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
+from ep2sindy.constraints import constraint
+from ep2sindy.integral.batch import cut_windows, dominant_window
+from ep2sindy.integral.descent import GradientDescent, NelderMead
+from ep2sindy.integral.multiple_shooting import MultipleShooting
+from ep2sindy.integral.problem import Iteration
+from ep2sindy.integral.single_shooting import SingleShooting
+from ep2sindy.integral.steps import HermiteSimpson, RungeKutta
+from ep2sindy.library import named_terms
+from ep2sindy.model import SparseModel, coef_matrix
+from ep2sindy.refine import Refinement, loss_against_window, refine, refine_many
+from ep2sindy.systems import System, lorenz, lotka_volterra
+from ep2sindy.trajectory import Trajectory
+
+PREY, LORENZ = lotka_volterra(), lorenz()
+LONG = replace(PREY, duration_s=300.0)  # 30 windows of 100 samples, none twice
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Batches this small only wait for each other."""
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+def off(model: SparseModel, factors: np.ndarray | float) -> SparseModel:
+    return replace(model, coef=model.coef * factors)
+
+
+@cache
+def clean(system: System) -> Trajectory:
+    return system.trajectory()
+
+
+def noisy(system: System, noise: float, rng: np.random.Generator) -> Trajectory:
+    """White noise of a share of each state's standard deviation."""
+    exact = clean(system)
+    std = exact.states.std(axis=0)
+    return replace(
+        exact, states=exact.states + noise * std * rng.standard_normal(exact.states.shape)
+    )
+
+
+def errors(found: Refinement, truth: SparseModel) -> np.ndarray:
+    used = truth.coef.T != 0.0
+    return found.model.coef.T[used] / truth.coef.T[used] - 1.0
+
+
+def spread(model: SparseModel, share: float, rng: np.random.Generator) -> SparseModel:
+    return off(model, 1.0 + share * rng.choice([-1.0, 1.0], model.coef.shape))
+
+
+@pytest.mark.parametrize("free_start", [True, False])
+def test_exact_data_give_the_exact_coefficients(free_start: bool) -> None:
+    system = lotka_volterra()
+    rng = np.random.default_rng(0)
+    found = refine(
+        spread(system.model, 0.3, rng),
+        [system.trajectory()],
+        window=60,
+        n_windows=8,
+        free_start=free_start,
+        rng=rng,
+    )
+    assert found.status == "converged"
+    # rk4 at 0.1 of a time unit of one: h^4 / 120.
+    np.testing.assert_allclose(errors(found, system.model), 0.0, atol=2e-6)
+
+
+def test_methods_agree_on_the_minimiser() -> None:
+    rng = np.random.default_rng(0)
+    data = noisy(PREY, 0.05, rng)
+    start = spread(PREY.model, 0.1, rng)
+
+    def fitted(method: object, **settings: bool) -> Refinement:
+        return refine(
+            start, [data], window=15, n_windows=3, method=method, n_reweights=0,
+            rng=np.random.default_rng(1), **settings,
+        )  # fmt: skip
+
+    for free_start in (True, False):
+        best = fitted(MultipleShooting(), free_start=free_start)
+        for method, tolerance in (
+            (SingleShooting(), 1e-7),
+            (MultipleShooting(step=HermiteSimpson()), 1e-4),
+        ):
+            other = fitted(method, free_start=free_start)
+            assert other.status == "converged"
+            np.testing.assert_allclose(other.model.coef, best.model.coef, rtol=tolerance)
+    other = fitted(NelderMead(tolerance=1e-3), free_start=False)
+    assert other.loss == pytest.approx(best.loss, rel=1e-4)
+
+
+@pytest.mark.slow  # torch.optim imports torch's compiler: five seconds
+@pytest.mark.parametrize("free_start", [True, False])
+def test_gradient_descent_finds_the_same_minimum(free_start: bool) -> None:
+    rng = np.random.default_rng(0)
+    data, start = noisy(PREY, 0.05, rng), spread(PREY.model, 0.1, rng)
+    settings = {"window": 25, "n_windows": 3, "n_reweights": 0, "free_start": free_start}
+    best, other = (
+        refine(start, [data], method=method, rng=np.random.default_rng(1), **settings)
+        for method in (MultipleShooting(), GradientDescent())
+    )
+    assert other.status == "converged"
+    assert other.loss == pytest.approx(best.loss, rel=1e-4)
+    np.testing.assert_allclose(other.model.coef, best.model.coef, rtol=1e-2)
+
+
+def test_reported_loss_is_that_of_an_independent_integration() -> None:
+    rng = np.random.default_rng(0)
+    data = noisy(PREY, 0.05, rng)
+    found = refine(PREY.model, [data], window=100, n_windows=5, rng=rng)
+    scale = found.batch.scale
+    for w, start in enumerate(found.batch.start.tolist()):
+        window = data.window(start, start + 100)
+        solution = solve_ivp(
+            lambda _, x: found.model.derivative(x, np.empty(0)),
+            (window.t[0], window.t[-1]),
+            found.trajectories[w, 0],
+            t_eval=window.t,
+            rtol=1e-10,
+            atol=1e-12,
+        )
+        loss = np.square((solution.y.T - window.states) / scale).mean()
+        assert found.window_loss[w] == pytest.approx(loss, rel=1e-5)
+    assert found.loss == pytest.approx(found.window_loss.mean())
+
+
+def test_rescaled_units_change_the_coefficients_and_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    data = noisy(PREY, 0.05, rng)
+    model = PREY.model
+    big = replace(data, states=data.states * 1e18, t=data.t * 1e-6)
+    powers = model.library.exponents.sum(axis=1)
+    rescaled = off(model, 1e6 * 1e18 ** (1.0 - powers[:, None]))
+    small, large = (
+        refine(m, [d], window=100, n_windows=5, rng=np.random.default_rng(1))
+        for m, d in ((model, data), (rescaled, big))
+    )
+    np.testing.assert_allclose(errors(large, rescaled), errors(small, model), rtol=1e-6)
+    assert large.loss == pytest.approx(small.loss)
+
+
+def test_constraint_holds_after_refinement_and_shapes_the_covariance() -> None:
+    rng = np.random.default_rng(0)
+    model = PREY.model
+    relations = constraint(
+        model.library, {s: tuple(model.terms(s)) for s in model.states},
+        ["x: x*y == -1 * y: x*y"],
+    )  # fmt: skip
+    data = noisy(PREY, 0.05, rng)
+    found = refine(model, [data], window=50, n_windows=20, constraint=relations, rng=rng)
+    assert found.model.terms("x")["x*y"] == -found.model.terms("y")["x*y"]
+    covariance = found.model.covariance
+    assert covariance is not None
+    np.testing.assert_allclose(covariance[1], -covariance[3])  # x: x, x*y; y: y, x*y
+
+
+def test_covariance_follows_the_order_of_the_model() -> None:
+    rng = np.random.default_rng(0)
+    model = PREY.model
+    swapped = constraint(model.library, {s: tuple(model.terms(s)) for s in ("y", "x")})
+    data = noisy(PREY, 0.05, rng)
+    plain, other = (
+        refine(model, [data], window=50, n_windows=20, constraint=c, rng=np.random.default_rng(1))
+        for c in (None, swapped)
+    )
+    assert plain.model.covariance is not None
+    assert other.model.covariance is not None
+    np.testing.assert_allclose(other.model.covariance, plain.model.covariance, rtol=1e-5)
+
+
+def test_windows_never_cross_trajectories_nor_overlap_where_there_is_room() -> None:
+    t = 0.1 * np.arange(3000)
+    data = Trajectory(t, np.stack([np.sin(t), np.cos(t)], axis=1), ["x", "y"])
+    parts = [data.window(0, 1200), data.window(1200, 1250), data.window(1250, 3000)]
+    rng = np.random.default_rng(0)
+    batch = cut_windows(parts, states=("x", "y"), inputs=(), n_windows=12, window=100, rng=rng)
+    assert len(batch.start) == 12
+    assert set(batch.trajectory) == {0, 2}
+    for j in (0, 2):
+        start = np.sort(batch.start[batch.trajectory == j])
+        assert start[-1] + 100 <= parts[j].n_samples
+        assert (np.diff(start) >= 100).all()
+    assert batch.multiplicity == 1.0
+    crowded = cut_windows(
+        [parts[0]], states=("x", "y"), inputs=(), n_windows=30, window=400, rng=rng
+    )
+    assert crowded.multiplicity == pytest.approx(30 * 400 / 1200)
+
+
+def test_unequal_steps_and_inputs_are_followed() -> None:
+    """x' = -x u with u = 1 + sin(t)/2, sampled at random: x = exp(-t - (1 - cos t)/2)."""
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.uniform(0.0, 3.0, 200))
+    x = np.exp(-t - 0.5 * (1.0 - np.cos(t)))
+    u = 1.0 + 0.5 * np.sin(t)
+    library = named_terms(["x", "u"], ["x*u"])
+    model = SparseModel(library, ["x"], np.array([[-0.6]]))
+    data = Trajectory(t, x[:, None], ["x"], u[:, None], ["u"])
+    for method in (MultipleShooting(), MultipleShooting(step=HermiteSimpson()), SingleShooting()):
+        found = refine(model, [data], window=50, n_windows=4, method=method, rng=rng)
+        assert found.model.coef[0, 0] == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_window_is_one_and_a_half_periods_of_the_sharpest_peak() -> None:
+    t = np.arange(1000) * 0.01
+    drift = np.cumsum(np.random.default_rng(0).standard_normal(1000))
+    data = Trajectory(t, np.stack([drift, np.sin(2.0 * np.pi * 2.0 * t)], axis=1), ["a", "b"])
+    assert dominant_window([data], ["a", "b"]) == pytest.approx(75, abs=2)
+
+
+def test_loss_against_window_gives_one_refinement_each() -> None:
+    rng = np.random.default_rng(0)
+    data = noisy(PREY, 0.05, rng)
+    found = loss_against_window(PREY.model, [data], [20, 80], n_windows=6, rng=rng)
+    assert list(found) == [20, 80]
+    assert all(each.loss < 0.05**2 * 1.2 for each in found.values())
+
+
+def test_history_reports_every_iteration_as_it_comes() -> None:
+    seen: list[Iteration] = []
+    rng = np.random.default_rng(0)
+    data = noisy(PREY, 0.05, rng)
+    model = spread(PREY.model, 0.2, rng)
+    found = refine(model, [data], window=60, n_windows=6, rng=rng, callback=seen.append)
+    assert tuple(seen) == found.history
+    assert seen[0].block == 5
+    assert seen[-1].block == 60
+    assert seen[-1].step < 1e-7
+    assert seen[-1].defect < 1e-7
+
+
+def test_model_without_dynamics_of_its_own_is_flat() -> None:
+    library = named_terms(["x", "y"], ["x", "y"])
+    model = SparseModel(library, ["x", "y"], np.array([[1e-3, 0.0], [0.0, 1e-3]]))
+    rng = np.random.default_rng(0)
+    found = refine(model, [clean(PREY)], window=300, n_windows=3, rng=rng)
+    assert found.status in ("flat", "unidentifiable")
+
+
+def test_terms_that_the_data_cannot_tell_apart_are_unidentifiable() -> None:
+    """With x = exp(-t) and y = x exactly, a and b of x' = a x + b y share one value."""
+    t = np.linspace(0.0, 3.0, 100)
+    x = np.exp(-t)
+    library = named_terms(["x", "u"], ["x", "u"])
+    model = SparseModel(library, ["x"], np.array([[-0.5], [-0.4]]))
+    rng = np.random.default_rng(0)
+    states = (x + 1e-3 * rng.standard_normal(100))[:, None]
+    data = Trajectory(t, states, ["x"], x[:, None], ["u"])
+    assert refine(model, [data], window=20, n_windows=5, rng=rng).status == "unidentifiable"
+
+
+def test_start_that_blows_up_is_a_result() -> None:
+    library = named_terms(["x", "y"], ["x", "x^2*y^2", "y"])
+    model = SparseModel(library, ["x", "y"], np.array([[0.0, 0.0], [1e200, 0.0], [0.0, 1e3]]))
+    rng = np.random.default_rng(0)
+    found = refine(model, [clean(PREY)], window=50, n_windows=3, rng=rng)
+    assert found.status == "non_finite"
+    assert found.loss == np.inf
+    np.testing.assert_array_equal(found.model.coef, model.coef)
+
+
+def test_points_refined_together_are_those_refined_alone() -> None:
+    rng = np.random.default_rng(0)
+    model = PREY.model
+    data = [[noisy(PREY, noise, rng)] for noise in (0.01, 0.1, 0.05)]
+    starts = [spread(model, share, rng) for share in (0.1, 0.9, 0.3)]
+    together = refine_many(starts, data, window=200, n_windows=5, rng=np.random.default_rng(1))
+    alone = refine_many(
+        starts, data, window=200, n_windows=5, points_per_batch=1, rng=np.random.default_rng(1)
+    )
+    for one, other in zip(together, alone, strict=True):
+        assert one.status == other.status == "converged"
+        assert len(one.history) == len(other.history)
+        np.testing.assert_allclose(one.model.coef, other.model.coef, rtol=1e-10)
+
+
+def test_bad_input_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    data, model = clean(PREY), PREY.model
+    with pytest.raises(ValueError, match="1001 samples were asked of trajectories of at most 1000"):
+        refine(model, [data], window=1001, rng=rng)
+    with pytest.raises(ValueError, match="at least one term"):
+        refine(off(model, 0.0), [data], rng=rng)
+    library = named_terms(["x", "u"], ["x", "u"])
+    with pytest.raises(ValueError, match="unknown variable 'u'"):
+        refine(SparseModel(library, ["x"], np.ones((2, 1))), [data], window=50, rng=rng)
+    with pytest.raises(ValueError, match="at least one trajectory"):
+        refine(model, [], window=50, rng=rng)
+    with pytest.raises(ValueError, match="NelderMead cannot fit initial states"):
+        refine(model, [data], window=50, method=NelderMead(), rng=rng)
+
+
+@cache
+def stiff(k_dt: float) -> tuple[SparseModel, Trajectory]:
+    """Lotka-Volterra and a third state that follows x at the rate k."""
+    library = named_terms(["x", "y", "z"], ["x", "y", "z", "x*y"])
+    k, t = k_dt / 0.1, np.arange(1000) * 0.1
+    equations = [
+        {"x": 2 / 3, "x*y": -1.0},
+        {"y": -1 / 3, "x*y": 1.0},
+        {"x": k, "z": -k},
+    ]
+    model = SparseModel(library, ["x", "y", "z"], coef_matrix(library, equations))
+
+    def rhs(_: float, x: np.ndarray) -> tuple[float, float, float]:
+        prey = x[0] * x[1]
+        return x[0] * 2 / 3 - prey, prey - x[1] / 3, k * (x[0] - x[2])
+
+    solution = solve_ivp(
+        rhs, (0.0, t[-1]), [1.0, 0.5, 1.0], method="LSODA", t_eval=t, rtol=1e-9, atol=1e-11
+    )
+    return model, Trajectory(t, solution.y.T, ["x", "y", "z"])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 50.0])
+@pytest.mark.parametrize("step", [RungeKutta(), HermiteSimpson()])
+def test_stiff_model_is_right_or_says_that_it_is_not(
+    k_dt: float, noise: float, step: RungeKutta | HermiteSimpson
+) -> None:
+    model, data = stiff(k_dt)
+    rng = np.random.default_rng(1)
+    std = data.states.std(axis=0)
+    data = replace(data, states=data.states + noise * std * rng.standard_normal(data.states.shape))
+    method = MultipleShooting(step=step)
+    found = refine(
+        spread(model, 0.2, rng), [data], window=100, n_windows=10, method=method, rng=rng
+    )
+    if found.status == "converged":
+        covariance = found.model.covariance
+        assert covariance is not None
+        used = model.coef.T[model.coef.T != 0.0]
+        allowed = np.maximum(4.0 * np.sqrt(np.diag(covariance)), 1e-3 * np.abs(used))
+        assert (np.abs(errors(found, model) * used) < allowed).all()
+    if k_dt <= 2.0 or (k_dt == 5.0 and noise and isinstance(step, HermiteSimpson)):
+        assert found.status == "converged"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("system", "noise", "window", "rms", "worst"),
+    [
+        (LONG, 0.05, 100, 2.5e-3, np.inf),
+        (LONG, 0.2, 100, np.inf, 1.5e-2),
+        (LORENZ, 0.05, 400, 1.2e-2, np.inf),
+        (LORENZ, 0.2, 400, np.inf, 7e-2),
+    ],
+)
+def test_free_starts_reach_the_accuracy_that_the_noise_allows(
+    system: System, noise: float, window: int, rms: float, worst: float
+) -> None:
+    found = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        start = spread(system.model, 0.2, rng)
+        result = refine(start, [noisy(system, noise, rng)], window=window, rng=rng)
+        assert result.status == "converged"
+        found.append(errors(result, system.model))
+    assert np.sqrt(np.square(found).mean()) < rms
+    assert np.median(np.abs(found).max(axis=1)) < worst
+
+
+STARTS = {
+    "20 %": lambda rng, shape: 1.0 + 0.2 * rng.choice([-1.0, 1.0], shape),
+    "50 %": lambda rng, shape: 1.0 + 0.5 * rng.choice([-1.0, 1.0], shape),
+    "90 %": lambda rng, shape: 1.0 + 0.9 * rng.choice([-1.0, 1.0], shape),
+    "some signs": lambda rng, shape: rng.choice([-1.0, 1.0], shape),
+    "every sign": lambda rng, shape: -np.ones(shape),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("window", [100, 400])
+@pytest.mark.parametrize("system", [PREY, LORENZ], ids=lambda s: s.name)
+def test_far_starts_converge(system: System, window: int, start: str) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        data = noisy(system, 0.05, rng)
+        model = off(system.model, STARTS[start](rng, system.model.coef.shape))
+        found = refine(model, [data], window=window, rng=rng)
+        assert found.status == "converged"
+        assert np.abs(errors(found, system.model)).max() < 0.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("structured", [False, True])
+def test_intervals_cover_as_they_say(structured: bool) -> None:
+    t, exact = breathing_states(12001)
+    used = TRUTH.coef.T != 0.0
+    scores = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        white = exact + 0.05 * exact.std(axis=0) * rng.standard_normal(exact.shape)
+        states = contaminated(exact, t, rng) if structured else white
+        found = refine(START, [Trajectory(t, states, STATES)], window=100, rng=rng)
+        assert found.status == "converged"
+        assert found.model.covariance is not None
+        error = (found.model.coef - TRUTH.coef).T[used]
+        scores.append(error / np.sqrt(np.diag(found.model.covariance)))
+    assert 0.92 <= (np.abs(scores) < 1.96).mean() <= 0.98
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_gpu_gives_the_same_coefficients() -> None:
+    rng = np.random.default_rng(0)
+    data = noisy(PREY, 0.05, rng)
+    refined = partial(refine, PREY.model, [data], window=100, n_windows=10)
+    cpu = refined(rng=np.random.default_rng(1))
+    gpu = refined(rng=np.random.default_rng(1), device="cuda")
+    np.testing.assert_allclose(gpu.model.coef, cpu.model.coef, rtol=1e-8)
