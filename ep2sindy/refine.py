@@ -219,7 +219,7 @@ def _result(
         with torch.no_grad():
             ode.scaling.copy_(torch.tensor(fit.scaling[point]))
             values = ode.coef.cpu().numpy()
-        refined, order = _with_coef(model, constraint, values)
+        refined, order = with_coef(model, constraint, values)
         by_scaling = (constraint.C * ode.free0.cpu().numpy())[order]
         robust, naive = (
             by_scaling @ each @ by_scaling.T
@@ -238,7 +238,7 @@ def _result(
     )
 
 
-def _with_coef(
+def with_coef(
     model: SparseModel, constraint: Constraint, values: np.ndarray
 ) -> tuple[SparseModel, list[int]]:
     """The model with these coefficients, and where its own order finds them among `values`."""

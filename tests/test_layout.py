@@ -41,6 +41,7 @@ ORDER = [
     "ode",
     "integral",
     "refine",
+    "correction",
     "estimators",
     "studies",
     "plots",
@@ -50,7 +51,7 @@ ORDER = [
 ]
 # PyTorch is slow to import and of no use to the search; `report` needs its TensorBoard writer.
 ALLOWED = {
-    "torch": {"ode", "integral", "refine", "report"},
+    "torch": {"ode", "integral", "refine", "correction", "report"},
     "hydra": set(),
     "omegaconf": set(),
     "matplotlib": {"plots", "study_plots", "report", "weak_plots"},

@@ -175,7 +175,7 @@ def trajectories(
     """(windows, samples, n_states) from starts (windows, n_states), differentiable."""
     ode.drive = drive
     last = n_samples - 1
-    t = torch.arange(n_samples, dtype=torch.float64)
+    t = torch.arange(n_samples, dtype=torch.float64, device=start.device)
     grid = torch.linspace(0.0, float(last), n_substeps * last + 1, dtype=torch.float64)
     options = {"grid_constructor": lambda func, y0, t: grid, "perturb": True}
     return odeint(ode, start, t, method="rk4", options=options).transpose(0, 1)
