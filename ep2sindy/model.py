@@ -127,11 +127,13 @@ class SparseModel:
         *,
         start: int = 0,
         n_samples: int | None = None,
+        initial: Float[np.ndarray, " n_states"] | None = None,
         blow_up: float = 100.0,
         rtol: float = 1e-8,
     ) -> Rollout:
         """Integrate from one sample of a trajectory, driven by its inputs (cubic splines).
 
+        initial: the state at that sample, in SI; None takes the data's.
         The states are scaled by their largest value in the window, so that one tolerance fits
         all. A state that exceeds `blow_up` times that value ends the run as diverged.
         Raises ValueError for a window outside the trajectory or a missing variable.
@@ -150,7 +152,7 @@ class SparseModel:
             solution = solve_ivp(
                 self._scaled_rhs(window, scale),
                 (window.t[0], window.t[-1]),
-                data[0] / scale,
+                (data[0] if initial is None else initial) / scale,
                 method="DOP853",
                 t_eval=window.t,
                 events=too_large,

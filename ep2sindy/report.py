@@ -119,6 +119,26 @@ class Screen:
         self._log.close()
 
 
+class LiveScalars:
+    """Scalars that TensorBoard shows while the run goes on; use it as a context."""
+
+    def __init__(self, folder: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # PyTorch takes seconds to import
+
+        self._writer = SummaryWriter(folder)
+
+    def write(self, scalars: Mapping[str, float], *, step: int) -> None:
+        for name, value in scalars.items():
+            self._writer.add_scalar(name, value, step)
+        self._writer.flush()
+
+    def __enter__(self) -> LiveScalars:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._writer.close()
+
+
 def commit(folder: Path) -> str:
     """Git commit of the code in `folder`, with "+changes" if some are not committed."""
     try:

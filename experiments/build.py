@@ -2,17 +2,21 @@
 
 import inspect
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from functools import reduce
+from operator import add
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
+import numpy as np
 import xarray as xr
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from ep2sindy.library import Library, polynomial
+from ep2sindy.library import Library, named_terms, polynomial
+from ep2sindy.names import split_factors
 from ep2sindy.report import RunFolder, Screen
 
 # The keys of conf/config.yaml, which every study meets; each study names those it adds.
@@ -62,11 +66,21 @@ def check_config(config: DictConfig, *, keys: Collection[str]) -> None:
 
 def check_durations(config: DictConfig) -> None:
     """Raise ValueError unless `rollout_s` and all of `figures` are positive, or null."""
-    durations = {
-        "rollout_s": config.rollout_s,
-        **{f"figures.{k}": v for k, v in config.figures.items()},
-    }
-    for key, value in durations.items():
+    _check_positive({"rollout_s": config.rollout_s})
+    check_figures(config)
+
+
+def check_figures(config: DictConfig) -> None:
+    """Raise ValueError unless `figures` has its two keys, both positive, or null."""
+    if set(config.figures) != {"duration_s", "f_max_Hz"}:
+        raise ValueError(
+            f"figures must have duration_s and f_max_Hz: {sorted(map(str, config.figures))} came"
+        )
+    _check_positive({f"figures.{key}": value for key, value in config.figures.items()})
+
+
+def _check_positive(numbers: Mapping[str, object]) -> None:
+    for key, value in numbers.items():
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"{key} must be a positive number, or null for all: {value!r} came")
 
@@ -104,6 +118,44 @@ def inputs_of(config: DictConfig, libraries: Iterable[Library]) -> list[str]:
     known = {*config.trajectory.states, *products}
     variables = dict.fromkeys(v for library in libraries for v in library.variables)
     return [name for name in variables if name not in known]
+
+
+def terms_of(
+    model: DictConfig, *, states: Sequence[str], key: str = "model"
+) -> tuple[Library, dict[str, list[str]]]:
+    """The terms of every state, and a library that holds each of them once.
+
+    key: what the config calls this model, for the message.
+    """
+    given = cast(dict, OmegaConf.to_container(model))
+    if set(given) != set(states) or not all(
+        isinstance(names, list) and names for names in given.values()
+    ):
+        raise ValueError(
+            f"{key} must list the terms of every state of {list(states)}, such as "
+            f"{{x: [x, x*y]}}: {given} came"
+        )
+    terms = {state: [str(name) for name in given[state]] for state in states}
+    factors = [
+        variable
+        for names in terms.values()
+        for name in names
+        if name.strip() != "1"
+        for variable, _ in split_factors(name)
+    ]
+    variables = list(dict.fromkeys([*states, *factors]))
+    named = reduce(add, (named_terms(variables, names) for names in terms.values()))
+    by_degree = np.argsort(named.exponents.sum(axis=1), kind="stable")
+    return Library(variables, named.exponents[by_degree]), terms
+
+
+def relations_of(given: Any, *, key: str) -> list[str]:
+    """The relations of a config. Raises ValueError unless they are a list with something in it."""
+    if not isinstance(given, ListConfig) or not given:
+        raise ValueError(
+            f"{key} must be a list of relations, such as ['x: x*y == -1 * y: x*y']: {given!r} came"
+        )
+    return [str(text) for text in given]
 
 
 LIBRARY_KEYS = {"variables", "variables_if_present", "degree", "products", "n_norm"}

@@ -20,6 +20,12 @@ def check_n_jobs(config: DictConfig) -> None:
         )
 
 
+def check_share(config: DictConfig, key: str) -> None:
+    """Raise ValueError unless it is a number between zero and one."""
+    if type(config[key]) not in (int, float) or not 0 < config[key] < 1:
+        raise ValueError(f"{key} must be a number between 0 and 1: {config[key]!r} came")
+
+
 def check_lists(config: DictConfig, *keys: str) -> None:
     """Raise ValueError unless each is a list with something in it, everything once."""
     for key in keys:

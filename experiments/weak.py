@@ -1,8 +1,6 @@
 """Known terms in the weak form, with windows of several lengths: `+exp=weak`."""
 
 from collections.abc import Mapping
-from functools import reduce
-from operator import add
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,20 +9,25 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from ep2sindy import weak_plots
-from ep2sindy.library import Library, named_terms
-from ep2sindy.names import split_factors
 from ep2sindy.report import RunFolder, write_tensorboard
+from ep2sindy.setting_plots import settings_derivative_figure, settings_figures
 from ep2sindy.smoothing import Smoother
 from ep2sindy.spectrum import dominant_frequency
 from ep2sindy.studies.weak_forms import Fitted, Setting, boxes_grid, fit_settings
 from ep2sindy.weak import Weak
 from ep2sindy.windows import Boxes
-from experiments.build import check_durations, inputs_of, open_prepared_field, started_run
+from experiments.build import (
+    check_durations,
+    inputs_of,
+    open_prepared_field,
+    started_run,
+    terms_of,
+)
 from experiments.checks import check_counts, check_numbers
 from experiments.libraries import rollout_table
 from experiments.libraries_view import print_data
-from experiments.weak_view import Outcome, coefficients, page, print_outcome, settings_table
+from experiments.model_view import coefficients
+from experiments.weak_view import Outcome, page, print_outcome, settings_table
 
 KEYS = (
     "boxes", "automatic", "model", "n_windows", "n_points", "rollout_s", "figures", "thesis",
@@ -39,7 +42,7 @@ def run(config: DictConfig) -> Path:
         check_numbers(config, "n_points", whole=True)
         # Everything but the data is built first: a misspelt key must not cost a simulation.
         settings = settings_of(config)
-        library, terms = model_of(config)
+        library, terms = terms_of(config.model, states=config.trajectory.states)
         to_trajectory = instantiate(config.trajectory, _convert_="all")
         field = open_prepared_field(config)
         data = to_trajectory(field, inputs=inputs_of(config, [library]), label=config.experiment)
@@ -91,49 +94,17 @@ def boxes_form(config: DictConfig) -> Weak:
     return instantiate(config.boxes, test_functions=Boxes())
 
 
-def model_of(config: DictConfig) -> tuple[Library, dict[str, list[str]]]:
-    """The terms of every state, and a library that holds each of them once."""
-    states = list(config.trajectory.states)
-    model = cast(dict, OmegaConf.to_container(config.model))
-    if set(model) != set(states) or not all(
-        isinstance(names, list) and names for names in model.values()
-    ):
-        raise ValueError(
-            f"model must list the terms of every state of {states}, such as {{x: [x, x*y]}}: "
-            f"{model} came"
-        )
-    terms = {state: [str(name) for name in model[state]] for state in states}
-    factors = [
-        variable
-        for names in terms.values()
-        for name in names
-        if name.strip() != "1"
-        for variable, _ in split_factors(name)
-    ]
-    variables = list(dict.fromkeys([*states, *factors]))
-    named = reduce(add, (named_terms(variables, names) for names in terms.values()))
-    by_degree = np.argsort(named.exponents.sum(axis=1), kind="stable")
-    return Library(variables, named.exponents[by_degree]), terms
-
-
 def _figures(outcome: Outcome, smoother: Smoother, shown: DictConfig) -> dict[str, Figure]:
     run = outcome.run
-    duration_s = shown.duration_s or float(run.t[-1] - run.t[0])
-    f_max_Hz = shown.f_max_Hz or 0.5 / run.dt_s
     models = {name: f.integrated.model for name, f in outcome.labelled.items()}
     rollouts = {name: f.integrated.rollout for name, f in outcome.labelled.items()}
-    figures = {
-        "trajectories": weak_plots.settings_trajectory_figure(run, rollouts, duration_s=duration_s),
-        "derivatives": weak_plots.settings_derivative_figure(
+    duration_s = shown.duration_s or float(run.t[-1] - run.t[0])
+    return {
+        **settings_figures(run, rollouts, duration_s=duration_s, f_max_Hz=shown.f_max_Hz),
+        "derivatives": settings_derivative_figure(
             run, models, smoother=smoother, duration_s=duration_s
         ),
-        "spectra": weak_plots.settings_spectrum_figure(run, rollouts, f_max_Hz=f_max_Hz),
     }
-    if len(run.state_names) > 1:
-        figures["phase"] = weak_plots.settings_phase_figure(
-            run, rollouts, plane=run.state_names[:2], duration_s=duration_s
-        )
-    return figures
 
 
 def _write(
@@ -143,7 +114,8 @@ def _write(
         folder.write_model(name, fitted.integrated.model)
         folder.write_table(f"rollout_{name}", rollout_table(outcome.run, fitted.integrated))
     folder.write_table("settings", settings_table(outcome))
-    folder.write_table("coefficients", coefficients(outcome))
+    models = {name: fitted.integrated.model for name, fitted in outcome.fitted.items()}
+    folder.write_table("coefficients", coefficients(models, heading="setting"))
     folder.write_figures(figures)
     write_tensorboard(
         folder.path / "tensorboard",

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +14,7 @@ from ep2sindy.spectrum import frequency_text
 from ep2sindy.studies.weak_forms import Fitted
 from ep2sindy.trajectory import Trajectory
 from ep2sindy.units import prefixed
+from experiments.model_view import equations_html, frequency_cell, intervals_text
 
 
 @dataclass(frozen=True)
@@ -82,20 +82,6 @@ def settings_table(outcome: Outcome) -> pd.DataFrame:
     return pd.DataFrame(rows).astype({"n_points": "Int64", "half_width": "Int64"})
 
 
-def coefficients(outcome: Outcome) -> pd.DataFrame:
-    """One row per setting, state and term: in SI, with 95 % intervals where they are known."""
-    rows = []
-    for name, fitted in outcome.fitted.items():
-        model = fitted.integrated.model
-        for state in model.states:
-            ends = model.intervals(state) if model.covariance is not None else {}
-            for term, value in model.terms(state).items():
-                lower, upper = ends.get(term, (np.nan, np.nan))
-                row: dict[str, Any] = {"setting": name, "state": state, "term": term}
-                rows.append(row | {"coef": value, "lower": lower, "upper": upper})
-    return pd.DataFrame(rows)
-
-
 def print_outcome(screen: Screen, outcome: Outcome) -> None:
     for state, terms in outcome.published.items():
         screen.print(f"thesis, Eq. 24: {equation_text(state, terms)}")
@@ -111,7 +97,7 @@ def print_outcome(screen: Screen, outcome: Outcome) -> None:
                 *window_texts(fitted, state, outcome).values(),
                 f"{fitted.r2[state]:.3f}",
                 equation_text(state, integrated.model.terms(state)),
-                "" if k else _frequency(fitted, states[0]),
+                "" if k else frequency_cell(fitted.integrated, states[0], fitted.f_error),
                 "" if k else ("-" if np.isnan(integrated.nrmse) else f"{integrated.nrmse:.2f}"),
                 end_section=k == len(states) - 1,
             )
@@ -120,20 +106,7 @@ def print_outcome(screen: Screen, outcome: Outcome) -> None:
         model = fitted.integrated.model
         if model.covariance is not None:
             for state in model.states:
-                screen.print(f"{name}: {state}' {_intervals_text(fitted, state)}")
-
-
-def _frequency(fitted: Fitted, state: str) -> str:
-    frequency_Hz = fitted.integrated.frequency_Hz[state]
-    if np.isnan(frequency_Hz):
-        return fitted.integrated.verdict
-    return f"{frequency_text(frequency_Hz)} ({100 * fitted.f_error:+.0f} %)"
-
-
-def _intervals_text(fitted: Fitted, state: str) -> str:
-    """`n_i: -6.77e+05 to -6.74e+05`, term by term."""
-    ends = fitted.integrated.model.intervals(state)
-    return "; ".join(f"{term}: {low:.4g} to {high:.4g}" for term, (low, high) in ends.items())
+                screen.print(f"{name}: {state}' {intervals_text(model, state)}")
 
 
 TITLE = "integrated from the first sample (nrmse 1: no better than a constant)"
@@ -150,13 +123,8 @@ def page(outcome: Outcome, figures: Mapping[str, Figure]) -> str:
     body = ["<h2>Equations</h2>"]
     for state, terms in outcome.published.items():
         body.append(f'<p class="published">thesis, Eq. 24: {equation_html(state, terms)}</p>')
-    for name, fitted in outcome.labelled.items():
-        model = fitted.integrated.model
-        body.append(f"<h3>{name}</h3>")
-        for state in model.states:
-            body.append(f'<p class="equation">{equation_html(state, model.terms(state))}</p>')
-            if model.covariance is not None:
-                body.append(f'<p class="published">95 %: {_intervals_text(fitted, state)}</p>')
+    models = {name: fitted.integrated.model for name, fitted in outcome.labelled.items()}
+    body += equations_html(models)
     body += [
         "<p>The intervals say how far the noise of the samples moves the coefficients if these "
         "terms are the whole law; what the terms lack, they do not count.</p>",
@@ -180,7 +148,9 @@ def _readable(outcome: Outcome) -> pd.DataFrame:
                     "state": state,
                     **window_texts(fitted, state, outcome),
                     "R2": fitted.r2[state],
-                    "frequency": "" if k else _frequency(fitted, state),
+                    "frequency": ""
+                    if k
+                    else frequency_cell(fitted.integrated, state, fitted.f_error),
                     "nrmse": "" if k else fitted.integrated.nrmse,
                     "verdict": "" if k else fitted.integrated.verdict,
                 }

@@ -45,6 +45,7 @@ ORDER = [
     "estimators",
     "studies",
     "plots",
+    "setting_plots",
     "weak_plots",
     "study_plots",
     "report",
@@ -54,7 +55,7 @@ ALLOWED = {
     "torch": {"ode", "integral", "refine", "correction", "report"},
     "hydra": set(),
     "omegaconf": set(),
-    "matplotlib": {"plots", "study_plots", "report", "weak_plots"},
+    "matplotlib": {"plots", "study_plots", "report", "setting_plots", "weak_plots"},
 }
 
 

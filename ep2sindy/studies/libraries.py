@@ -37,7 +37,7 @@ class LibraryCase:
 
 @dataclass(frozen=True, eq=False)
 class Integrated:
-    """A model, its run from the first sample of the data, and how far it strays.
+    """A model, its run over the first samples of the data, and how far it strays.
 
     frequency_Hz: dominant frequency of each state of the rollout; NaN where it diverged, or where
     the state died out: less than a tenth of the data's spread in the second half.
@@ -126,9 +126,18 @@ def _refitted(
     return found
 
 
-def integrate(model: SparseModel, run: Trajectory, n_samples: int) -> Integrated:
-    """Run a model over the first samples of the data, and compare."""
-    rollout = model.rollout(run, n_samples=n_samples)
+def integrate(
+    model: SparseModel,
+    run: Trajectory,
+    n_samples: int,
+    *,
+    initial: Float[np.ndarray, " n_states"] | None = None,
+) -> Integrated:
+    """Run a model over the first samples of the data, and compare.
+
+    initial: the state to start from, in SI; None takes the data's.
+    """
+    rollout = model.rollout(run, n_samples=n_samples, initial=initial)
     return Integrated(model, rollout, _frequencies(model, rollout, run), _nrmse(rollout, run))
 
 
