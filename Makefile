@@ -19,7 +19,7 @@ lint: .venv/installed
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest -q -m "not slow"
+	$(BIN)/python -m pytest -q -m "not slow" -n auto --dist worksteal
 
 # EP2SINDY_DATA=folder adds the checks against files that are not shipped.
 test-slow: lint

@@ -44,7 +44,7 @@ def mask_and_coef(problem: Regression, candidate: Candidate) -> tuple[np.ndarray
 def test_whitened_residuals_of_the_truth_are_white_with_unit_variance() -> None:
     system = lotka_volterra()
     squares, products = [], []
-    for problem in problems_of(system, noisy_runs(system, 0.02, n=12)):
+    for problem in problems_of(system, noisy_runs(system, 0.02, n=6)):
         (state,) = problem.equations
         truth = fit_support(problem, state, list(system.model.terms(state)))
         truth = replace(truth, coef=np.array(list(system.model.terms(state).values())))
@@ -53,9 +53,9 @@ def test_whitened_residuals_of_the_truth_are_white_with_unit_variance() -> None:
         residual = rows.target - rows.theta @ coef
         squares.append(np.square(residual).mean())
         products.append((residual[1:] * residual[:-1]).mean())
-    # About 4000 rows each: five standard errors of the mean square and of the product.
-    assert squares == pytest.approx([1.0, 1.0], abs=5 * np.sqrt(2 / 4000))
-    assert products == pytest.approx([0.0, 0.0], abs=5 / np.sqrt(4000))
+    # About 2000 rows each: five standard errors of the mean square and of the product.
+    assert squares == pytest.approx([1.0, 1.0], abs=5 * np.sqrt(2 / 2000))
+    assert products == pytest.approx([0.0, 0.0], abs=5 / np.sqrt(2000))
 
 
 def test_noise_in_a_linear_term_does_not_shrink_its_coefficient() -> None:
@@ -79,7 +79,7 @@ def test_noise_in_a_linear_term_does_not_shrink_its_coefficient() -> None:
 @pytest.mark.parametrize("system", [lotka_volterra(), lorenz()], ids=lambda s: s.name)
 def test_errors_are_of_the_size_that_the_covariance_says(system: System) -> None:
     scores = []
-    for k in range(10):
+    for k in range(5):
         rng = np.random.default_rng(100 + k)
         run = system.trajectory(noise=0.05, rng=rng)
         for problem in problems_of(system, [run]):
@@ -87,8 +87,8 @@ def test_errors_are_of_the_size_that_the_covariance_says(system: System) -> None
             truth = system.model.terms(candidate.equation)
             error = candidate.coef - [truth[name] for name in candidate.terms]
             scores.append(error @ np.linalg.solve(candidate.covariance, error) / len(error))
-    # Mean of chi-square per coefficient: standard error sqrt(2 / n), n = 10 x 4 or 10 x 7.
-    assert np.mean(scores) == pytest.approx(1.0, abs=3 * np.sqrt(2 / (10 * 4)))
+    # Mean of chi-square per coefficient: standard error sqrt(2 / n), n = 5 x 4 or 5 x 7.
+    assert np.mean(scores) == pytest.approx(1.0, abs=3 * np.sqrt(2 / (5 * 4)))
 
 
 def test_units_change_nothing_but_units() -> None:
