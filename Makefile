@@ -30,6 +30,7 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.simulator
 	$(BIN)/python -m benchmarks.operating_points
 	$(BIN)/python -m benchmarks.refine
+	$(BIN)/python -m benchmarks.intervals
 
 clean:
 	rm -rf .venv .cache .mypy_cache .ruff_cache .pytest_cache

@@ -21,6 +21,7 @@ from scipy.integrate import odeint, solve_ivp
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
+from benchmarks.timing import cpu_s
 from ep2sindy.integral.batch import WindowBatch, cut_windows
 from ep2sindy.integral.descent import GradientDescent, window_paths
 from ep2sindy.integral.multiple_shooting import MultipleShooting
@@ -187,17 +188,6 @@ def descent_s(work: Problem, method: GradientDescent, *, goal: float) -> float:
     method.fit(replace(work, observe=observe))
     below = [k for k, loss in enumerate(losses) if loss <= goal]
     return times[below[0] - 1] - times[0] if below else float("nan")
-
-
-def cpu_s(run: Callable[[], object], *, n_runs: int) -> float:
-    """Median CPU time of a few runs, after one that warms caches."""
-    run()
-    times = []
-    for _ in range(n_runs):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return float(np.median(times))
 
 
 def ours(case: Case, method: MultipleShooting | SingleShooting, *, free_start: bool) -> float:

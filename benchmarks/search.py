@@ -9,14 +9,12 @@ assembled rows and end with the best candidate of every size on the held-out row
     python -m benchmarks.search
 """
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 import sklearn
 from sklearn.linear_model import lasso_path
 from threadpoolctl import threadpool_limits
 
+from benchmarks.timing import cpu_s
 from ep2sindy.pareto import ParetoFront, pareto_front
 from ep2sindy.regression import Differential, Regression
 from ep2sindy.search import AdaptiveLasso, Bootstraps, pooled_supports
@@ -70,17 +68,6 @@ def plain_front(
         if error < best.get(len(columns), (np.inf,))[0]:
             best[len(columns)] = (error, columns, coef)
     return best
-
-
-def cpu_s(run: Callable[[], object], *, n_runs: int) -> float:
-    """Median CPU time of a few runs, after one that warms caches."""
-    run()
-    times = []
-    for _ in range(n_runs):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return float(np.median(times))
 
 
 def main() -> None:

@@ -178,7 +178,9 @@ class _Linearised:
         noise = []
         for v, std in enumerate(rows.noise_std.T):
             sensitivity = slopes[v] @ coef if v < n_variables else np.zeros(len(x))
-            residual = _times(rows.mean, sensitivity) - (slope if v == rows.state else 0.0 * slope)
+            residual = _times(rows.mean, sensitivity)
+            if v == rows.state:
+                residual = residual - slope
             noise.append(_times(residual, std))
         factor = _banded_cholesky(sum(m @ m.T for m in noise))
         theta = rows.mean @ terms

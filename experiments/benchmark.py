@@ -18,6 +18,7 @@ from experiments.build import started_run
 from experiments.checks import check_counts, check_lists, check_n_jobs, check_numbers
 from experiments.variants import chosen_variants
 
+USES: tuple[str, ...] = ()  # of conf/config.yaml
 KEYS = (
     "n_realizations", "n_trajectories", "n_jobs", "systems", "noises", "variants", "definitions",
     "thesis",

@@ -1,6 +1,7 @@
 """From config to values: what several experiments share."""
 
 import inspect
+import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,17 @@ BASE_KEYS = {
     "data", "formulation", "search", "bootstraps", "selection", "depth", "experiment", "study",
     "seed", "output", "prepare", "trajectory",
 }  # fmt: skip
+
+
+def check_overrides(overrides: Iterable[str], *, used: Collection[str], experiment: str) -> None:
+    """Raise ValueError for a key of conf/config.yaml that was set but that a study does not use."""
+    unused = BASE_KEYS - {"experiment", "study", "seed", "output"} - set(used)
+    for text in overrides:
+        key = re.split(r"[.=@]", text.lstrip("+~/"))[0]
+        if key in unused:
+            raise ValueError(
+                f"{text!r} would do nothing: {experiment} does not use {key!r}; leave it out"
+            )
 
 
 @contextmanager

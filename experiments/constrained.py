@@ -32,6 +32,7 @@ from experiments.libraries import rollout_table
 from experiments.libraries_view import print_data
 from experiments.model_view import coefficients
 
+USES: tuple[str, ...] = ("data", "prepare", "trajectory", "formulation")  # of conf/config.yaml
 KEYS = ("models", "held_out", "figures")
 
 

@@ -19,6 +19,7 @@ from experiments.build import started_run
 from experiments.checks import check_n_jobs, check_numbers
 from experiments.variants import chosen_variants
 
+USES: tuple[str, ...] = ()  # of conf/config.yaml
 KEYS = ("system", "variants", "definitions", "rates_Hz", "durations_s", "n_jobs")
 TITLE = "Lowest sampling rate from which on all rates identify the system"
 CAPTION = (

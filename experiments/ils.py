@@ -41,6 +41,7 @@ from experiments.libraries import rollout_table
 from experiments.libraries_view import print_data
 from experiments.model_view import coefficients
 
+USES: tuple[str, ...] = ("data", "prepare", "trajectory", "formulation")  # of conf/config.yaml
 KEYS = (
     "weak", "model", "relations", "held_out", "n_windows", "window", "windows", "figures",
 )  # fmt: skip

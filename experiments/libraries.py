@@ -41,6 +41,16 @@ from experiments.libraries_view import (
     print_outcome,
 )
 
+USES: tuple[str, ...] = (
+    "data",
+    "prepare",
+    "trajectory",
+    "formulation",
+    "search",
+    "bootstraps",
+    "selection",
+    "depth",
+)  # of conf/config.yaml
 KEYS = ("libraries", "rollout_s", "figures", "thesis")
 
 

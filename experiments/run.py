@@ -5,9 +5,12 @@ from importlib import import_module
 from pathlib import Path
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
+
+from experiments.build import check_overrides
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 # Modules of this package; only the one asked for is imported, for some take seconds.
@@ -25,7 +28,10 @@ def main(config: DictConfig) -> None:
     if config.study not in STUDIES:
         sys.exit(f"error: study must be one of {sorted(STUDIES)}: {config.study!r} came")
     try:
-        folder = import_module(f"experiments.{config.study}").run(config)
+        study = import_module(f"experiments.{config.study}")
+        overrides = HydraConfig.get().overrides.task
+        check_overrides(overrides, used=study.USES, experiment=config.experiment)
+        folder = study.run(config)
     except KeyboardInterrupt:
         sys.exit("interrupted: files under their final names are whole")
     except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:

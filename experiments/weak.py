@@ -29,6 +29,7 @@ from experiments.libraries_view import print_data
 from experiments.model_view import coefficients
 from experiments.weak_view import Outcome, page, print_outcome, settings_table
 
+USES: tuple[str, ...] = ("data", "prepare", "trajectory", "formulation")  # of conf/config.yaml
 KEYS = (
     "boxes", "automatic", "model", "n_windows", "n_points", "rollout_s", "figures", "thesis",
 )  # fmt: skip

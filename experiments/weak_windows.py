@@ -20,6 +20,7 @@ from experiments.build import started_run
 from experiments.checks import check_counts, check_n_jobs, check_numbers
 from experiments.weak import settings_of
 
+USES: tuple[str, ...] = ()  # of conf/config.yaml
 KEYS = (
     "boxes", "automatic", "system", "rate_Hz", "n_windows", "n_points", "noises",
     "n_realizations", "n_jobs",

@@ -20,7 +20,7 @@ from ep2sindy.io import write_field
 from ep2sindy.library import polynomial
 from ep2sindy.model import SparseModel
 from experiments import constrained, frontier, ils, libraries, weak, weak_windows
-from experiments.build import open_prepared_field, selection_of
+from experiments.build import check_overrides, open_prepared_field, selection_of
 from experiments.run import innermost
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -347,6 +347,15 @@ def test_settings_that_cannot_work_are_refused(
     with pytest.raises((ValueError, OSError, HydraException, OmegaConfBaseException)) as caught:
         libraries.run(config)
     assert message in str(innermost(caught.value))
+
+
+def test_a_setting_that_a_study_does_not_use_is_refused() -> None:
+    given = ["+exp=benchmark", "seed=1", "n_realizations=1"]
+    check_overrides(given, used=(), experiment="benchmark")
+    check_overrides(["search=stlsq", "depth=2"], used=("search", "depth"), experiment="breathing")
+    for unused in ("search=stlsq", "depth=2", "formulation.smoother.window=21", "data=file"):
+        with pytest.raises(ValueError, match="would do nothing: benchmark does not use"):
+            check_overrides([*given, unused], used=(), experiment="benchmark")
 
 
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:

@@ -1,0 +1,47 @@
+"""How often 95 % intervals of the weighted weak form hold the true coefficient, at 5 % noise.
+
+python -m benchmarks.intervals --n 200
+"""
+
+import argparse
+
+import numpy as np
+from joblib import Parallel, delayed
+
+from ep2sindy.errors_in_variables import reweighted
+from ep2sindy.pareto import fit_support
+from ep2sindy.regression import RandomSplit
+from ep2sindy.studies.benchmark import DRAWS, realization
+from ep2sindy.weak import Weak
+
+NOISE = 0.05
+
+
+def held(name: str, number: int) -> list[bool]:
+    """For every true coefficient of one realization: is it inside its interval?"""
+    system, runs = realization(name, NOISE, number, seed=1)
+    formulation = Weak(split=RandomSplit(0.0))
+    inside: list[bool] = []
+    rng = np.random.default_rng(0)
+    for problem in formulation.assemble(runs, system.model.library, rng=rng):
+        (state,) = problem.equations
+        truth = system.model.terms(state)
+        candidate = reweighted(problem, fit_support(problem, state, list(truth)))
+        assert candidate.covariance is not None
+        error = candidate.coef - [truth[term] for term in candidate.terms]
+        inside += (np.abs(error) < 1.96 * np.sqrt(np.diag(candidate.covariance))).tolist()
+    return inside
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="coverage of 95 % intervals at 5 % noise")
+    parser.add_argument("--n", type=int, default=200, help="realizations per system")
+    n = parser.parse_args().n
+    print(f"true coefficients inside their 95 % interval, {n} realizations at 5 % noise")
+    for name in DRAWS:
+        found = Parallel(n_jobs=-1)(delayed(held)(name, number) for number in range(n))
+        print(f"{name:<16}{np.mean(found):7.1%}")
+
+
+if __name__ == "__main__":
+    main()
