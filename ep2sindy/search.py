@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.ambiguity import usable_terms
 from ep2sindy.kernels import adaptive_lasso_supports, best_subsets, thresholded_supports
 from ep2sindy.regression import Grams, Regression
+from ep2sindy.resampling import moving_block_counts
 
 
 @runtime_checkable
@@ -138,6 +139,8 @@ class Bootstraps:
 
     Each of the `n` draws takes, with replacement, a random share of the training groups
     between `smallest` and `largest`, and leaves out `n_culled` random terms.
+    block: groups drawn together, side by side; 1 draws them one by one, as the thesis does, and
+    then says too little of a time series, whose neighbours are alike.
     n = 0: one search on all training rows and terms. Source: the thesis, II-C and II-H.
     """
 
@@ -145,6 +148,7 @@ class Bootstraps:
     n_culled: int = 1
     smallest: float = 0.2
     largest: float = 0.8
+    block: int = 1
 
     def __post_init__(self) -> None:
         for name in ("n", "n_culled"):
@@ -156,6 +160,8 @@ class Bootstraps:
                 "shares must satisfy 0 < smallest <= largest: "
                 f"smallest={self.smallest}, largest={self.largest} came"
             )
+        if not isinstance(self.block, int) or self.block < 1:
+            raise ValueError(f"block must be a whole number, one or more: {self.block!r} came")
 
     def draw(
         self, problem: Regression, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
@@ -175,7 +181,7 @@ class Bootstraps:
         kept = np.repeat(terms[None], self.n, axis=0)
         for k in range(self.n):
             size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
-            counts[k] = np.bincount(rng.integers(n_groups, size=size), minlength=n_groups)
+            counts[k] = moving_block_counts(n_groups, n_drawn=size, block=self.block, rng=rng)
             kept[k, rng.permutation(usable)[: self.n_culled]] = False
         return problem.resampled_grams(counts[:, group]), kept
 

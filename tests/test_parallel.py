@@ -1,0 +1,93 @@
+import os
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from distributed import LocalCluster
+from threadpoolctl import threadpool_info
+
+from ep2sindy.parallel import Dask, Loky, Serial, Workers
+
+PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
+
+
+def total(values: np.ndarray) -> float:
+    return float(values.sum())
+
+
+def n_threads(_: object) -> int:
+    np.ones((2, 2)) @ np.ones((2, 2))
+    return max(pool["num_threads"] for pool in threadpool_info())
+
+
+def fails_on_three(piece: int) -> int:
+    if piece == 3:
+        raise ValueError("three came")
+    return piece
+
+
+def dies_once(marker: str) -> str:
+    """Kill the worker process the first time that the piece is tried."""
+    try:
+        with open(marker, "x"):
+            pass
+    except FileExistsError:
+        return "survived"
+    os._exit(1)
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """A scheduler with two workers, on loopback, in processes of their own."""
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(params=["serial", "loky", "dask"])
+def workers(request: pytest.FixtureRequest) -> Workers:
+    if request.param == "dask":
+        return Dask(request.getfixturevalue("address"))
+    return Serial() if request.param == "serial" else Loky(n_jobs=2)
+
+
+def test_every_piece_is_done_once_and_keeps_its_number(workers: Workers) -> None:
+    found = dict(workers.run(total, iter(PIECES)))
+    assert found == {k: piece.sum() for k, piece in enumerate(PIECES)}
+
+
+def test_a_piece_has_one_thread(workers: Workers) -> None:
+    assert set(dict(workers.run(n_threads, range(2))).values()) == {1}
+
+
+def test_the_error_of_a_piece_arrives(workers: Workers) -> None:
+    with pytest.raises(ValueError, match="three came"):
+        list(workers.run(fails_on_three, range(6)))
+
+
+def test_no_pieces_are_no_results(workers: Workers) -> None:
+    assert list(workers.run(total, [])) == []
+
+
+def test_pieces_of_a_dead_worker_are_done_by_another(address: str, tmp_path: object) -> None:
+    marker = str(tmp_path) + "/died"
+    assert dict(Dask(address).run(dies_once, [marker])) == {0: "survived"}
+
+
+def test_a_silent_scheduler_is_named() -> None:
+    begin = time.monotonic()
+    with pytest.raises(OSError, match=r"must answer at 'tcp://127.0.0.1:9' within 0.5 s"):
+        list(Dask("tcp://127.0.0.1:9", timeout_s=0.5).run(total, PIECES))
+    assert time.monotonic() - begin < 30.0
+
+
+def test_an_address_must_be_one() -> None:
+    with pytest.raises(OSError, match="must answer at 'nowhere:nothing'"):
+        list(Dask("nowhere:nothing", timeout_s=0.5).run(total, PIECES))
+
+
+def test_a_number_of_processes_must_be_one() -> None:
+    with pytest.raises(ValueError, match="n_jobs must be a number of processes"):
+        Loky(n_jobs=0)
