@@ -9,6 +9,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 # From data to report; a module may import only from those before it.
 ORDER = [
     "files",
+    "parallel",
+    "resampling",
     "units",
     "names",
     "kernels",
