@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import uuid
 from collections.abc import Iterator
@@ -29,3 +30,15 @@ def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text under `path`, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def fingerprint(settings: str, *, sources: Path) -> str:
+    """Sixteen hexadecimal digits of some settings and of the source text that uses them.
+
+    sources: a folder of Python files; what a changed formula would answer differently is not
+    taken from what an old one left on disk.
+    """
+    digest = hashlib.sha256(settings.encode())
+    for source in sorted(sources.rglob("*.py")):
+        digest.update(source.name.encode() + source.read_bytes())
+    return digest.hexdigest()[:16]

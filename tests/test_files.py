@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from ep2sindy.files import replacing, write_text
+from ep2sindy.files import fingerprint, replacing, write_text
 from ep2sindy.report import RunFolder, equation_html, table_html
 
 NOW = datetime(2026, 1, 2, 3, 4, 5)
@@ -32,6 +32,17 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, end: type) -> 
 def test_a_write_creates_its_folder(tmp_path: Path) -> None:
     write_text(tmp_path / "a" / "b.txt", "text")
     assert (tmp_path / "a" / "b.txt").read_text() == "text"
+
+
+def test_a_fingerprint_knows_settings_and_source(tmp_path: Path) -> None:
+    (tmp_path / "deeper").mkdir()
+    source = tmp_path / "deeper" / "formula.py"
+    source.write_text("x = 1")
+    first = fingerprint("{}", sources=tmp_path)
+    assert fingerprint("{}", sources=tmp_path) == first
+    assert fingerprint("{a}", sources=tmp_path) != first
+    source.write_text("x = 2")
+    assert fingerprint("{}", sources=tmp_path) != first
 
 
 def test_two_runs_in_one_second_get_two_folders(tmp_path: Path) -> None:

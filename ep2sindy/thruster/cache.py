@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import xarray as xr
 from tqdm import tqdm
 
-from ep2sindy.files import replacing
+from ep2sindy.files import fingerprint, replacing
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.simulate import simulate, to_json
 
@@ -35,7 +34,8 @@ def simulate_cached(
         "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s, "n_cells": n_cells,
     }  # fmt: skip
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
-    path = Path(cache) / f"thruster_{operating_point.label}_{cache_key(to_json(parameters))}.nc"
+    key = fingerprint(to_json(parameters), sources=Path(__file__).parent)
+    path = Path(cache) / f"thruster_{operating_point.label}_{key}.nc"
     if path.exists():
         try:
             return read(path)
@@ -59,14 +59,6 @@ def simulate_cached(
     )
     write(field, path)
     return field
-
-
-def cache_key(parameters_json: str) -> str:
-    """Sixteen hexadecimal digits of the parameters and of the source text that uses them."""
-    digest = hashlib.sha256(parameters_json.encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(source.name.encode() + source.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def read(path: Path) -> xr.Dataset:
