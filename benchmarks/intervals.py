@@ -4,11 +4,12 @@ python -m benchmarks.intervals --n 200
 """
 
 import argparse
+from functools import partial
 
 import numpy as np
-from joblib import Parallel, delayed
 
 from ep2sindy.errors_in_variables import reweighted
+from ep2sindy.parallel import Loky
 from ep2sindy.pareto import fit_support
 from ep2sindy.regression import RandomSplit
 from ep2sindy.studies.benchmark import DRAWS, realization
@@ -39,8 +40,8 @@ def main() -> None:
     n = parser.parse_args().n
     print(f"true coefficients inside their 95 % interval, {n} realizations at 5 % noise")
     for name in DRAWS:
-        found = Parallel(n_jobs=-1)(delayed(held)(name, number) for number in range(n))
-        print(f"{name:<16}{np.mean(found):7.1%}")
+        found = dict(Loky().run(partial(held, name), range(n))).values()
+        print(f"{name:<16}{np.mean(list(found)):7.1%}")
 
 
 if __name__ == "__main__":

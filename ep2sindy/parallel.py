@@ -44,6 +44,9 @@ class Serial:
             yield _on_one_thread(function, numbered)
 
 
+ONE_BY_ONE = Serial()
+
+
 @dataclass(frozen=True)
 class Loky:
     """Pieces side by side in processes of this machine. n_jobs: how many; -1, one per core."""

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pandas as pd
+from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
@@ -15,12 +16,12 @@ from ep2sindy.studies.benchmark import COUNTS, MERITS, cells, run_benchmark
 from ep2sindy.study_plots import benchmark_figure
 from experiments.benchmark_view import Outcome, page, print_outcome
 from experiments.build import started_run
-from experiments.checks import check_counts, check_lists, check_n_jobs, check_numbers
+from experiments.checks import check_counts, check_lists, check_numbers
 from experiments.variants import chosen_variants
 
-USES: tuple[str, ...] = ()  # of conf/config.yaml
+USES: tuple[str, ...] = ("parallel",)  # of conf/config.yaml
 KEYS = (
-    "n_realizations", "n_trajectories", "n_jobs", "systems", "noises", "variants", "definitions",
+    "n_realizations", "n_trajectories", "systems", "noises", "variants", "definitions",
     "thesis",
 )  # fmt: skip
 
@@ -29,7 +30,7 @@ def run(config: DictConfig) -> Path:
     """Draw, search, count; everything lands in a new run folder."""
     with started_run(config, keys=KEYS) as (folder, screen):
         check_counts(config, "n_realizations", "n_trajectories")
-        check_n_jobs(config)
+        workers = instantiate(config.parallel)
         check_lists(config, "systems")
         check_numbers(config, "noises", zero=True)
         variants = chosen_variants(config)
@@ -41,7 +42,7 @@ def run(config: DictConfig) -> Path:
                 noises=[float(noise) for noise in config.noises],
                 n_realizations=config.n_realizations,
                 n_trajectories=config.n_trajectories,
-                n_jobs=config.n_jobs,
+                workers=workers,
                 seed=config.seed,
                 progress=lambda n_done: cast(None, bar.update(n_done - bar.n)),
             )

@@ -22,8 +22,8 @@ from ep2sindy.report import RunFolder, Screen
 
 # The keys of conf/config.yaml, which every study meets; each study names those it adds.
 BASE_KEYS = {
-    "data", "formulation", "search", "bootstraps", "selection", "depth", "experiment", "study",
-    "seed", "output", "prepare", "trajectory",
+    "data", "formulation", "search", "bootstraps", "selection", "depth", "parallel", "experiment",
+    "study", "seed", "output", "prepare", "trajectory",
 }  # fmt: skip
 
 

@@ -12,14 +12,6 @@ def check_counts(config: DictConfig, *keys: str) -> None:
             raise ValueError(f"{key} must be a whole number, one or more: {config[key]!r} came")
 
 
-def check_n_jobs(config: DictConfig) -> None:
-    """Raise ValueError unless n_jobs is what joblib takes."""
-    if type(config.n_jobs) is not int or config.n_jobs == 0:
-        raise ValueError(
-            f"n_jobs must be a number of processes, or -1 for one per core: {config.n_jobs!r} came"
-        )
-
-
 def check_share(config: DictConfig, key: str) -> None:
     """Raise ValueError unless it is a number between zero and one."""
     if type(config[key]) not in (int, float) or not 0 < config[key] < 1:

@@ -16,11 +16,11 @@ from ep2sindy.studies.frontier import identification_frontier
 from ep2sindy.systems import System
 from ep2sindy.weak_plots import frontier_figure
 from experiments.build import started_run
-from experiments.checks import check_n_jobs, check_numbers
+from experiments.checks import check_numbers
 from experiments.variants import chosen_variants
 
-USES: tuple[str, ...] = ()  # of conf/config.yaml
-KEYS = ("system", "variants", "definitions", "rates_Hz", "durations_s", "n_jobs")
+USES: tuple[str, ...] = ("parallel",)  # of conf/config.yaml
+KEYS = ("system", "variants", "definitions", "rates_Hz", "durations_s")
 TITLE = "Lowest sampling rate from which on all rates identify the system"
 CAPTION = (
     "Filled: the true equations of all states are on the variant's fronts. Hollow: they are not. "
@@ -31,7 +31,7 @@ CAPTION = (
 def run(config: DictConfig) -> Path:
     """Sample, search, judge; everything lands in a new run folder."""
     with started_run(config, keys=KEYS) as (folder, screen):
-        check_n_jobs(config)
+        workers = instantiate(config.parallel)
         check_numbers(config, "rates_Hz", "durations_s")
         variants = chosen_variants(config)
         system = instantiate(config.system)
@@ -43,7 +43,7 @@ def run(config: DictConfig) -> Path:
                 variants,
                 rates_Hz=[float(rate) for rate in config.rates_Hz],
                 durations_s=[float(duration) for duration in config.durations_s],
-                n_jobs=config.n_jobs,
+                workers=workers,
                 seed=config.seed,
                 progress=lambda n_done: cast(None, bar.update(n_done - bar.n)),
             )

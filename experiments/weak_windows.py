@@ -17,13 +17,13 @@ from ep2sindy.studies.weak_windows import coefficient_errors, window_cells
 from ep2sindy.systems import System
 from ep2sindy.weak_plots import window_error_figure
 from experiments.build import started_run
-from experiments.checks import check_counts, check_n_jobs, check_numbers
+from experiments.checks import check_counts, check_numbers
 from experiments.weak import settings_of
 
-USES: tuple[str, ...] = ()  # of conf/config.yaml
+USES: tuple[str, ...] = ("parallel",)  # of conf/config.yaml
 KEYS = (
     "boxes", "automatic", "system", "rate_Hz", "n_windows", "n_points", "noises",
-    "n_realizations", "n_jobs",
+    "n_realizations",
 )  # fmt: skip
 COUNTS = ("n_windows", "n_points")
 TITLE = "Coefficient error, mean over the realizations"
@@ -37,7 +37,7 @@ def run(config: DictConfig) -> Path:
     """Draw noise, fit, measure; everything lands in a new run folder."""
     with started_run(config, keys=KEYS) as (folder, screen):
         check_counts(config, "n_realizations")
-        check_n_jobs(config)
+        workers = instantiate(config.parallel)
         check_numbers(config, "n_windows", "n_points", whole=True)
         check_numbers(config, "noises", zero=True)
         settings = settings_of(config)
@@ -50,7 +50,7 @@ def run(config: DictConfig) -> Path:
                 settings,
                 noises=[float(noise) for noise in config.noises],
                 n_realizations=config.n_realizations,
-                n_jobs=config.n_jobs,
+                workers=workers,
                 seed=config.seed,
                 progress=lambda n_done: cast(None, bar.update(n_done - bar.n)),
             )

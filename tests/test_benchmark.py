@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from ep2sindy.library import Library
+from ep2sindy.parallel import Loky
 from ep2sindy.regression import Differential
 from ep2sindy.search import STLSQ, AdaptiveLasso, Bootstraps
 from ep2sindy.selection import Knee
@@ -92,7 +93,7 @@ def test_leaving_a_variant_out_changes_no_other() -> None:
 def test_the_number_of_processes_changes_nothing() -> None:
     settings = {"variants": {"BALASSO": BALASSO, "STLSQ": STLSQ_}}
     pd.testing.assert_frame_equal(
-        outcomes_of(**settings, n_jobs=2), outcomes_of(**settings, n_jobs=1)
+        outcomes_of(**settings, workers=Loky(n_jobs=2)), outcomes_of(**settings)
     )
 
 

@@ -25,7 +25,7 @@ def toy(output: Path) -> list[str]:
     return [
         f"output={output}",
         "n_realizations=1",
-        "n_jobs=1",
+        "parallel=serial",
         "systems=[lotka_volterra,oscillator]",
         "noises=[0,0.05]",
         "variants=[ALASSO,ours]",
@@ -141,7 +141,7 @@ def test_a_rival_without_pysindy_is_refused(
         ("n_realizations=0", "n_realizations must be a whole number, one or more: 0 came"),
         ("n_realizations=1.5", "n_realizations must be a whole number, one or more: 1.5 came"),
         ("n_trajectories=true", "n_trajectories must be a whole number, one or more: True came"),
-        ("n_jobs=0", "n_jobs must be a number of processes"),
+        ("+parallel.n_jobs=0", "unexpected keyword argument 'n_jobs'"),
         ("noises=[0.1,-0.1]", "noises must be numbers, zero or more: -0.1 came"),
         ("noises=[nan]", "noises must be numbers, zero or more: nan came"),
         ("noises=0.1", "noises must be a list"),

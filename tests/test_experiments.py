@@ -438,7 +438,7 @@ def test_weak_settings_that_cannot_work_are_refused(
 
 
 def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
-    overrides = ["n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "n_jobs=1"]
+    overrides = ["n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "parallel=serial"]
     config = composed("+exp=weak_windows", *overrides, "n_realizations=2", f"output={tmp_path}")
     folder = weak_windows.run(config)
     found = summary_of(folder)["cells"]
@@ -455,8 +455,9 @@ def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
 
 
 def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
-    overrides = ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]", "n_jobs=1"]
-    folder = frontier.run(composed("+exp=frontier", *overrides, f"output={tmp_path}"))
+    overrides = ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]"]
+    settings = ["+exp=frontier", "parallel=serial", *overrides, f"output={tmp_path}"]
+    folder = frontier.run(composed(*settings))
     points = summary_of(folder)["points"]
     assert len(points) == 8
     found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
@@ -474,7 +475,7 @@ def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
         (["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
         (["rates_Hz=[0]"], "rates_Hz must be numbers, above zero: 0 came"),
         (["durations_s=10"], "durations_s must be a list such as [a,b]"),
-        (["n_jobs=0"], "n_jobs must be a number of processes"),
+        (["parallel.n_jobs=0"], "n_jobs must be a number of processes"),
     ],
 )
 def test_frontier_settings_that_cannot_work_are_refused(

@@ -8,14 +8,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
-from threadpoolctl import threadpool_limits
 
 from ep2sindy.library import Library
+from ep2sindy.parallel import ONE_BY_ONE, Workers
 from ep2sindy.pareto import pareto_front
 from ep2sindy.regression import Formulation
 from ep2sindy.search import Bootstraps, Search, pooled_supports
@@ -135,11 +135,11 @@ def run_benchmark(
     noises: Sequence[float],
     n_realizations: int,
     n_trajectories: int = 1,
-    n_jobs: int = 1,
+    workers: Workers = ONE_BY_ONE,
     seed: int = 0,
     progress: Callable[[int], None] = lambda n_done: None,
 ) -> pd.DataFrame:
-    """Every variant on every realization, realizations side by side in `n_jobs` processes.
+    """Every variant on every realization, realizations being the workers' pieces.
 
     One row per system, noise, number and variant: on_front and selected (is the whole system
     right), correct_terms (true terms among those selected), cpu_s. A variant that selects nothing
@@ -153,12 +153,9 @@ def run_benchmark(
             f"variants={list(variants)}"
         )
     tasks = [(s, noise, k) for s in systems for noise in noises for k in range(n_realizations)]
-    outcomes = Parallel(n_jobs=n_jobs, return_as="generator_unordered")(
-        delayed(_outcomes)(variants, *task, n_trajectories=n_trajectories, seed=seed)
-        for task in tasks
-    )
+    judge = partial(_outcomes, variants, n_trajectories=n_trajectories, seed=seed)
     rows = []
-    for n_done, found in enumerate(outcomes, start=1):
+    for n_done, (_, found) in enumerate(workers.run(judge, tasks), start=1):
         rows += found
         progress(n_done)
     order = ["system", "noise", "number", "variant"]
@@ -170,23 +167,21 @@ def run_benchmark(
 
 def _outcomes(
     variants: Mapping[str, Variant],
-    name: str,
-    noise: float,
-    number: int,
+    task: tuple[str, float, int],
     *,
     n_trajectories: int,
     seed: int,
 ) -> list[dict[str, object]]:
+    name, noise, number = task
     system, runs = realization(name, noise, number, n_trajectories=n_trajectories, seed=seed)
     truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
     rows: list[dict[str, object]] = []
     for label, variant in variants.items():
         # A stream of its own, so that leaving a variant out changes no other.
         rng = np.random.default_rng([seed, number, *label.encode()])
-        with threadpool_limits(limits=1):
-            start = time.process_time()
-            finding = variant.find(runs, system.model.library, rng=rng)
-            cpu_s = time.process_time() - start
+        start = time.process_time()
+        finding = variant.find(runs, system.model.library, rng=rng)
+        cpu_s = time.process_time() - start
         rows.append(
             {"system": name, "noise": noise, "number": number, "variant": label}
             | judged(finding, truth)

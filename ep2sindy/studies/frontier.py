@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
-from threadpoolctl import threadpool_limits
 
+from ep2sindy.parallel import ONE_BY_ONE, Workers
 from ep2sindy.studies.benchmark import Variant, judged
 from ep2sindy.systems import System
 
@@ -23,7 +23,7 @@ def identification_frontier(
     *,
     rates_Hz: Sequence[float],
     durations_s: Sequence[float],
-    n_jobs: int = 1,
+    workers: Workers = ONE_BY_ONE,
     seed: int = 0,
     progress: Callable[[int], None] = lambda n_done: None,
 ) -> pd.DataFrame:
@@ -43,12 +43,9 @@ def identification_frontier(
     # The largest comes first: a variant that cannot run at all fails before the work is done.
     points = sorted(((r, d) for r in rates_Hz for d in durations_s), reverse=True)
     largest = (max(rates_Hz), max(durations_s))
-    outcomes = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(_point)(system, variants, *point, seed=seed, may_fail=point != largest)
-        for point in points
-    )
+    judge = partial(_point, system, variants, seed=seed, largest=largest)
     rows = []
-    for n_done, found in enumerate(outcomes, start=1):
+    for n_done, (_, found) in enumerate(workers.run(judge, points), start=1):
         rows += found
         progress(n_done)
     table = pd.DataFrame(rows)
@@ -60,12 +57,12 @@ def identification_frontier(
 def _point(
     system: System,
     variants: Mapping[str, Variant],
-    rate_Hz: float,
-    duration_s: float,
+    point: tuple[float, float],
     *,
     seed: int,
-    may_fail: bool,
+    largest: tuple[float, float],
 ) -> list[dict[str, object]]:
+    rate_Hz, duration_s = point
     n_samples = round(rate_Hz * duration_s)
     sampled = replace(system, rate_Hz=rate_Hz, duration_s=duration_s)
     truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
@@ -78,11 +75,10 @@ def _point(
             if n_samples < 2:
                 raise ValueError(f"a trajectory needs two samples: {n_samples} fit in")
             run = sampled.trajectory()
-            with threadpool_limits(limits=1):
-                finding = variant.find([run], system.model.library, rng=rng)
+            finding = variant.find([run], system.model.library, rng=rng)
             identified = judged(finding, truth)["on_front"] == 1.0
         except ValueError as error:
-            if not may_fail:
+            if point == largest:
                 raise
             reason = str(error)
         rows.append(

@@ -6,13 +6,13 @@ Source: the thesis, appendix, III-A: the true support is known, and least square
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
-from threadpoolctl import threadpool_limits
 
 from ep2sindy.library import Library, named_terms
+from ep2sindy.parallel import ONE_BY_ONE, Workers
 from ep2sindy.studies.weak_forms import Setting, check_windows, fitted_terms
 from ep2sindy.systems import System
 from ep2sindy.trajectory import Trajectory
@@ -43,11 +43,11 @@ def coefficient_errors(
     *,
     noises: Sequence[float],
     n_realizations: int,
-    n_jobs: int = 1,
+    workers: Workers = ONE_BY_ONE,
     seed: int = 0,
     progress: Callable[[int], None] = lambda n_done: None,
 ) -> pd.DataFrame:
-    """The error of every setting on every realization, side by side in `n_jobs` processes.
+    """The error of every setting on every realization, realizations being the workers' pieces.
 
     noises: standard deviations of the white noise, in RMS of each state. A realization is one
     draw of it, the same for all settings and, but for its size, for all levels.
@@ -61,26 +61,24 @@ def coefficient_errors(
         )
     check_windows(settings, round(system.duration_s * system.rate_Hz))
     tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
-    outcomes = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(_realization)(system, settings, *task, seed=seed) for task in tasks
-    )
-    rows = []
-    for n_done, found in enumerate(outcomes, start=1):
-        rows += found
+    fit = partial(_realization, system, settings, seed=seed)
+    found = {}
+    for n_done, (place, rows) in enumerate(workers.run(fit, tasks), start=1):
+        found[place] = rows
         progress(n_done)
-    return pd.DataFrame(rows)
+    return pd.DataFrame([row for place in sorted(found) for row in found[place]])
 
 
 def _realization(
-    system: System, settings: Mapping[str, Setting], noise: float, number: int, *, seed: int
+    system: System, settings: Mapping[str, Setting], task: tuple[float, int], *, seed: int
 ) -> list[dict[str, object]]:
+    noise, number = task
     run = system.trajectory(noise=noise, rng=np.random.default_rng([seed, number]))
     rows: list[dict[str, object]] = []
     for name, setting in settings.items():
         # A stream of its own, so that leaving a setting out changes no other.
         rng = np.random.default_rng([seed, number, *name.encode()])
-        with threadpool_limits(limits=1):
-            error = coefficient_error(system, run, setting, rng=rng)
+        error = coefficient_error(system, run, setting, rng=rng)
         rows.append({"setting": name, "noise": noise, "number": number, "error": error})
     return rows
 
