@@ -9,6 +9,8 @@ from numba import njit
 
 # A column counts as dependent on others when what they leave of its square falls below this.
 DEPENDENT = 1e-11
+# What is left of a target's square below this share of it is rounding.
+ROUNDING = 1e-15
 
 
 @njit(cache=True)
@@ -221,13 +223,22 @@ def _sweep(source, target, j, size):
 
 
 @njit(cache=True)
-def _least_residual(matrix, first, size, diagonal, scratch):
-    """Residual left when every column from `first` on is used: a bound for a whole subtree."""
-    scratch[first:size, first:size] = matrix[first:size, first:size]
-    for j in range(first, size - 1):
-        if scratch[j, j] > DEPENDENT * diagonal[j]:
-            _sweep(scratch, scratch, j, size)
-    return scratch[size - 1, size - 1]
+def _joined(total, residual, rounding, n_problems):
+    """Carry the product of residuals on by one: as a logarithm, or plainly if it is the only."""
+    return residual if n_problems == 1 else total + np.log(max(residual, rounding))
+
+
+@njit(cache=True)
+def _least_residual(matrices, first, size, smallest, scratch):
+    """The same when every column from `first` on is used: a bound for a whole subtree."""
+    total = 0.0
+    for p in range(len(matrices)):
+        scratch[first:size, first:size] = matrices[p, first:size, first:size]
+        for j in range(first, size - 1):
+            if scratch[j, j] > smallest[p, j]:
+                _sweep(scratch, scratch, j, size)
+        total = _joined(total, scratch[size - 1, size - 1], smallest[p, size - 1], len(matrices))
+    return total
 
 
 @njit(cache=True)
@@ -251,24 +262,31 @@ def _offer(residual, chosen, n_chosen, best, best_masks):
 def best_subsets(xx, xy, yy, max_terms, n_best):
     """The `n_best` supports of least residual of every size up to max_terms, proven best.
 
-    Depth first over subsets with the residual Gram matrix carried along, so a leaf costs one
+    One support serves several problems, each with its own coefficients: what is least is the
+    product of their residuals (for one problem, the residual), so that no scale of a target
+    counts. A problem in which a column depends on those chosen keeps its residual.
+    Depth first over subsets with the residual Gram matrices carried along, so a leaf costs one
     division; a branch is cut when even all of its columns together leave more than the best
     known (Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231).
-    xx: (terms, terms), columns ordered with the most telling first for early cuts.
+    xx: (problems, terms, terms), columns ordered with the most telling first for early cuts;
+    xy: (problems, terms); yy: (problems,).
     Returns (supports, terms) of bool, the empty support first.
     """
-    n_terms = len(xy)
+    n_problems, n_terms = xy.shape
     size = n_terms + 1
     depth = min(max_terms, n_terms)
-    levels = np.zeros((depth + 1, size, size))
-    levels[0, :n_terms, :n_terms] = xx
-    levels[0, :n_terms, n_terms], levels[0, n_terms, :n_terms] = xy, xy
-    levels[0, n_terms, n_terms] = yy
-    diagonal = np.diag(xx).copy()
+    levels = np.zeros((depth + 1, n_problems, size, size))
+    levels[0, :, :n_terms, :n_terms] = xx
+    levels[0, :, :n_terms, n_terms], levels[0, :, n_terms, :n_terms] = xy, xy
+    levels[0, :, n_terms, n_terms] = yy
+    smallest = np.empty((n_problems, size))
+    for p in range(n_problems):
+        smallest[p, :n_terms] = DEPENDENT * np.diag(xx[p])
+        smallest[p, n_terms] = ROUNDING * yy[p] if yy[p] > 0.0 else 1.0
     scratch = np.empty((size, size))
     best = np.full((depth + 1, n_best), np.inf)
     best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
-    best[0, 0] = yy
+    best[0, 0] = 0.0
     chosen = np.zeros(depth + 1, dtype=np.int64)
     following = np.zeros(depth + 1, dtype=np.int64)
     level = 0
@@ -278,23 +296,28 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
             level -= 1
             continue
         following[level] = j + 1
-        here = levels[level]
-        if here[j, j] <= DEPENDENT * diagonal[j]:
+        residual, adds = 0.0, False
+        for p in range(n_problems):  # in place: views would cost more than the work
+            left, pivot = levels[level, p, n_terms, n_terms], levels[level, p, j, j]
+            if pivot > smallest[p, j]:
+                left -= levels[level, p, j, n_terms] ** 2 / pivot
+                adds = True
+            residual = _joined(residual, left, smallest[p, n_terms], n_problems)
+        if not adds:
             continue
         chosen[level] = j
-        _offer(
-            here[n_terms, n_terms] - here[j, n_terms] ** 2 / here[j, j],
-            chosen,
-            level + 1,
-            best,
-            best_masks,
-        )
+        _offer(residual, chosen, level + 1, best, best_masks)
         if level + 1 == depth or j + 1 == n_terms:
             continue
-        _sweep(here, levels[level + 1], j, size)
+        for p in range(n_problems):
+            here, below = levels[level, p], levels[level + 1, p]
+            if here[j, j] > smallest[p, j]:
+                _sweep(here, below, j, size)
+            else:
+                below[j + 1 :, j + 1 :] = here[j + 1 :, j + 1 :]
         worth_bounding = n_terms - j > 6 and depth - level > 2
         if worth_bounding and best[level + 2, n_best - 1] <= _least_residual(
-            levels[level + 1], j + 1, size, diagonal, scratch
+            levels[level + 1], j + 1, size, smallest, scratch
         ):
             continue
         following[level + 1] = j + 1

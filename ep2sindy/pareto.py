@@ -44,10 +44,11 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class ParetoFront:
-    """The best candidates of every size, the empty model first; the best error falls with size.
+    """The best candidates of every size, the empty model first.
 
-    Sorted by size, and within a size by error: the first of each size is the front proper, any
-    others are runners-up (see `pareto_front`). problem: the rows that they were fitted to.
+    From `pareto_front` they are sorted by size, and within a size by error: the first of each
+    size is the front proper, whose error falls, any others are runners-up. A joint search ranks
+    by all of its points: at one of them errors may rise. problem: the rows they were fitted to.
     """
 
     equation: str
@@ -58,8 +59,6 @@ class ParetoFront:
         object.__setattr__(self, "candidates", tuple(self.candidates))
         assert self.candidates
         assert self.candidates[0].n_terms == 0
-        assert all(np.diff([c.n_terms for c in self.candidates]) >= 0)
-        assert all(np.diff(self.errors[self.leading]) < 0)
 
     @property
     def errors(self) -> Float[np.ndarray, " candidates"]:
@@ -87,11 +86,19 @@ def fit_support(problem: Regression, equation: str, terms: Sequence[str]) -> Can
     """
     mask = np.zeros((1, len(problem.library)), dtype=np.bool_)
     mask[0, [problem.library.index(name) for name in terms]] = True
-    nothing = np.full((len(problem.library) + 1, len(problem.library)), np.nan)
-    (candidate,) = _candidates(problem, Supports(equation, mask, np.array([np.nan]), nothing))
+    (candidate,) = fit_supports(problem, equation, mask)
     if not np.isfinite(candidate.coef).all():
         raise ValueError(f"terms must be independent to be fitted: {list(terms)} are not")
     return candidate
+
+
+def fit_supports(
+    problem: Regression, equation: str, masks: Bool[np.ndarray, "supports terms"]
+) -> list[Candidate]:
+    """Fit given supports, as `fit_support`; coefficients of dependent terms are NaN."""
+    unknown = np.full(len(masks), np.nan)
+    nothing = np.full((len(problem.library) + 1, len(problem.library)), np.nan)
+    return _candidates(problem, Supports(equation, masks, unknown, nothing))
 
 
 def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> ParetoFront:
@@ -102,8 +109,6 @@ def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> 
     depend on each other. With noise in the library a wrong support can lead the true one of its
     size by a hair; a depth of 3 keeps both for a better judge.
     """
-    if depth < 1:
-        raise ValueError(f"depth must be at least 1: {depth} came")
     n_terms = len(problem.library)
     equation = problem.equations.index(supports.equation)
     best = _best_of_each_size(problem, equation, supports.masks, depth)
@@ -114,15 +119,29 @@ def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> 
         share=np.append(supports.share[~supports.masks.any(axis=1)].sum(), supports.share[best]),
         inclusion=supports.inclusion,
     )
-    by_size = groupby(_candidates(problem, chosen), key=lambda c: c.n_terms)
-    front: list[Candidate] = []
-    highest = -np.inf
-    for _, same_size in by_size:
-        ranked = sorted(same_size, key=_score, reverse=True)
-        if _score(ranked[0]) > highest:
-            highest = _score(ranked[0])
+    candidates = _candidates(problem, chosen)
+    order = front_order(
+        np.array([c.n_terms for c in candidates]),
+        np.array([-_score(c) for c in candidates]),
+        depth=depth,
+    )
+    return ParetoFront(supports.equation, [candidates[k] for k in order], problem)
+
+
+def front_order(
+    sizes: Int[np.ndarray, " candidates"], errors: Float[np.ndarray, " candidates"], *, depth: int
+) -> list[int]:
+    """The `depth` of least error of each size whose best beats all smaller sizes, in order."""
+    if depth < 1:
+        raise ValueError(f"depth must be at least 1: {depth} came")
+    front: list[int] = []
+    lowest = np.inf
+    for _, same_size in groupby(np.lexsort((errors, sizes)).tolist(), key=lambda k: sizes[k]):
+        ranked = list(same_size)[:depth]
+        if errors[ranked[0]] < lowest:
+            lowest = errors[ranked[0]]
             front += ranked
-    return ParetoFront(supports.equation, front, problem)
+    return front
 
 
 def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:

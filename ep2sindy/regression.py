@@ -73,14 +73,15 @@ class Regression:
         object.__setattr__(self, "theta", read_only(self.theta))
         object.__setattr__(self, "target", read_only(self.target))
         object.__setattr__(self, "equations", tuple(self.equations))
-        columns = [*self.library.names, *(f"d({e})/dt" for e in self.equations)]
-        finite = np.isfinite(np.concatenate([self.theta, self.target], axis=1))
-        if not finite.all():
-            row, column = np.argwhere(~finite)[0]
-            raise ValueError(
-                f"every term must be finite on every row: {columns[column]!r} is not on row {row}; "
-                "lower the degree or rescale the variables"
-            )
+        rates = [f"d({e})/dt" for e in self.equations]
+        for names, values in ((self.library.names, self.theta), (rates, self.target)):
+            finite = np.isfinite(values)
+            if not finite.all():
+                row, column = np.argwhere(~finite)[0]
+                raise ValueError(
+                    f"every term must be finite on every row: {names[column]!r} is not on row "
+                    f"{row}; lower the degree or rescale the variables"
+                )
         n_train = int((~self.test).sum())
         if n_train < len(self.library):
             raise ValueError(
@@ -138,9 +139,12 @@ class Regression:
         return self._grams(whole)
 
     def _scaled(self, rows: np.ndarray) -> np.ndarray:
-        return np.concatenate(
-            [self.theta[rows] / self.theta_scale, self.target[rows] / self.target_scale], axis=1
-        )
+        index, n = np.flatnonzero(rows), len(self.library)
+        # Filled in place: joining narrow arrays side by side takes ten times as long.
+        scaled = np.empty((len(index), n + len(self.equations)))
+        scaled[:, :n], scaled[:, n:] = self.theta[index], self.target[index]
+        scaled /= np.concatenate([self.theta_scale, self.target_scale])
+        return scaled
 
     def _grams(self, products: np.ndarray) -> Grams:
         n = len(self.library)
@@ -153,9 +157,11 @@ class Regression:
 
 def _column_norms(values: np.ndarray) -> np.ndarray:
     """L2 norms without overflow at densities to high powers."""
-    largest = np.abs(values).max(axis=0)
+    columns = np.abs(values.T, order="C")  # each in one stretch of memory
+    largest = columns.max(axis=1)
     largest[largest == 0.0] = 1.0
-    norms = largest * np.sqrt(np.square(values / largest).sum(axis=0))
+    columns /= largest[:, None]
+    norms = largest * np.sqrt(np.einsum("cr,cr->c", columns, columns))
     norms[norms == 0.0] = 1.0
     return norms
 

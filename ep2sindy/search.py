@@ -10,7 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.ambiguity import usable_terms
-from ep2sindy.kernels import adaptive_lasso_supports, best_subsets, thresholded_supports
+from ep2sindy.kernels import (
+    adaptive_lasso_supports,
+    best_subsets,
+    solve_masks,
+    thresholded_supports,
+)
 from ep2sindy.regression import Grams, Regression
 from ep2sindy.resampling import moving_block_counts
 
@@ -114,11 +119,25 @@ class BestSubset:
         xy: Float[np.ndarray, " terms"],
         yy: float,
     ) -> Bool[np.ndarray, "supports terms"]:
-        # Branches are cut sooner when the columns closest to the target come first.
-        order = np.argsort(-np.abs(xy), kind="stable")
+        return self.joint_supports(xx[None], xy[None], np.array([yy]))
+
+    def joint_supports(
+        self,
+        xx: Float[np.ndarray, "problems terms terms"],
+        xy: Float[np.ndarray, "problems terms"],
+        yy: Float[np.ndarray, " problems"],
+    ) -> Bool[np.ndarray, "supports terms"]:
+        """Supports that serve several problems at once, coefficients free in each.
+
+        The best leave the least product of residuals: for Gaussian errors of a variance of
+        their own in every problem, that is the largest likelihood when all have as many rows. No
+        weight is needed, since the scale of one problem multiplies all products alike.
+        """
+        # Branches are cut sooner when the columns closest to the targets come first.
+        order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
         found = best_subsets(
-            np.ascontiguousarray(xx[np.ix_(order, order)]),
-            xy[order],
+            xx.take(order, axis=1).take(order, axis=2),
+            xy.take(order, axis=1),
             yy,
             self.max_terms,
             self.n_best,
@@ -183,7 +202,9 @@ class Bootstraps:
             size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
             counts[k] = moving_block_counts(n_groups, n_drawn=size, block=self.block, rng=rng)
             kept[k, rng.permutation(usable)[: self.n_culled]] = False
-        return problem.resampled_grams(counts[:, group]), kept
+        if n_groups < len(group):
+            counts = counts[:, group]
+        return problem.resampled_grams(counts), kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,17 +222,58 @@ class Supports:
     inclusion: Float[np.ndarray, "sizes terms"]
 
 
-def pooled_supports(
-    problem: Regression,
-    search: Search,
-    bootstraps: Bootstraps,
-    *,
-    rng: np.random.Generator,
-) -> tuple[Supports, ...]:
-    """Search every bootstrap of the training rows; one `Supports` per equation.
+@dataclass(frozen=True, eq=False)
+class Resamples:
+    """Bootstraps of one problem, columns scaled to unit norm in every draw.
+
+    xx: (draws, terms, terms), xy: (draws, equations, terms), yy: (draws, equations); a term that
+    a draw lacks is a column of zeros. at_hand: (draws, terms). scale: from the problem's scaled
+    columns to these. counted: False for the one search on all rows.
+    """
+
+    equations: Sequence[str]
+    xx: Float[np.ndarray, "draws terms terms"]
+    xy: Float[np.ndarray, "draws equations terms"]
+    yy: Float[np.ndarray, "draws equations"]
+    at_hand: Bool[np.ndarray, "draws terms"]
+    scale: Float[np.ndarray, "draws terms"]
+    kept: Bool[np.ndarray, "draws terms"]
+    counted: bool
+
+    def searched(self, search: Search, equation: int) -> list[Bool[np.ndarray, "_ terms"]]:
+        """What a search proposes in every draw."""
+        draws = zip(self.xx, self.xy[:, equation], self.yy[:, equation].tolist(), strict=True)
+        return [search.supports(*draw) for draw in draws]
+
+    def fits(
+        self,
+        equation: int,
+        found: Sequence[Bool[np.ndarray, "_ terms"]],
+        support: Bool[np.ndarray, " terms"],
+    ) -> Float[np.ndarray, "draws terms"]:
+        """Each draw's own best support of this support's size, fitted to the draw.
+
+        found: as `searched` gives it; where a draw has none of that size, the support itself
+        serves, as far as its terms are at hand. In units of the problem's scaled columns.
+        """
+        coef = np.empty(self.at_hand.shape)
+        for k, masks in enumerate(found):
+            same_size = masks[masks.sum(axis=1) == support.sum()]
+            if not len(same_size):
+                same_size = (support & self.at_hand[k])[None]
+            xx, xy = self.xx[k], self.xy[k, equation]
+            fits = solve_masks(xx, np.where(same_size, xy, 0.0), same_size)
+            explained = (fits * (2.0 * xy - fits @ xx)).sum(axis=1)
+            coef[k] = fits[int(np.argmax(explained))] * self.scale[k]
+        return coef
+
+
+def resamples(
+    problem: Regression, bootstraps: Bootstraps, *, rng: np.random.Generator
+) -> Resamples:
+    """Draw bootstraps of the training rows, once for all equations.
 
     Terms that are zero, or repeat an earlier term, are left out (see `ambiguities`).
-    The same resamples serve all equations, so their Gram matrices are computed once.
     """
     grams, kept = bootstraps.draw(problem, usable_terms(problem), rng)
     # A resample changes the norms: unit columns again, so that no unit or draw leaks in; a
@@ -219,31 +281,35 @@ def pooled_supports(
     diagonal = np.diagonal(grams.xx, axis1=1, axis2=2)
     at_hand = kept & (diagonal > 0.0)
     scale = at_hand / np.sqrt(np.where(at_hand, diagonal, 1.0))
-    xx = grams.xx * scale[:, :, None] * scale[:, None, :]
-    xy = grams.xy * scale[:, None, :]
-    pooled = tuple(
-        _pool(name, [search.supports(*draw) for draw in zip(xx, xy[:, k], yy, strict=True)], kept)
-        for k, (name, yy) in enumerate(zip(problem.equations, grams.yy.T.tolist(), strict=True))
-    )
-    return pooled if bootstraps.n else tuple(map(_without_shares, pooled))
-
-
-def _without_shares(found: Supports) -> Supports:
-    """One search on all rows says nothing of how often another would agree."""
-    return replace(
-        found,
-        share=np.full_like(found.share, np.nan),
-        inclusion=np.full_like(found.inclusion, np.nan),
+    return Resamples(
+        equations=problem.equations,
+        xx=grams.xx * scale[:, :, None] * scale[:, None, :],
+        xy=grams.xy * scale[:, None, :],
+        yy=grams.yy,
+        at_hand=at_hand,
+        scale=scale,
+        kept=kept,
+        counted=bootstraps.n > 0,
     )
 
 
-def _pool(
-    equation: str,
-    found: Sequence[Bool[np.ndarray, "_ terms"]],
-    kept: Bool[np.ndarray, "draws terms"],
+def pooled_supports(
+    problem: Regression,
+    search: Search,
+    bootstraps: Bootstraps,
+    *,
+    rng: np.random.Generator,
+) -> tuple[Supports, ...]:
+    """Search every bootstrap of the training rows; one `Supports` per equation."""
+    draws = resamples(problem, bootstraps, rng=rng)
+    return tuple(pooled(draws, k, draws.searched(search, k)) for k in range(len(draws.equations)))
+
+
+def pooled(
+    draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]
 ) -> Supports:
-    """Count supports and terms over the bootstraps; kept: which terms each had at hand."""
-    n_terms = kept.shape[1]
+    """Count supports and terms over the draws, as `searched` found them."""
+    n_terms = draws.kept.shape[1]
     source = np.repeat(np.arange(len(found)), [len(masks) for masks in found])
     masks = np.concatenate(found)
     sizes = masks.sum(axis=1)
@@ -257,9 +323,17 @@ def _pool(
     found_in = np.zeros((len(first), len(found)), dtype=np.bool_)
     found_in[which, source] = True
     order = np.argsort(sizes[first], kind="stable")
-    return Supports(
-        equation=equation,
+    supports = Supports(
+        equation=draws.equations[equation],
         masks=masks[first[order]],
         share=found_in.mean(axis=1)[order],
-        inclusion=included.sum(axis=0) / np.maximum(kept.sum(axis=0), 1),
+        inclusion=included.sum(axis=0) / np.maximum(draws.kept.sum(axis=0), 1),
+    )
+    if draws.counted:
+        return supports
+    # One search on all rows says nothing of how often another would agree.
+    return replace(
+        supports,
+        share=np.full_like(supports.share, np.nan),
+        inclusion=np.full_like(supports.inclusion, np.nan),
     )

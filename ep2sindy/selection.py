@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb, log
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -154,6 +154,10 @@ class EBIC:
                 f"coarsening counts rows, and must be above 1: {self.coarsening} came; None "
                 "trusts the residuals to the end"
             )
+
+    def shared_by(self, n_points: int) -> EBIC:
+        """The rule at one of n points that share a support: together they pay its count once."""
+        return replace(self, gamma=self.gamma / n_points)
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
         found = []

@@ -39,10 +39,14 @@ ORDER = [
     "ensemble",
     "validation",
     "systems",
+    "control_law",
     "discover",
+    "joint",
+    "tied",
     "ode",
     "integral",
     "refine",
+    "refined_score",
     "correction",
     "estimators",
     "studies",
@@ -50,6 +54,8 @@ ORDER = [
     "setting_plots",
     "weak_plots",
     "study_plots",
+    "map_plots",
+    "parametric_plots",
     "report",
 ]
 # PyTorch is slow to import and of no use to the search; `report` needs its TensorBoard writer.
@@ -57,7 +63,15 @@ ALLOWED = {
     "torch": {"ode", "integral", "refine", "correction", "report"},
     "hydra": set(),
     "omegaconf": set(),
-    "matplotlib": {"plots", "study_plots", "report", "setting_plots", "weak_plots"},
+    "matplotlib": {
+        "parametric_plots",
+        "plots",
+        "study_plots",
+        "report",
+        "setting_plots",
+        "weak_plots",
+        "map_plots",
+    },
 }
 
 

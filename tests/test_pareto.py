@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ep2sindy.library import named_terms
-from ep2sindy.pareto import pareto_front, r2
+from ep2sindy.pareto import front_order, pareto_front, r2
 from ep2sindy.regression import Differential, RandomSplit, Regression
 from ep2sindy.search import (
     STLSQ,
@@ -64,6 +64,13 @@ def test_depth_keeps_runners_up_behind_the_best_of_each_size() -> None:
     assert [c.terms for c in best] == [c.terms for c in front.candidates]
     assert np.array_equal(deep.errors[deep.leading], front.errors)
     assert len({c.terms for c in deep.candidates}) == len(deep.candidates)
+
+
+def test_a_size_whose_best_does_not_beat_smaller_ones_is_left_out() -> None:
+    sizes = np.array([2, 1, 0, 1, 3, 2, 4])
+    errors = np.array([0.4, 0.3, 1.0, 0.5, 0.2, 0.3, 0.2])
+    assert front_order(sizes, errors, depth=1) == [2, 1, 4]
+    assert front_order(sizes, errors, depth=2) == [2, 1, 3, 4]
 
 
 def test_a_front_without_depth_is_refused() -> None:

@@ -1,0 +1,454 @@
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from ep2sindy.discover import discover
+from ep2sindy.errors_in_variables import WeightedWeak
+from ep2sindy.joint import JointDiscovery, discover_jointly
+from ep2sindy.library import Library, named_terms, polynomial
+from ep2sindy.parallel import Serial
+from ep2sindy.regression import Differential, Formulation, RandomSplit, Regression
+from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps, Search
+from ep2sindy.selection import BIC, EBIC, AICc, Knee, Selection, log_supports
+from ep2sindy.studies.joint_family import (
+    LAW,
+    LIBRARY,
+    PARAMETERS,
+    TRUTH,
+    Method,
+    rates,
+    realization,
+    run_family,
+    system_at,
+)
+from ep2sindy.systems import lotka_volterra
+from ep2sindy.tied import tied_fit
+from ep2sindy.trajectory import Trajectory
+from ep2sindy.weak import Weak
+from ep2sindy.windows import Bumps
+
+METHOD = Method(
+    WeightedWeak(Weak(test_functions=Bumps(half_width_s=1.5), split=RandomSplit(0.0))),
+    BestSubset(n_best=5),
+    EBIC(),
+    depth=5,
+)
+BEST = BestSubset()
+NAMES = ["a", "b", "c", "d", "e", "f"]
+
+
+@dataclass(frozen=True)
+class Given:
+    """Rows made by a test, found by the label of their trajectory."""
+
+    rows: Mapping[str, Regression]
+
+    def assemble(
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> tuple[Regression, ...]:
+        return (self.rows[trajectories[0].label],)
+
+
+def rows_of(
+    coef: Mapping[str, float],
+    *,
+    seed: int,
+    noise: float = 0.0,
+    n_rows: int = 60,
+    silent: Sequence[str] = (),
+) -> Regression:
+    """Rows of six unrelated terms and a target that some of them make up; silent ones are zero."""
+    rng = np.random.default_rng(seed)
+    theta = rng.normal(size=(n_rows, 6))
+    theta[:, [NAMES.index(name) for name in silent]] = 0.0
+    error = noise * rng.normal(size=n_rows)
+    truth = np.array([coef.get(name, 0.0) for name in NAMES])
+    return Regression(
+        theta=theta,
+        target=(theta @ truth + error)[:, None],
+        library=named_terms(NAMES, NAMES),
+        equations=["y"],
+        groups=np.arange(n_rows),
+        test=np.zeros(n_rows, dtype=bool),
+    )
+
+
+def searched(
+    rows: Mapping[str, Regression], *, selection: Selection, search: Search = BEST
+) -> JointDiscovery:
+    def label(point: str) -> Trajectory:
+        ramp = np.arange(3.0)
+        values = np.ones((3, 6))
+        return Trajectory(ramp, ramp[:, None], ["y"], values, NAMES, label=point)
+
+    return discover_jointly(
+        {point: [label(point)] for point in rows},
+        named_terms(NAMES, NAMES),
+        formulation=Given(rows),
+        search=search,
+        selection=selection,
+        rng=np.random.default_rng(0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("formulation", "selection"),
+    [(Differential(), Knee()), (WeightedWeak(), EBIC()), (Weak(), BIC())],
+    ids=lambda value: type(value).__name__,
+)
+def test_one_point_gives_what_discover_does(formulation: Formulation, selection: Selection) -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=np.random.default_rng(0)).window(0, 300)
+    library = polynomial(["x", "y"], degree=3)
+    settings = {
+        "formulation": formulation,
+        "search": BestSubset(n_best=3),
+        "selection": selection,
+        "depth": 3,
+    }
+    alone = discover(
+        [run], library, **settings, bootstraps=Bootstraps(n=0), rng=np.random.default_rng(1)
+    )
+    joint = discover_jointly({"A": [run]}, library, **settings, rng=np.random.default_rng(1))
+    for state, front in alone.fronts.items():
+        assert joint.fronts[state].supports == tuple(c.terms for c in front.candidates)
+        assert joint.fronts[state].errors == pytest.approx(front.errors, rel=1e-12)
+        assert joint.scores[state] == pytest.approx(alone.scores[state], rel=1e-12)
+    assert np.array_equal(joint.models["A"].coef, alone.model.coef)
+    if alone.model.covariance is not None:
+        assert np.array_equal(joint.models["A"].covariance, alone.model.covariance)
+
+
+def test_noise_free_equations_come_back_at_every_point() -> None:
+    found = METHOD.find(realization(0.0, 0))
+    for point, parameters in PARAMETERS.items():
+        truth = system_at(parameters).model
+        assert found.models[point].coef == pytest.approx(truth.coef, rel=1e-8)
+        assert found.models[point].provenance["point"] == point
+
+
+@pytest.mark.parametrize("n_best", [1, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_joint_subsets_match_exhaustive_enumeration(seed: int, n_best: int) -> None:
+    rng = np.random.default_rng(seed)
+    theta = 2.0 * rng.normal(size=(3, 40, 1)) + rng.normal(size=(3, 40, 9))
+    theta[0, :, 2] = 0.0  # a term that the first problem cannot show
+    theta[1, :, 5] = theta[1, :, 0] - theta[1, :, 1]  # dependent in the second
+    norms = np.linalg.norm(theta, axis=1, keepdims=True)
+    theta /= np.where(norms > 0.0, norms, 1.0)
+    target = theta[:, :, :4] @ [1.0, -2.0, 0.5, 1.5] + 0.3 * rng.normal(size=(3, 40))
+    target *= np.array([[1.0], [1e-6], [1e9]])
+
+    def log_product(columns: tuple[int, ...]) -> float:
+        residuals = [
+            np.linalg.norm(y - x[:, columns] @ np.linalg.lstsq(x[:, columns], y)[0])
+            for x, y in zip(theta, target, strict=True)
+        ]
+        return float(np.log(residuals).sum())
+
+    masks = BestSubset(max_terms=9, n_best=n_best).joint_supports(
+        np.einsum("pri,prj->pij", theta, theta),
+        np.einsum("pri,pr->pi", theta, target),
+        np.square(target).sum(axis=1),
+    )
+    assert not masks[0].any()
+    for size in range(1, 10):
+        ranked = sorted(combinations(range(9), size), key=log_product)
+        found = {tuple(np.flatnonzero(m)) for m in masks if m.sum() == size}
+        assert found == set(ranked[:n_best])
+
+
+def test_a_term_that_some_points_cannot_show_is_found() -> None:
+    rows = {
+        "coefficient vanishes": rows_of({"a": 1.0}, seed=0, noise=0.1),
+        "signal vanishes": rows_of({"a": 1.0, "b": 0.5}, seed=1, noise=0.1, silent=["b"]),
+        "both show": rows_of({"a": 2.0, "b": -0.5}, seed=2, noise=0.1),
+        "both show again": rows_of({"a": 1.5, "b": 0.6}, seed=3, noise=0.1),
+    }
+    found = searched(rows, selection=EBIC())
+    assert found.chosen["y"] == ("a", "b")
+    assert found.models["both show"].terms("y") == pytest.approx({"a": 2.0, "b": -0.5}, abs=0.05)
+    assert found.models["coefficient vanishes"].terms("y")["b"] == pytest.approx(0.0, abs=0.05)
+    assert list(found.models["signal vanishes"].terms("y")) == ["a"]
+    assert (
+        found.ambiguities["signal vanishes"][0].message
+        == "'b' is zero on every row and is left out"
+    )
+    assert found.ambiguities["both show"] == ()
+    for point in ("coefficient vanishes", "signal vanishes"):
+        alone = searched({point: rows[point]}, selection=EBIC())
+        assert alone.chosen["y"] == ("a",)
+
+
+def test_terms_taken_in_by_chance_at_single_points_are_dropped() -> None:
+    truth = {"a": 1.0, "b": -0.6, "c": 0.4}
+    rows = {f"P{k}": rows_of(truth, seed=k, noise=0.5, n_rows=30) for k in range(8)}
+    alone = [searched({p: r}, selection=BIC()).chosen["y"] for p, r in rows.items()]
+    assert sum(set(terms) - set(truth) != set() for terms in alone) >= 2
+    assert searched(rows, selection=BIC()).chosen["y"] == ("a", "b", "c")
+
+
+def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -> None:
+    rows = {p: rows_of({"b": 1.0}, seed=k, noise=0.1) for k, p in enumerate(("A", "B"))}
+    alike = rows["A"].theta.copy()
+    alike[:, 0] = 3.0 * alike[:, 1]
+    rows["A"] = replace(rows["A"], theta=alike)
+    assert searched({"A": rows["A"]}, selection=EBIC()).chosen["y"] == ("a",)
+    assert searched(rows, selection=EBIC()).chosen["y"] == ("b",)
+
+
+def test_joint_errors_are_geometric_means_that_fall_with_size() -> None:
+    truth = {"a": 1.0, "b": -0.6}
+    rows = {f"P{k}": rows_of(truth, seed=k, noise=0.1 * 10.0**k) for k in range(3)}
+    front = searched(rows, selection=BIC()).fronts["y"]
+    assert np.all(np.diff(front.errors) < 0)
+    at_points = np.array([each.errors for each in front.points.values()])
+    assert front.errors == pytest.approx(np.prod(at_points, axis=0) ** (1 / 3), rel=1e-12)
+
+
+@pytest.mark.parametrize("selection", [AICc(), BIC(), EBIC()], ids=lambda s: s.label)
+def test_units_and_amplitude_of_one_point_change_nothing(selection: Selection) -> None:
+    truth = {"a": 1.0, "b": -0.6, "c": 0.1}
+    rows = {f"P{k}": rows_of(truth, seed=k, noise=0.5) for k in range(4)}
+    plain = searched(rows, selection=selection)
+    scale = np.array([1e18, 1e-14, 1.0, 1e30, 1e-5, 3.0])
+    other = replace(rows["P1"], theta=rows["P1"].theta * scale, target=rows["P1"].target * 1e20)
+    scaled = searched({**rows, "P1": other}, selection=selection)
+    assert scaled.fronts["y"].supports == plain.fronts["y"].supports
+    gaps, scaled_gaps = (np.diff(each.scores["y"]) for each in (plain, scaled))
+    assert scaled_gaps == pytest.approx(gaps, rel=1e-9)
+    coef = scaled.models["P1"].coef[:, 0] * scale / 1e20
+    assert coef == pytest.approx(plain.models["P1"].coef[:, 0], rel=1e-9)
+
+
+def test_order_of_points_changes_nothing() -> None:
+    points = dict(list(realization(0.05, 1).items())[:3])
+    split = replace(METHOD, formulation=Weak(test_functions=Bumps(half_width_s=0.8)))
+    forth, back = split.find(points), split.find(dict(reversed(points.items())))
+    assert forth.chosen == back.chosen
+    for point in points:
+        assert np.array_equal(forth.models[point].coef, back.models[point].coef)
+
+
+def test_points_may_be_sampled_differently() -> None:
+    fast, slow = replace(lotka_volterra(), rate_Hz=25.0, duration_s=30.0), lotka_volterra(b=0.5)
+    found = discover_jointly(
+        {
+            "fast": [fast.trajectory()],
+            "slow": [slow.trajectory(), slow.trajectory().window(0, 400)],
+        },
+        polynomial(["x", "y"], degree=3),
+        formulation=WeightedWeak(),
+        search=BestSubset(),
+        selection=EBIC(),
+        rng=np.random.default_rng(0),
+    )
+    assert found.models["fast"].terms("x") == pytest.approx({"x": 2 / 3, "x*y": -1.0}, rel=1e-6)
+    assert found.models["slow"].terms("x") == pytest.approx({"x": 2 / 3, "x*y": -0.5}, rel=1e-6)
+
+
+def test_the_count_of_supports_is_paid_once() -> None:
+    rows = {f"P{k}": rows_of({"a": 1.0, "b": 0.5}, seed=k, noise=0.5) for k in range(5)}
+    plain = searched(rows, selection=EBIC(gamma=0.0))
+    full = searched(rows, selection=EBIC(gamma=0.7))
+    library = named_terms(NAMES, NAMES)
+    counts = np.array([log_supports(library, terms) for terms in plain.fronts["y"].supports])
+    assert full.scores["y"] == pytest.approx(plain.scores["y"] + 1.4 * counts, rel=1e-12)
+
+
+def law_rows(noise: float, *, seed: int = 0, bend: float = 0.0) -> dict[str, Regression]:
+    """a follows 2 - 3 p, b follows p + bend p^2 over four points."""
+    return {
+        f"p={p}": rows_of(
+            {"a": 2.0 - 3.0 * p, "b": p + bend * p**2}, seed=10 * seed + p, noise=noise * (1 + p)
+        )
+        for p in range(1, 5)
+    }
+
+
+STRAIGHT = polynomial(["p"], degree=1)
+AT = {f"p={p}": {"p": float(p)} for p in range(1, 5)}
+
+
+def test_a_law_that_holds_is_recovered_exactly() -> None:
+    fit = tied_fit(searched(law_rows(0.0), selection=EBIC()), STRAIGHT, parameters=AT)
+    equation = fit.equations["y"]
+    assert equation.terms == ("a", "b")
+    assert equation.coef == pytest.approx(np.array([[2.0, -3.0], [0.0, 1.0]]), abs=1e-12)
+    assert list(equation.r2_tied.values()) == pytest.approx([1.0] * 4, abs=1e-12)
+    assert equation.p_value == pytest.approx(1.0)
+    between = fit.model_at({"p": 2.5})
+    assert between.terms("y") == pytest.approx({"a": -5.5, "b": 2.5}, rel=1e-12)
+
+
+def test_a_law_that_does_not_hold_is_refused_by_the_test_and_costs_r2() -> None:
+    found = searched(law_rows(0.1, bend=0.3), selection=EBIC())
+    bent = tied_fit(found, STRAIGHT, parameters=AT).equations["y"]
+    assert bent.p_value < 1e-6
+    assert all(bent.r2_tied[p] < bent.r2_free[p] for p in AT)
+    right = tied_fit(found, polynomial(["p"], degree=2), parameters=AT).equations["y"]
+    assert right.p_value > 0.05
+    assert right.coef[1] == pytest.approx([0.0, 1.0, 0.3], abs=0.15)
+
+
+@pytest.mark.slow
+def test_a_true_law_is_rejected_as_often_as_the_level_says() -> None:
+    p_values = np.array(
+        [
+            tied_fit(searched(law_rows(0.2, seed=k), selection=EBIC()), STRAIGHT, parameters=AT)
+            .equations["y"]
+            .p_value
+            for k in range(300)
+        ]
+    )
+    for level in (0.05, 0.3, 0.7):
+        share = np.mean(p_values < level)
+        assert share == pytest.approx(level, abs=3.0 * np.sqrt(level * (1.0 - level) / 300))
+
+
+def test_units_of_parameters_and_points_do_not_change_a_tied_fit() -> None:
+    rows = law_rows(0.1)
+    plain = tied_fit(searched(rows, selection=EBIC()), STRAIGHT, parameters=AT)
+    scaled_rows = {
+        p: replace(r, theta=r.theta * 1e-15, target=r.target * 1e9) for p, r in rows.items()
+    }
+    at = {p: {"p": 1e-6 * v["p"]} for p, v in AT.items()}
+    scaled = tied_fit(searched(scaled_rows, selection=EBIC()), STRAIGHT, parameters=at)
+    back = scaled.equations["y"].coef * 1e-24 * np.array([1.0, 1e-6])
+    assert back == pytest.approx(plain.equations["y"].coef, rel=1e-7)
+    assert pytest.approx(plain.equations["y"].F, rel=1e-6) == scaled.equations["y"].F
+
+
+def test_a_law_with_a_term_per_point_is_no_tie() -> None:
+    points = dict(list(realization(0.05, 0).items())[:2])
+    found = METHOD.find(points)
+    at = {point: {"p": float(k)} for k, point in enumerate(points)}
+    fit = tied_fit(found, STRAIGHT, parameters=at)
+    for point in points:
+        free, tied = found.models[point], fit.model_at(at[point])
+        assert tied.coef == pytest.approx(free.coef, rel=1e-6)
+        assert free.covariance is not None
+        assert tied.covariance is not None
+        # The noise level is estimated from the residuals too: n rows know it to 1/sqrt(2n).
+        ratio = np.diag(tied.covariance) / np.diag(free.covariance)
+        assert ratio == pytest.approx(np.ones(len(ratio)), abs=0.8)
+    assert np.isnan(fit.equations["n_i"].p_value)
+
+
+def test_a_study_judges_all_points_jointly_and_each_alone() -> None:
+    method = Method(Differential(split=RandomSplit(0.0)), BestSubset(max_terms=3), EBIC())
+    outcomes = run_family(method, noises=[0.01], n_realizations=2, workers=Serial(), seed=3)
+    table = rates(outcomes)
+    assert list(table.columns) == ["joint", "pooled", *PARAMETERS]
+    points = realization(0.01, 1, seed=3)
+    for name, runs in {"joint": points, **{p: {p: points[p]} for p in points}}.items():
+        right = all(set(c) == set(TRUTH[s]) for s, c in method.find(runs).chosen.items())
+        assert outcomes[name].tolist()[1] == float(right)
+        assert table.loc[0.01, name] == 50.0 * outcomes[name].sum()
+    assert outcomes["error_tied"].isna().tolist() == (outcomes["joint"] == 0.0).tolist()
+
+
+@pytest.mark.slow
+def test_joint_search_finds_the_family_where_single_points_fail() -> None:
+    outcomes = run_family(METHOD, noises=[0.05], n_realizations=30, workers=Serial(), seed=9)
+    assert outcomes["joint"].mean() >= 29 / 30
+    assert outcomes[list(PARAMETERS)].mean().max() < 0.8
+    # Three law terms for six points: half the coefficients, errors smaller by sqrt(2) or more.
+    assert outcomes["error_tied"].mean() < outcomes["error_free"].mean() / np.sqrt(2.0)
+
+
+def test_the_family_follows_its_law() -> None:
+    for parameters in PARAMETERS.values():
+        model = system_at(parameters).model
+        law = LAW.evaluate(np.array([parameters["V_D"], parameters["mdot_mgs"]]))
+        for state, terms in TRUTH.items():
+            expected = {name: law @ coef for name, coef in terms.items()}
+            assert model.terms(state) == pytest.approx(expected)
+    assert system_at(PARAMETERS["300V_5mgs"]).model.terms("n_n")["1"] == pytest.approx(0.075)
+
+
+def pair(**changes: object) -> dict[str, list[Trajectory]]:
+    run = system_at(PARAMETERS["300V_5mgs"]).trajectory()
+    return {"A": [run], "B": [replace(run, **changes)]}
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ({}, "no point came"),
+        ({**pair(), "C": []}, r"\['C'\] came without"),
+        (pair(units={"n_i": "m^-3"}), "'B' does not with trajectory 0 of 'A': units must agree"),
+        (pair(state_names=["n_i", "n_e"]), "'B' does not.*every trajectory needs the states"),
+    ],
+)
+def test_points_that_do_not_agree_are_refused(
+    points: dict[str, list[Trajectory]], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        METHOD.find(points)
+
+
+def test_searches_of_one_problem_are_refused() -> None:
+    with pytest.raises(ValueError, match="must weigh all points at once: AdaptiveLasso"):
+        searched(law_rows(0.1), selection=EBIC(), search=AdaptiveLasso())
+
+
+def test_a_joint_front_without_depth_is_refused() -> None:
+    with pytest.raises(ValueError, match="depth must be at least 1: 0 came"):
+        replace(METHOD, depth=0).find(pair())
+
+
+@pytest.mark.parametrize(
+    ("law", "parameters", "message"),
+    [
+        (STRAIGHT, {"p=1": {"p": 1.0}}, "every point needs parameters, and no other"),
+        (STRAIGHT, {**AT, "p=9": {"p": 9.0}}, "every point needs parameters, and no other"),
+        (STRAIGHT, {**AT, "p=2": {"q": 2.0}}, r"'p=2' needs one finite value for each of \['p'\]"),
+        (STRAIGHT, {**AT, "p=2": {"p": np.nan}}, "'p=2' needs one finite value"),
+        (STRAIGHT, {p: {"p": 3.0} for p in AT}, r"\['p'\] do not vary"),
+        (polynomial(["p"], degree=4), AT, "a law of 5 terms needs as many points: 4 came"),
+        (
+            polynomial(["p", "q"], degree=1),
+            {p: {"p": v["p"], "q": 2 * v["p"]} for p, v in AT.items()},
+            "some are combinations of others",
+        ),
+    ],
+)
+def test_laws_that_the_points_cannot_show_are_refused(
+    law: Library, parameters: dict[str, dict[str, float]], message: str
+) -> None:
+    found = searched(law_rows(0.1), selection=EBIC())
+    with pytest.raises(ValueError, match=message):
+        tied_fit(found, law, parameters=parameters)
+
+
+def test_a_law_for_a_term_that_one_point_shows_is_refused() -> None:
+    rows = {
+        p: rows_of({"a": 1.0, "b": 2.0}, seed=k, noise=0.1, silent=["b"] if k else [])
+        for k, p in enumerate(AT)
+    }
+    found = searched(rows, selection=EBIC())
+    assert found.chosen["y"] == ("a", "b")
+    with pytest.raises(ValueError, match="too few points show the terms"):
+        tied_fit(found, STRAIGHT, parameters=AT)
+
+
+def test_equations_without_terms_can_be_tied() -> None:
+    rows = {p: rows_of({}, seed=k, noise=1.0) for k, p in enumerate(AT)}
+    found = searched(rows, selection=EBIC())
+    assert found.chosen["y"] == ()
+    fit = tied_fit(found, STRAIGHT, parameters=AT)
+    assert fit.model_at({"p": 2.0}).terms("y") == {}
+
+
+def test_a_family_needs_something_to_run() -> None:
+    with pytest.raises(ValueError, match="a noise level and a realization at least"):
+        run_family(METHOD, noises=[], n_realizations=1, workers=Serial())
+
+
+def test_realizations_share_their_noise_pattern() -> None:
+    clean, low, high = (realization(noise, 4)["300V_2mgs"][0].states for noise in (0.0, 0.1, 0.2))
+    assert high - clean == pytest.approx(2.0 * (low - clean), rel=1e-9, abs=1e-12)
+    assert len(LIBRARY) == 10
