@@ -1,0 +1,264 @@
+"""One model at several operating points, its trends and control laws: `+exp=parametric`."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra.utils import instantiate
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from ep2sindy.library import polynomial
+from ep2sindy.parametric_plots import trends_figure
+from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
+from ep2sindy.studies.parametric import REFINED, PointResult, parametric_study
+from ep2sindy.studies.trends import laws
+from experiments.build import started_run
+from experiments.checks import check_counts
+from experiments.model_view import coefficients
+from experiments.parametric_setup import opened_point, point_configs, study_of
+from experiments.parametric_tables import (
+    EACH_POINT,
+    Outcome,
+    estimates_table,
+    laws_table,
+    points_table,
+    published_table,
+    supports_table,
+    trends_table,
+)
+from experiments.parametric_view import page, print_outcome
+
+USES: tuple[str, ...] = (
+    "data",
+    "prepare",
+    "trajectory",
+    "formulation",
+    "search",
+    "bootstraps",
+    "selection",
+    "depth",
+    "parallel",
+)  # of conf/config.yaml
+KEYS = (
+    "parameters", "points", "model", "cases", "bootstrap", "refining", "library", "law", "trends",
+    "figures", "thesis",
+)  # fmt: skip
+
+
+def run(config: DictConfig) -> Path:
+    """Open, fit, refine and search every point; everything lands in a new run folder."""
+    with started_run(config, keys=KEYS) as (folder, screen):
+        # Everything but the data is built first: a misspelt key must not cost a simulation.
+        study = study_of(config)
+        names = [str(name) for name in config.parameters]
+        law_library = polynomial(names, degree=config.law.degree)
+        check_views(config, names)
+        thesis = config.thesis and OmegaConf.to_container(config.thesis)
+        published = published_table(thesis, names)
+        workers = instantiate(config.parallel)
+        configs = point_configs(config)
+        points = in_order(_watched(workers.run(opened_point, configs), len(configs), "opened"))
+
+        found = parametric_study(
+            points, study, workers=workers, rng=np.random.default_rng(config.seed)
+        )
+        with LiveScalars(folder.path / "tensorboard") as live:
+            results = in_order(_told(_watched(found, len(points), "fitted"), live))
+        outcome = Outcome(
+            title=config.experiment,
+            study=study,
+            parameters=names,
+            results=results,
+            laws=laws(results, law_library, max_terms=config.law.max_terms),
+            # Another search adds its model at every point here, such as one support for all.
+            searches={EACH_POINT: [result.searched for result in results]},
+            trends=[(str(each.along), dict(each.at)) for each in config.trends],
+            published=published,
+        )
+        print_outcome(screen, outcome)
+        _write(folder, config, outcome)
+    return folder.path
+
+
+def in_order(numbered: Iterable[tuple[int, Any]]) -> list[Any]:
+    return [result for _, result in sorted(numbered, key=lambda each: each[0])]
+
+
+def check_views(config: DictConfig, names: list[str]) -> None:
+    """Raise ValueError unless laws, trends and panels can be made of what there is."""
+    if set(config.law) != {"degree", "max_terms"}:
+        raise ValueError(f"law must have degree and max_terms: {list(config.law)} came")
+    check_counts(config.law, *(["max_terms"] if config.law.max_terms is not None else []))
+    for each in config.trends:
+        if set(each) != {"along", "at"} or {each.along, *each.at} != set(names):
+            raise ValueError(
+                f"a trend goes along one parameter and holds the others of {names}: {each} came"
+            )
+    if set(config.figures) != {"panels", "labels"}:
+        raise ValueError(f"figures must have panels and labels: {list(config.figures)} came")
+    quantities = {name for case in config.cases.values() for name in case.quantities}
+    unknown = {name for panel in config.figures.panels for name in panel} - quantities
+    if unknown:
+        raise ValueError(f"figures.panels names {sorted(unknown)}; there are {sorted(quantities)}")
+
+
+def _watched(
+    numbered: Iterable[tuple[int, Any]], total: int, verb: str
+) -> Iterator[tuple[int, Any]]:
+    yield from tqdm(numbered, total=total, unit=f"point {verb}", disable=None)
+
+
+def _told(
+    numbered: Iterable[tuple[int, PointResult]], live: LiveScalars
+) -> Iterator[tuple[int, PointResult]]:
+    """Every result to TensorBoard as it comes; a step is the number of a point in the config."""
+    for number, result in numbered:
+        scalars = {
+            f"{name}/{quantity}": estimate.value
+            for name, fit in result.fits.items()
+            for quantity, estimate in fit.estimates.items()
+        }
+        for name, fit in result.fits.items():
+            scalars |= {f"{name}/r2/{state}": value for state, value in fit.r2.items()}
+        live.write(scalars, step=number)
+        yield number, result
+
+
+def _write(folder: RunFolder, config: DictConfig, outcome: Outcome) -> None:
+    figures = _figures(config, outcome)
+    for number, result in enumerate(outcome.results):
+        for name, fit in result.fits.items():
+            folder.write_model(f"point_{number}_{name}", fit.model)
+    models = {
+        f"point {number}, {name}": fit.model
+        for number, result in enumerate(outcome.results)
+        for name, fit in result.fits.items()
+    }
+    tables = {
+        "points": points_table(outcome),
+        "quantities": estimates_table(outcome),
+        "supports": supports_table(outcome),
+        "laws": laws_table(outcome),
+        "trends": trends_table(outcome),
+        "coefficients": coefficients(models, heading="model"),
+    }
+    for name, table in tables.items():
+        folder.write_table(name, table)
+    folder.write_figures(figures)
+    write_tensorboard(
+        folder.path / "tensorboard",
+        figures=figures,
+        texts={name: f"    {model.text()}" for name, model in models.items()},
+        hparams=_hparams(config),
+        metrics=_metrics(outcome),
+    )
+    folder.write_text("report.html", page(outcome, figures))
+    folder.write_json("summary.json", _summary(config, outcome))
+
+
+def _figures(config: DictConfig, outcome: Outcome) -> dict[str, Figure]:
+    """None where no point oscillates: an empty figure says nothing."""
+    estimates = estimates_table(outcome)
+    if estimates.empty:
+        return {}
+    drawn = {fit: laws for fit, laws in outcome.laws.items() if not fit.endswith(REFINED)}
+    figure = trends_figure(
+        estimates[estimates["usable"]],
+        outcome.published,
+        drawn,
+        panels=[list(panel) for panel in config.figures.panels],
+        trends=outcome.trends,
+        labels={str(name): label for name, label in config.figures.labels.items()},
+    )
+    return {"trends": figure}
+
+
+def _hparams(config: DictConfig) -> dict[str, Any]:
+    """The settings that decide the outcome; fixed keys, so that runs can be compared."""
+    return {
+        "seed": config.seed,
+        **{
+            key: str(OmegaConf.to_container(config[key]))
+            for key in ("formulation", "bootstrap", "refining", "search", "selection", "law")
+        },
+    }
+
+
+def _metrics(outcome: Outcome) -> dict[str, float]:
+    metrics = {"n_oscillating": float(sum(bool(result.fits) for result in outcome.results))}
+    for fit, by_quantity in outcome.laws.items():
+        for quantity, law in by_quantity.items():
+            metrics[f"law/{fit}/{quantity}/loo_error"] = law.loo_error
+            metrics[f"law/{fit}/{quantity}/search_error"] = law.search_error
+    return metrics
+
+
+def _summary(config: DictConfig, outcome: Outcome) -> dict[str, Any]:
+    return {
+        "experiment": config.experiment,
+        "seed": config.seed,
+        "points": [_point_summary(outcome, k) for k in range(len(outcome.results))],
+        "laws": {
+            fit: {
+                name: {
+                    "terms": law.coef_by_term,
+                    "r2": law.r2,
+                    "loo_error": law.loo_error,
+                    "search_error": law.search_error,
+                }
+                for name, law in by_quantity.items()
+            }
+            for fit, by_quantity in outcome.laws.items()
+        },
+        "trends": trends_table(outcome).to_dict("records"),
+    }
+
+
+def _point_summary(outcome: Outcome, number: int) -> dict[str, Any]:
+    """Quantities are null where a point has no fit, or a refinement nothing finite."""
+    result = outcome.results[number]
+    cases = outcome.study.cases
+    refined = {}
+    for name in cases:
+        fit = result.fits.get(name + REFINED)
+        refined[name] = {
+            "status": fit.status if fit else None,
+            "loss": fit.loss if fit else None,
+            **_values(outcome, result, name, suffix=REFINED),
+            "ci95": _intervals(result, name + REFINED),
+            "r2": dict(fit.r2) if fit else None,
+        }
+    return {
+        **result.parameters,
+        "status": result.status,
+        "f_kHz": 1e-3 * result.f_Hz,
+        "n_samples": result.n_samples,
+        "dt_s": result.dt_s,
+        **{name: _values(outcome, result, name) for name in cases},
+        "ci95": {name: _intervals(result, name) for name in cases},
+        "r2": {name: dict(result.fits[name].r2) for name in cases if name in result.fits},
+        "refined": refined,
+        "searched": {
+            search: {state: fitted.model.terms(state) for state in fitted.model.states}
+            for search, found in outcome.searches.items()
+            if (fitted := found[number]) is not None
+        },
+    }
+
+
+def _values(
+    outcome: Outcome, result: PointResult, case: str, *, suffix: str = ""
+) -> dict[str, float | None]:
+    fit = result.fits.get(case + suffix)
+    known = fit.estimates if fit else {}
+    names = outcome.study.cases[case].quantities
+    return {name: known[name].value if name in known else None for name in names}
+
+
+def _intervals(result: PointResult, name: str) -> dict[str, list[float]] | None:
+    if name not in result.fits:
+        return None
+    return {q: [e.low, e.high] for q, e in result.fits[name].estimates.items()}

@@ -1,0 +1,239 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from ep2sindy.io import write_field
+from ep2sindy.model import SparseModel
+from experiments import parametric
+from experiments.run import innermost
+
+ROOT = Path(__file__).resolve().parents[1]
+ESTIMATES = {
+    "constrained": {"L_m", "g_inj", "eps"},
+    "free": {"L_m", "g_inj", "eps_i", "eps_n"},
+}
+THREE = (
+    "points=[{V_D_V: 200.0, mdot_mg_s: 5.0},{V_D_V: 300.0, mdot_mg_s: 5.0},"
+    "{V_D_V: 300.0, mdot_mg_s: 2.0, data: {operating_point: {neutral_speed: 190.0}}}]"
+)
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=["+exp=parametric", *overrides])
+
+
+def toy(output: Path) -> list[str]:
+    """Overrides that run the experiment on short, coarse simulations."""
+    return [
+        f"output={output}",
+        f"data.cache={output / 'cache'}",
+        "data.duration_s=2.0e-3",
+        "data.warm_up_s=0.5e-3",
+        "data.n_cells=30",
+        "parallel=serial",
+        "bootstraps.n=2",
+        "bootstrap.n_draws=40",
+        "refining.n_windows=20",
+        "library.variables=[n_i,n_n,R_ion]",
+    ]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of three operating points."""
+    return parametric.run(composed(*toy(tmp_path_factory.mktemp("outputs")), THREE))
+
+
+def summary_of(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_the_summary_has_every_point(folder: Path) -> None:
+    summary = summary_of(folder)
+    assert (summary["experiment"], summary["seed"]) == ("parametric", 0)
+    points = summary["points"]
+    assert [(p["V_D_V"], p["mdot_mg_s"]) for p in points] == [(200, 5), (300, 5), (300, 2)]
+    for point in points:
+        assert point["status"] == "oscillating"
+        assert 10.0 < point["f_kHz"] < 20.0
+        for case, names in ESTIMATES.items():
+            assert set(point[case]) == set(point["ci95"][case]) == names
+            for name, value in point[case].items():
+                low, high = point["ci95"][case][name]
+                assert low < value < high
+            assert set(point["r2"][case]) == {"n_i", "n_n"}
+            refined = point["refined"][case]
+            assert set(refined) == names | {"status", "loss", "ci95", "r2"}
+        assert set(point["searched"]) == {"each point"}
+        assert set(point["searched"]["each point"]) == {"n_i", "n_n"}
+    assert points[2]["constrained"]["g_inj"] < points[1]["constrained"]["g_inj"]
+    assert set(summary["laws"]["constrained"]) == ESTIMATES["constrained"]
+    for law in summary["laws"]["constrained"].values():
+        assert {"terms", "r2", "loo_error", "search_error"} == set(law)
+        assert len(law["terms"]) == 1  # of three points
+
+
+def test_quantities_are_the_coefficients_of_the_models(folder: Path) -> None:
+    for number, point in enumerate(summary_of(folder)["points"]):
+        free = SparseModel.load(folder / "models" / f"point_{number}_free.json")
+        assert point["free"]["L_m"] == pytest.approx(-1 / free.terms("n_i")["n_i*u_iz"])
+        assert point["free"]["g_inj"] == free.terms("n_n")["1"]
+        assert point["free"]["eps_n"] == -free.terms("n_n")["n_i*n_n*R_ion"]
+        shared = SparseModel.load(folder / "models" / f"point_{number}_constrained.json")
+        assert point["constrained"]["eps"] == shared.terms("n_i")["n_i*n_n*R_ion"]
+        assert point["constrained"]["eps"] == -shared.terms("n_n")["n_i*n_n*R_ion"]
+
+
+def test_each_point_is_simulated_where_it_operates(folder: Path) -> None:
+    names = sorted(path.name[:19] for path in (folder.parents[1] / "cache").iterdir())
+    assert names == ["thruster_200V_5mgs_", "thruster_300V_2mgs_", "thruster_300V_5mgs_"]
+
+
+def test_tables_figures_and_page_are_written(folder: Path) -> None:
+    quantities = pd.read_csv(folder / "tables" / "quantities.csv")
+    at = quantities.set_index(["V_D_V", "mdot_mg_s", "fit", "quantity"])["thesis"]
+    assert at[200.0, 5.0, "constrained", "g_inj"] == 2.72e23
+    assert at[300.0, 2.0, "free", "eps_n"] == 0.67
+    assert np.isnan(at[300.0, 2.0, "free_refined", "eps_n"])
+    trends = pd.read_csv(folder / "tables" / "trends.csv")
+    exponents = trends.set_index(["along", "fit", "quantity"])
+    # Between two points an exponent is a ratio of logarithms; the thesis's from all its points.
+    points = [p["free"]["g_inj"] for p in summary_of(folder)["points"]]
+    row = exponents.loc["mdot_mg_s", "free", "g_inj"]
+    assert row["exponent"] == pytest.approx(np.log(points[1] / points[2]) / np.log(2.5))
+    assert row["low"] < row["exponent"] < row["high"]
+    assert row["thesis"] == pytest.approx(0.98, abs=0.01)
+    supports = pd.read_csv(folder / "tables" / "supports.csv")
+    assert set(supports["search"]) == {"given", "each point"}
+    for name in ("points", "laws", "coefficients"):
+        assert len(pd.read_csv(folder / "tables" / f"{name}.csv"))
+    assert (folder / "figures" / "trends.png").is_file()
+    assert "figures/trends.png" in (folder / "report.html").read_text()
+    assert list((folder / "tensorboard").iterdir())
+    log = (folder / "run.log").read_text()
+    assert "V_D_V=200, mdot_mg_s=5: oscillating" in log
+    assert "control laws, with the RMS error at points left out" in log
+
+
+def breathing_file(path: Path, *, amplitude: float, dt_s: float, rate: float = 1.0) -> Path:
+    """A field whose ions obey the free model by construction of R_ion; neutrals swing."""
+    t = dt_s * np.arange(round(1.5e-3 / dt_s))
+    phase = 2 * np.pi * 14e3 * t
+    n_i = 1e18 * (1 + amplitude * np.sin(phase))
+    n_n = rate * 4e18 * (1 + 0.5 * amplitude * np.cos(phase))
+    data = {
+        "n_i": (n_i, "m^-3"),
+        "n_n": (n_n, "m^-3"),
+        "R_ion": (5e-14 * (1 + 0.6 * amplitude * np.cos(phase + 0.4)), "m^3/s"),
+        "u_iz": (4e3 * (1 + 0.3 * amplitude * np.sin(phase + 1)), "m/s"),
+    }
+    profile = np.ones((1, 3))
+    field = xr.Dataset(
+        {
+            name: (("time", "z"), v[:, None] * profile, {"units": u})
+            for name, (v, u) in data.items()
+        },
+        coords={"time": t, "z": [0.016, 0.02, 0.024]},
+    )
+    write_field(field, path)
+    return path
+
+
+def own_files(output: Path, *points: str) -> list[str]:
+    return [
+        *toy(output)[:1],
+        *toy(output)[5:],
+        "data=file",
+        "data.path=none.nc",
+        "data.variables.R_ion.name=R_ion",
+        "data.variables.u_iz.name=u_iz",
+        "parameters={V_D_V: null, mdot_mg_s: null}",
+        f"points=[{','.join(points)}]",
+    ]
+
+
+def test_own_files_and_a_point_that_does_not_oscillate(tmp_path: Path) -> None:
+    first = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
+    second = breathing_file(tmp_path / "b.nc", amplitude=0.4, dt_s=2e-6, rate=1.1)
+    still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
+    places = {first: "200.0", second: "300.0", still: "400.0"}
+    points = [f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {p}}}}}" for p, V in places.items()]
+    folder = parametric.run(composed(*own_files(tmp_path, *points)))
+    summary = summary_of(folder)
+    assert [p["status"] for p in summary["points"]] == ["oscillating", "oscillating", "steady"]
+    assert [p["dt_s"] for p in summary["points"]] == pytest.approx([1.5e-6, 2e-6, 1.5e-6])
+    steady = summary["points"][2]
+    assert steady["constrained"] == {"L_m": None, "g_inj": None, "eps": None}
+    assert steady["ci95"]["free"] is None
+    assert summary["laws"] == {}
+    assert {row["n_points"] for row in summary["trends"] if row["along"] == "V_D_V"} == {2}
+    assert "V_D_V=400, mdot_mg_s=5: steady" in (folder / "report.html").read_text()
+    assert "left out of trends" in (folder / "run.log").read_text()
+
+
+def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
+    still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
+    point = f"{{V_D_V: 300.0, mdot_mg_s: 5.0, data: {{path: {still}}}}}"
+    folder = parametric.run(composed(*own_files(tmp_path, point)))
+    assert not (folder / "figures").exists()
+    assert summary_of(folder)["points"][0]["status"] == "steady"
+
+
+def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
+    whole = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
+    with xr.open_dataset(whole, decode_times=False) as field:
+        write_field(field.load().drop_vars("u_iz"), tmp_path / "b.nc")
+    points = [
+        f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {tmp_path / name}}}}}"
+        for V, name in ((200.0, "a.nc"), (300.0, "b.nc"))
+    ]
+    with pytest.raises(ValueError, match=r"operating point V_D_V=300, mdot_mg_s=5: .*'u_iz'"):
+        parametric.run(composed(*own_files(tmp_path, *points)))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["points=[]"], "points must be a list with all of ['V_D_V', 'mdot_mg_s'] each"),
+        (["points=[{V_D_V: 300}]"], "a point must have ['V_D_V', 'mdot_mg_s'], and data"),
+        (["points=[{V_D_V: a, mdot_mg_s: 5}]"], "points must give V_D_V as a number: 'a' came"),
+        (
+            ["points=[{V_D_V: 300, mdot_mg_s: 5},{V_D_V: 300.0, mdot_mg_s: 5}]"],
+            "an operating point may come once: V_D_V=300, mdot_mg_s=5 comes again",
+        ),
+        (
+            ["parameters.V_D_V=null", "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"],
+            "operating points must differ in their data: V_D_V=2, mdot_mg_s=5 has that of V_D_V=1",
+        ),
+        (["parameters.V_D_V=operating_point.volts"], "data.operating_point.volts is none"),
+        (["points=[{V_D_V: 1, mdot_mg_s: 5, data: {n_cels: 3}}]"], "n_cels"),
+        (["cases=null"], "cases must be like {free: {relations: [], quantities:"),
+        (["~cases.free.relations"], "cases.free must have relations and quantities"),
+        (["cases.free.quantities.L_m.coefficient='n_i: n_n'"], "unknown term 'n_n'; this library"),
+        (["cases.free.quantities.L_m.power=3"], "the power 1 or -1"),
+        (["+cases.free.quantities.L_m.exponent=3"], "unexpected keyword argument 'exponent'"),
+        (["bootstrap.n_draws=5"], "a 95 % interval needs 40 draws or more"),
+        (["+library.variables_if_present=[u_ir]"], "the same for every point"),
+        (["trends=[{along: V_D_V, at: {}}]"], "a trend goes along one parameter and holds"),
+        (["figures.panels=[[L]]"], "figures.panels names ['L']; there are ["),
+        (["+laws=1"], "unknown keys ['laws']"),
+        (["law.max_terms=0"], "max_terms must be a whole number, one or more: 0 came"),
+        (["+law.terms=3"], "law must have degree and max_terms"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(
+    overrides: list[str], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises((ValueError, HydraException, OmegaConfBaseException)) as caught:
+        parametric.run(composed(*toy(tmp_path), *overrides))
+    assert message in str(innermost(caught.value))
+    assert not (tmp_path / "cache").exists()

@@ -1,0 +1,432 @@
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ep2sindy.constrained import constrained_fit
+from ep2sindy.constraints import constraint
+from ep2sindy.library import named_terms, polynomial
+from ep2sindy.model import SparseModel, coef_matrix
+from ep2sindy.parallel import Loky, Serial
+from ep2sindy.regression import Differential, RandomSplit, Regression
+from ep2sindy.resampling import moving_block_counts
+from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.selection import Knee
+from ep2sindy.smoothing import NoSmoothing
+from ep2sindy.studies.operating_points import PointData, oscillation
+from ep2sindy.studies.parametric import (
+    Case,
+    Fitted,
+    PointResult,
+    Refining,
+    Searching,
+    Study,
+    TimeBootstrap,
+    parametric_study,
+)
+from ep2sindy.studies.quantities import Estimate, Quantity, drawn_estimates, propagated_estimates
+from ep2sindy.studies.time_bootstrap import resampled_coefficients
+from ep2sindy.studies.trends import laws, trends
+from ep2sindy.trajectory import Trajectory
+from ep2sindy.weak import Weak
+
+LIBRARY = named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])
+TERMS = {"x": ["x*u", "x*y*R"], "y": ["1", "x*y*R"]}
+SHARED = "x: x*y*R == -1 * y: x*y*R"
+UNITS = {"x": "m^-3", "y": "m^-3", "R": "m^3/s", "u": "m/s"}
+LENGTH, INJECTED = Quantity("x: x*u", -1.0, -1), Quantity("y: 1")
+CASES = {
+    "free": Case(
+        constraint(LIBRARY, TERMS),
+        {
+            "L": LENGTH,
+            "g": INJECTED,
+            "eps_x": Quantity("x: x*y*R"),
+            "eps_y": Quantity("y: x*y*R", -1.0),
+        },
+    ),
+    "constrained": Case(
+        constraint(LIBRARY, TERMS, [SHARED]),
+        {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
+    ),
+}
+SEARCHING = Searching(
+    library=polynomial(["x", "y", "R", "u"], degree=2, products=["x*y*R"]),
+    search=BestSubset(max_terms=3),
+    bootstraps=Bootstraps(n=0),
+    selection=Knee(n_norm="max_terms"),
+)
+
+
+def study(*, weak: bool = True) -> Study:
+    every = RandomSplit(0.0)
+    return Study(
+        library=LIBRARY,
+        cases=CASES,
+        formulation=Weak(split=every) if weak else Differential(NoSmoothing(), split=every),
+        bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
+        refining=Refining(n_windows=10, periods=0.5, max_iter=50),
+        searching=SEARCHING,
+    )
+
+
+def forced(*, L: float, g: float, eps: float, dt: float = 0.01, periods: float = 20) -> Trajectory:
+    """x' = -x u / L + eps x y R, y' = g - eps x y R, R and u waves of period one."""
+    t = np.arange(0.0, periods, dt)
+
+    def inputs(t: np.ndarray | float) -> tuple:
+        return 1 + 0.5 * np.sin(2 * np.pi * t), 1 + 0.2 * np.sin(2 * np.pi * t + 1)
+
+    def slope(t: float, states: np.ndarray) -> list[float]:
+        (x, y), (R, u) = states, inputs(t)
+        return [-x * u / L + eps * x * y * R, g - eps * x * y * R]
+
+    whole = solve_ivp(
+        slope, (-20.0, t[-1]), [g * L, 1 / (L * eps)], t_eval=t, rtol=1e-10, atol=1e-12
+    )
+    return Trajectory(
+        t=t,
+        states=whole.y.T,
+        state_names=["x", "y"],
+        inputs=np.stack(inputs(t), axis=1),
+        input_names=["R", "u"],
+        units=UNITS,
+    )
+
+
+TRUTHS = [
+    {"L": 0.5, "g": 3.0, "eps": 2.0},
+    {"L": 0.6, "g": 4.0, "eps": 1.8},
+    {"L": 0.7, "g": 5.0, "eps": 1.5},
+]
+
+
+@pytest.fixture(scope="module")
+def points() -> list[PointData]:
+    """Three points with sampling of their own, and one that does not oscillate."""
+    runs = [
+        forced(**truth, dt=dt, periods=periods)
+        for truth, dt, periods in zip(TRUTHS, (0.01, 0.013, 0.008), (20, 25, 15), strict=True)
+    ]
+    return [
+        *(PointData({"V": 100.0 * (k + 1), "m": 2.0**k}, run) for k, run in enumerate(runs)),
+        PointData({"V": 400.0, "m": 8.0}, None, "steady"),
+    ]
+
+
+def results_of(points: list[PointData], how: Study, *, seed: int = 0) -> list[PointResult]:
+    found = dict(parametric_study(points, how, workers=Serial(), rng=np.random.default_rng(seed)))
+    return [found[k] for k in range(len(points))]
+
+
+@pytest.fixture(scope="module")
+def results(points: list[PointData]) -> list[PointResult]:
+    return results_of(points, study())
+
+
+def test_quantities_of_every_point_come_back(results: list[PointResult]) -> None:
+    # The data were integrated to 1e-10 and cubics of the inputs are as good: windows leave 1e-5,
+    # steps of Runge-Kutta (omega dt)^4 / 120 = 1e-6 of waves with harmonics.
+    for truth, result in zip(TRUTHS, results, strict=False):
+        assert result.status == "oscillating"
+        assert result.f_Hz == pytest.approx(1.0, rel=1e-3)
+        expected = {"free": truth | {"eps_x": truth["eps"], "eps_y": truth["eps"]}}
+        expected["constrained"] = truth
+        for name, values in expected.items():
+            for fit in (name, f"{name}_refined"):
+                estimates = result.fits[fit].estimates
+                found = {key: estimate.value for key, estimate in estimates.items()}
+                assert found == pytest.approx({key: values[key] for key in found}, rel=1e-4)
+                assert set(found) == set(CASES[name].quantities)
+                assert result.usable(fit)
+            assert result.fits[name].r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-6)
+        assert result.fits["free_refined"].loss < 1e-8
+
+
+def test_a_relation_holds_exactly_in_fits_refinements_and_draws(
+    results: list[PointResult],
+) -> None:
+    for result in results[:3]:
+        for fit in ("constrained", "constrained_refined"):
+            model = result.fits[fit].model
+            assert model.terms("x")["x*y*R"] == -model.terms("y")["x*y*R"]
+        fitted = result.fits["constrained"]
+        # Coefficients by equation: x*u, x*y*R, 1, x*y*R.
+        assert fitted.model.covariance is not None
+        assert fitted.model.covariance[1, 1] == pytest.approx(-fitted.model.covariance[1, 3])
+        assert fitted.draws["eps"].shape == (60,)
+
+
+def test_a_search_finds_the_terms_that_made_the_data(results: list[PointResult]) -> None:
+    for result in results[:3]:
+        assert result.searched is not None
+        found = {state: set(result.searched.model.terms(state)) for state in ("x", "y")}
+        assert found == {state: set(terms) for state, terms in TERMS.items()}
+
+
+def test_a_point_that_does_not_oscillate_is_kept_and_left_out(
+    points: list[PointData], results: list[PointResult]
+) -> None:
+    assert (results[3].status, dict(results[3].fits)) == ("steady", {})
+    assert not results[3].usable("free")
+    still = replace(points[0].trajectory, states=1.0 + 1e-3 * points[0].trajectory.states)
+    (found,) = results_of([replace(points[0], trajectory=still)], study())
+    assert (found.status, found.fits, found.searched) == ("steady", {}, None)
+    assert found.spread["x"] < 0.01
+    assert trends([found], along="V", at={}).empty
+    assert laws([found], polynomial(["V", "m"], degree=1)) == {}
+    along_m = trends(results, along="m", at={})
+    assert set(along_m["n_points"]) == {3}
+
+
+def test_a_point_does_not_depend_on_the_others(
+    points: list[PointData], results: list[PointResult]
+) -> None:
+    (alone,) = results_of(points[:1], study())
+    for fit, fitted in alone.fits.items():
+        assert fitted.estimates == results[0].fits[fit].estimates
+
+
+@pytest.mark.slow
+def test_workers_change_nothing(points: list[PointData], results: list[PointResult]) -> None:
+    found = dict(parametric_study(points, study(), workers=Loky(2), rng=np.random.default_rng(0)))
+    for k, result in enumerate(results):
+        assert {fit: dict(found[k].fits[fit].estimates) for fit in found[k].fits} == {
+            fit: dict(result.fits[fit].estimates) for fit in result.fits
+        }
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"input_names": ["R", "v"], "units": {}},
+            "operating point V=200, m=2: every trajectory needs the states ['x', 'y'] and the",
+        ),
+        ({"state_names": ["x", "z"]}, "operating point V=200, m=2: every trajectory needs"),
+        ({"units": UNITS | {"u": "km/s"}}, "operating point V=200, m=2: units must agree: 'u'"),
+    ],
+)
+def test_points_that_differ_in_their_variables_are_refused(
+    change: Mapping[str, object], message: str, points: list[PointData]
+) -> None:
+    other = replace(points[1], trajectory=replace(points[1].trajectory, **change))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        results_of([points[0], other], study())
+
+
+def wave(t: np.ndarray) -> np.ndarray:
+    return np.sin(2 * np.pi * t)
+
+
+@pytest.mark.parametrize(
+    ("signal", "status"),
+    [
+        (lambda t: 2 + wave(t), "oscillating"),
+        (lambda t: 2 + wave(t) + 3 * wave(7 * t + 0.3 * wave(t)), "oscillating"),
+        (lambda t: 2 + 0.01 * wave(t), "steady"),
+        (lambda t: 2 + np.exp(-t) * wave(t), "steady"),
+        (lambda t: 2 + np.exp(-0.1 * t) * wave(t), "decaying"),
+        (lambda t: 2 + wave(t / 10), "no dominant frequency"),
+        (lambda t: 2 + np.random.default_rng(0).normal(size=len(t)), "no dominant frequency"),
+    ],
+)
+def test_records_say_whether_they_oscillate(signal: object, status: str) -> None:
+    t = np.linspace(0.0, 20.0, 2001)
+    x = signal(t)  # type: ignore[operator]
+    assert oscillation(Trajectory(t, np.stack([x, 2 + wave(t)], axis=1), ["x", "y"])) == status
+
+
+def test_draws_are_least_squares_on_repeated_rows() -> None:
+    run = forced(**TRUTHS[0])
+    rng = np.random.default_rng(1)
+    noisy = replace(run, states=run.states * (1 + 0.01 * rng.normal(size=run.states.shape)))
+    problems = Differential(split=RandomSplit(0.25)).assemble([noisy], LIBRARY, rng=rng)
+    relations = CASES["constrained"].constraint
+    model = constrained_fit(problems, relations)
+    settings = {"block": 40, "n_draws": 7}
+    found = resampled_coefficients(
+        problems, relations, model, **settings, rng=np.random.default_rng(5)
+    )
+    (problem,) = problems
+    n, again = int((~problem.test).sum()), np.random.default_rng(5)
+    stacked, std = [], []
+    for k, terms in enumerate(TERMS.values()):
+        columns = problem.theta[~problem.test][:, [LIBRARY.index(name) for name in terms]]
+        target = problem.target[~problem.test, k]
+        residual = target - columns @ np.linalg.lstsq(columns, target)[0]
+        std.append(np.sqrt(np.sum(residual**2) / (n - 2)))
+        stacked.append((columns, target))
+    expected = []
+    for _ in range(7):
+        counts = moving_block_counts(n, n_drawn=n, block=40, rng=again)
+        rows, targets = [], []
+        for (columns, target), s, places in zip(stacked, std, ([0, 1], [2, 3]), strict=True):
+            picked = np.repeat(np.arange(n), counts)
+            rows.append(columns[picked] @ relations.C[places] / s)
+            targets.append(target[picked] / s)
+        z = np.linalg.lstsq(np.concatenate(rows), np.concatenate(targets))[0]
+        expected.append(relations.coef(z))
+    centred = np.array(expected) - np.mean(expected, axis=0)
+    np.testing.assert_allclose(found - found.mean(axis=0), centred, rtol=1e-8, atol=1e-10)
+    fit = [model.terms(state)[term] for state, term in relations.coefficients]
+    np.testing.assert_allclose(found.mean(axis=0), fit, rtol=1e-12)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_draws_of_whitened_rows_spread_as_their_covariance_says(case: Case) -> None:
+    run, rng = forced(**TRUTHS[0]), np.random.default_rng(0)
+    noise = 0.03 * run.states.std(axis=0) * rng.normal(size=run.states.shape)
+    noisy = replace(run, states=run.states + noise)
+    problems = Weak(split=RandomSplit(0.0)).assemble([noisy], LIBRARY, rng=rng)
+    model = constrained_fit(problems, case.constraint)
+    draws = resampled_coefficients(problems, case.constraint, model, block=1, n_draws=500, rng=rng)
+    assert model.covariance is not None
+    ratio = draws.std(axis=0) / np.sqrt(np.diag(model.covariance))
+    # 18 segments of time: a standard deviation from them is known to 17 %, twice that is allowed.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.35)
+
+
+def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) -> Regression:
+    """z' = 2 a - 3 b, with columns and errors that are averages over `memory` rows."""
+    white = rng.normal(size=(n_rows + memory, 3))
+    kernel = np.ones(memory) / np.sqrt(memory)
+    smooth = np.stack([np.convolve(column, kernel, "valid")[:n_rows] for column in white.T], 1)
+    theta = smooth[:, :2]
+    return Regression(
+        theta=theta,
+        target=(theta @ [2.0, -3.0] + 0.3 * smooth[:, 2])[:, None],
+        library=named_terms(["a", "b"], ["a", "b"]),
+        equations=["z"],
+        groups=np.arange(n_rows),
+        test=np.zeros(n_rows, dtype=bool),
+    )
+
+
+def coverage(*, block: int, n_seeds: int) -> float:
+    """Share of 95 % intervals that hold the true coefficient."""
+    library = named_terms(["a", "b"], ["a", "b"])
+    relations = constraint(library, {"z": ["a", "b"]})
+    quantities = {"p": Quantity("z: a"), "q": Quantity("z: b", -1.0)}
+    inside = []
+    for rng in np.random.default_rng(0).spawn(n_seeds):
+        problem = correlated_problem(rng, n_rows=1000, memory=5)
+        model = constrained_fit([problem], relations)
+        draws = resampled_coefficients(
+            [problem], relations, model, block=block, n_draws=200, rng=rng
+        )
+        coef = np.array([model.terms("z")[name] for name in ("a", "b")])
+        estimates, _ = drawn_estimates(coef, draws, quantities, relations, library)
+        inside += [e.low <= t <= e.high for e, t in zip(estimates.values(), (2, 3), strict=True)]
+    return float(np.mean(inside))
+
+
+def test_intervals_hold_the_truth_where_rows_are_alike() -> None:
+    # 200 intervals: two standard deviations of a share of 0.95 are 0.03; blocks that keep most of
+    # the memory, and are few, cost some more.
+    assert 0.88 < coverage(block=20, n_seeds=100) < 0.99
+    # Row by row the variance is some 3.4 times too small: 0.95 becomes 0.7.
+    assert coverage(block=1, n_seeds=100) < 0.8
+
+
+def test_a_quantity_is_a_coefficient_or_its_reciprocal() -> None:
+    assert LENGTH.of(np.array([-40.0, -50.0])) == pytest.approx([0.025, 0.02])
+    assert LENGTH.slope(-40.0) == pytest.approx(1 / 1600)
+    assert Quantity("y: x*y*R", -1.0).slope(-0.6) == -1.0
+    units = [q.unit(LIBRARY, UNITS) for q in CASES["free"].quantities.values()]
+    assert units == ["m", "m^-3 s^-1", "1", "1"]
+
+
+def model_of(covariance: np.ndarray | None = None) -> SparseModel:
+    coef = coef_matrix(LIBRARY, [{"x*u": -40.0, "x*y*R": 0.8}, {"1": 2.0, "x*y*R": -0.6}])
+    return SparseModel(LIBRARY, ["x", "y"], coef, UNITS, {}, covariance)
+
+
+def test_intervals_are_carried_from_coefficients_to_quantities() -> None:
+    model = model_of(np.diag([4.0, 1e-4, 0.01, 4e-4]))
+    case = CASES["free"]
+    found = propagated_estimates(model, case.quantities, case.constraint, LIBRARY)
+    reach = {name: 0.5 * (e.high - e.low) for name, e in found.items()}
+    z = 1.959964
+    assert reach == pytest.approx(
+        {"L": z * 2.0 / 1600, "g": z * 0.1, "eps_x": z * 0.01, "eps_y": z * 0.02}, rel=1e-6
+    )
+    assert found["L"].value == pytest.approx(0.025)
+
+
+def power_law(V: float, m: float, status: str = "fitted") -> PointResult:
+    """L = V^0.5 m^-0.3, its draws 10 % to either side."""
+    value = V**0.5 * m**-0.3
+    fitted = Fitted(
+        model_of(),
+        status,
+        {"x": 1.0, "y": 1.0},
+        estimates={"L": Estimate(value, 0.9 * value, 1.1 * value)},
+        draws={"L": value * np.linspace(0.9, 1.1, 41)} if status == "fitted" else {},
+    )
+    return PointResult({"V": float(V), "m": float(m)}, "oscillating", fits={"free": fitted})
+
+
+def test_trends_are_exponents_with_the_other_parameters_held() -> None:
+    results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 5), (300, 6), (400, 5))]
+    (row,) = trends(results, along="m", at={"V": 300.0}).to_dict("records")
+    assert (row["n_points"], row["exponent"]) == (3, pytest.approx(-0.3))
+    (row,) = trends(results, along="V", at={"m": 5.0}).to_dict("records")
+    assert (row["n_points"], row["exponent"]) == (3, pytest.approx(0.5))
+    # The k-th draws of all points are off by one factor, which moves no slope.
+    assert row["low"] == pytest.approx(0.5)
+    lost = [*results, power_law(300, 9, status="max_iter")]
+    (row,) = trends(lost, along="m", at={"V": 300.0}).to_dict("records")
+    assert row["n_points"] == 3
+
+
+def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
+    library = polynomial(["V", "m"], degree=1)
+    results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 6), (400, 5))]
+    law = laws(results, library, max_terms=2)["free"]["L"]
+    assert len(law.terms) <= 2
+    lost = [*results[:2], *(power_law(300, m, status="max_iter") for m in (7, 8))]
+    assert laws(lost, library) == {}
+    held = [power_law(300, m) for m in (2, 4, 6)]
+    assert laws(held, library) == {}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Quantity("x"), "a quantity needs a coefficient such as 'n_i: n_i*u_iz': 'x'"),
+        (lambda: Quantity("x: x", factor=0.0), "factor=0.0, power=1 came"),
+        (lambda: Quantity("x: x", power=2), "the power 1 or -1"),
+        (lambda: TimeBootstrap(n_draws=10, periods=1.0), "40 draws or more"),
+        (lambda: TimeBootstrap(n_draws=60, periods=0.0), "blocks some length"),
+        (
+            lambda: Refining(n_windows=1, periods=0.5, max_iter=50),
+            "two windows and iterations or more",
+        ),
+        (lambda: PointData({"V": 1.0}, None), "V=1 oscillates: it needs its trajectory"),
+        (
+            lambda: replace(
+                study(), cases={"a": replace(CASES["free"], quantities={"q": Quantity("x: 1")})}
+            ),
+            "the quantity of 'x: 1': '1' is not in the support of 'x'",
+        ),
+        (
+            lambda: trends([power_law(0.0, 1.0), power_law(1.0, 1.0)], along="V", at={}),
+            "an exponent needs parameters above zero: 0 came",
+        ),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()  # type: ignore[operator]
+
+
+def test_a_record_of_few_blocks_is_refused(points: list[PointData]) -> None:
+    how = replace(study(weak=False), bootstrap=TimeBootstrap(n_draws=60, periods=6.0))
+    with pytest.raises(
+        ValueError, match="needs 5 blocks or more: blocks of 600 were asked of 2000"
+    ):
+        results_of(points[:1], how)
