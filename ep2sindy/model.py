@@ -191,7 +191,7 @@ class SparseModel:
         lines = []
         for state in self.states:
             right = " ".join(
-                _latex_term(name, coef, digits, first=k == 0)
+                latex_term(name, coef, digits, first=k == 0)
                 for k, (name, coef) in enumerate(self.terms(state).items())
             )
             lines.append(f"{latex_derivative(state)} &= {right or '0'}")
@@ -330,7 +330,7 @@ def equation_text(state: str, terms: Mapping[str, float], *, digits: int = 3) ->
     return f"{state}' = {' '.join(parts) or '0'}"
 
 
-def _latex_term(name: str, coef: float, digits: int, *, first: bool) -> str:
+def latex_term(name: str, coef: float, digits: int, *, first: bool) -> str:
     sign = "-" if coef < 0 else "" if first else "+"
     mantissa, _, exponent = f"{abs(coef):.{digits}g}".partition("e")
     number = mantissa + (rf" \cdot 10^{{{int(exponent)}}}" if exponent else "")

@@ -62,7 +62,7 @@ class Trajectory:
     @property
     def values(self) -> Float[np.ndarray, "samples variables"]:
         """States and inputs side by side, in the order of `names`."""
-        return np.concatenate([self.states, self.inputs], axis=1)
+        return self.columns(self.names)
 
     @property
     def n_samples(self) -> int:
@@ -83,7 +83,11 @@ class Trajectory:
                 raise ValueError(
                     f"unknown variable {name!r}; this trajectory has {list(self.names)}"
                 )
-        return self.values[:, [self.names.index(name) for name in names]]
+        n_states = len(self.state_names)
+        columns = np.empty((self.n_samples, len(names)))
+        for j, k in enumerate(map(self.names.index, names)):
+            columns[:, j] = self.states[:, k] if k < n_states else self.inputs[:, k - n_states]
+        return columns
 
     def window(self, start: int, stop: int) -> Trajectory:
         """Samples start to stop (exclusive) as a trajectory of their own."""

@@ -1,0 +1,164 @@
+"""The pointwise study on a grid of 41 x 49 points and 12001 samples, read from disk, on one core.
+
+Five terms, two equations, best supports of every size, 32 bootstraps of the rows. Beside it, per
+point: the plain way (scikit-learn's `lasso_path` with 100 penalties on the resampled rows of every
+bootstrap, `lstsq` for every support found), and PySINDy's `EnsembleOptimizer` (32 models) at ten
+thresholds; both are given rows that are ready, and only a few points of the same grid.
+
+    python -m benchmarks.pointwise [--folder where 1 GB fits]
+"""
+
+import argparse
+import resource
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import netCDF4
+import numpy as np
+import pysindy
+import xarray as xr
+from sklearn.linear_model import lasso_path
+from threadpoolctl import threadpool_limits
+
+from benchmarks.timing import cpu_s
+from ep2sindy.io import read_field
+from ep2sindy.library import named_terms
+from ep2sindy.parallel import Serial
+from ep2sindy.regression import Differential, Regression
+from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.selection import Knee
+from ep2sindy.studies.blocks import blocks_of
+from ep2sindy.studies.pointwise import PointSearch, pointwise
+from ep2sindy.trajectory import Trajectory
+
+N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
+UNITS = {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s"}
+LEVELS = {"n_i": 4e17, "n_n": 3e18, "u_iz": 4e3, "u_ir": 5e2, "R_ion": 5e-14}
+TERMS = ["1", "n_n", "n_i*u_iz", "n_i*u_ir", "n_i*n_n*R_ion"]
+BLOCK_POINTS = 128
+SEARCH = PointSearch(
+    states=["n_i", "n_n"],
+    library=named_terms(list(UNITS), TERMS),
+    formulation=Differential(),
+    search=BestSubset(max_terms=5),
+    bootstraps=Bootstraps(n=32, n_culled=0),
+    selection=Knee(),
+)
+
+
+def write_grid(path: Path, rng: np.random.Generator) -> None:
+    """Oscillations of 14 kHz and its harmonic with 2 % noise, different at every point."""
+    t = np.arange(N_SAMPLES) * DT_S
+    axes = {"time": t, "z": np.linspace(0.0, 0.05, N_Z), "r": np.linspace(0.028, 0.057, N_R)}
+    with netCDF4.Dataset(path, "w") as file:
+        for axis, points in axes.items():
+            file.createDimension(axis, len(points))
+            variable = file.createVariable(axis, "f8", (axis,))
+            variable[:] = points
+            variable.units = "s" if axis == "time" else "m"
+        for name, unit in UNITS.items():
+            variable = file.createVariable(name, "f8", tuple(axes), contiguous=True)
+            variable.units = unit
+            phase, strength = rng.uniform(0.0, 2 * np.pi, (2, N_Z, N_R)), rng.uniform(0.2, 0.6, 2)
+            for start in range(0, N_SAMPLES, 1000):
+                turn = 2 * np.pi * 14e3 * t[start : start + 1000, None, None]
+                wave = sum(
+                    a * np.sin(k * turn + p)
+                    for k, (a, p) in enumerate(zip(strength, phase, strict=True), start=1)
+                )
+                noise = 0.02 * rng.standard_normal(wave.shape)
+                variable[start : start + 1000] = LEVELS[name] * (1.0 + wave + noise)
+
+
+def study(field: xr.Dataset) -> xr.Dataset:
+    return pointwise(field, SEARCH, workers=Serial(), block_points=BLOCK_POINTS)
+
+
+def read_all(field: xr.Dataset) -> None:
+    """What reading costs without any search."""
+    for block in blocks_of(field, BLOCK_POINTS):
+        field.isel(block.slices).load()
+
+
+def rows_at(field: xr.Dataset, iz: int, ir: int) -> Regression:
+    point = field.isel(z=iz, r=ir).load()
+    states = np.stack([point[name].values for name in SEARCH.states], axis=1)
+    names = SEARCH.variables[len(SEARCH.states) :]
+    inputs = np.stack([point[name].values for name in names], axis=1)
+    run = Trajectory(point["time"].values, states, SEARCH.states, inputs, names)
+    (problem,) = SEARCH.formulation.assemble([run], SEARCH.library, rng=np.random.default_rng(0))
+    return problem
+
+
+def plain_way(problem: Regression) -> None:
+    """Lasso paths of resampled rows, then a fit of every support that came up."""
+    rng = np.random.default_rng(0)
+    n_terms = len(problem.library)
+    theta, targets = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms:]
+    for target in targets.T:
+        supports = set()
+        for _ in range(SEARCH.bootstraps.n):
+            size = int(rng.uniform(0.2, 0.8) * len(theta))
+            rows = rng.integers(len(theta), size=size)
+            _, paths, _ = lasso_path(theta[rows], target[rows], alphas=100)
+            supports |= {tuple(np.flatnonzero(column)) for column in paths.T}
+        for support in supports:
+            np.linalg.lstsq(theta[:, list(support)], target)
+
+
+def ensemble_way(problem: Regression) -> None:
+    """PySINDy's bagging at ten thresholds, on columns that are scaled."""
+    n_terms = len(problem.library)
+    theta, targets = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms:]
+    for threshold in np.geomspace(1e-3, 1.0, 10):
+        optimizer = pysindy.EnsembleOptimizer(
+            pysindy.STLSQ(threshold=threshold, alpha=0.0),
+            bagging=True,
+            n_models=SEARCH.bootstraps.n,
+            n_subset=len(theta) // 2,
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # the highest removes every term
+            optimizer.fit(theta, targets)
+
+
+def per_point(way: Callable[[Regression], None], problems: list[Regression]) -> float:
+    begin = time.process_time()
+    for problem in problems:
+        way(problem)
+    return (time.process_time() - begin) / len(problems)
+
+
+def compare(path: Path) -> None:
+    field = read_field(path)
+    n_points = N_Z * N_R
+    read_s = cpu_s(lambda: read_all(field), n_runs=1)
+    total_s = cpu_s(lambda: study(field), n_runs=1)
+    # Kilobytes on Linux, bytes on macOS.
+    peak_GiB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    ours = total_s / n_points
+    print(f"{n_points} points x {N_SAMPLES} samples, {path.stat().st_size / 1e9:.2f} GB on disk")
+    print(f"  reading                   {read_s:8.1f} CPU-s")
+    print(f"  reading and searching     {total_s:8.1f} CPU-s, {1e3 * ours:.2f} ms per point")
+    print(f"  peak memory               {peak_GiB:8.2f} GiB")
+    problems = [rows_at(field, iz, 20) for iz in (10, 30)]
+    for name, way in (("scikit-learn", plain_way), ("PySINDy ensemble", ensemble_way)):
+        each = per_point(way, problems)
+        print(f"  {name:<25} {1e3 * each:8.0f} ms per point, {each / ours:.0f} times")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="the pointwise study at full size, on one core")
+    parser.add_argument("--folder", type=Path, default=None, help="where 1 GB fits")
+    folder = parser.parse_args().folder
+    with tempfile.TemporaryDirectory(dir=folder) as made, threadpool_limits(limits=1):
+        path = Path(made) / "grid.nc"
+        write_grid(path, np.random.default_rng(0))
+        compare(path)
+
+
+if __name__ == "__main__":
+    main()

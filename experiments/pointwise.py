@@ -1,0 +1,187 @@
+"""A search at every grid point, and the regimes that come out: `+exp=pointwise`."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import xarray as xr
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+import ep2sindy
+from ep2sindy.files import fingerprint, replacing
+from ep2sindy.library import Library, named_terms
+from ep2sindy.map_plots import coefficient_maps, quality_maps, regime_map
+from ep2sindy.model import equation_text
+from ep2sindy.names import split_factors
+from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
+from ep2sindy.studies.blocks import Kept
+from ep2sindy.studies.pointwise import PointSearch, pointwise
+from ep2sindy.studies.regimes import regimes
+from ep2sindy.thruster import Thruster
+from experiments.build import open_prepared_field, started_run
+from experiments.checks import check_counts, check_lists
+from experiments.pointwise_view import Outcome, page, print_outcome, summary, terms_table
+
+USES: tuple[str, ...] = (
+    "data",
+    "prepare",
+    "formulation",
+    "search",
+    "bootstraps",
+    "selection",
+    "depth",
+    "parallel",
+)  # of conf/config.yaml
+KEYS = (
+    "states", "terms", "variables_if_present", "least_variation", "max_regimes", "block_points",
+    "keep", "outline",
+)  # fmt: skip
+# What does not change the result of a point, and may differ when a broken run is taken up.
+AFTERWARDS = {"output", "parallel", "max_regimes", "keep", "outline", "experiment", "study"}
+
+
+def run(config: DictConfig) -> Path:
+    """Search everywhere, group what was found; everything lands in a new run folder."""
+    with started_run(config, keys=KEYS) as (folder, screen):
+        check_counts(config, "max_regimes", "block_points")
+        check_lists(config, "states", "terms")
+        # Everything but the data is built first: a misspelt key must not cost a simulation.
+        workers = instantiate(config.parallel)
+        settings = search_settings(config)
+        outline = instantiate(config.outline)
+        field = open_prepared_field(config)
+        search = PointSearch(library=library_of(config, field), **settings)
+        kept = Kept(Path(config.keep) / blocks_key(config))
+        n_points = int(np.prod([field.sizes.get(axis, 1) for axis in ("z", "r")]))
+        begin = time.perf_counter()
+        with progress_of(folder, n_points) as progress:
+            result = pointwise(
+                field,
+                search,
+                workers=workers,
+                kept=kept,
+                block_points=config.block_points,
+                progress=progress,
+            )
+        wall_s = time.perf_counter() - begin
+        found = regimes(
+            result, rng=np.random.default_rng(config.seed), max_regimes=config.max_regimes
+        )
+        result = result.assign(regime=found.labels, confidence=found.confidence)
+        write_result(folder.path / "pointwise.nc", result)
+        kept.clear()
+        outcome = Outcome(config.experiment, result, found, wall_s)
+        print_outcome(screen, outcome)
+        _write(folder, config, outcome, outline)
+    return folder.path
+
+
+def _write(
+    folder: RunFolder, config: DictConfig, outcome: Outcome, outline: Thruster | None
+) -> None:
+    folder.write_table("terms", terms_table(outcome.result))
+    folder.write_table("regimes", outcome.regimes.table)
+    figures = {
+        "coefficients": coefficient_maps(outcome.result, outline=outline),
+        "regimes": regime_map(outcome.regimes, outline=outline),
+        "quality": quality_maps(outcome.result, outline=outline),
+    }
+    folder.write_figures(figures)
+    found = summary(outcome)
+    counts = {f"points/{name}": float(n) for name, n in found["status"].items()}
+    write_tensorboard(
+        folder.path / "tensorboard",
+        figures=figures,
+        texts={f"regime_{k}": f"    {_text(outcome, k)}" for k in range(found["regimes"])},
+        hparams=_hparams(config),
+        metrics={key: float(found[key]) for key in ("n_points", "n_valid", "regimes")} | counts,
+    )
+    folder.write_text("report.html", page(outcome, figures))
+    folder.write_json(
+        "summary.json", found | {"experiment": config.experiment, "seed": config.seed}
+    )
+
+
+def _text(outcome: Outcome, regime: int) -> str:
+    equations = outcome.regimes.equations(regime)
+    return "; ".join(equation_text(state, terms) for state, terms in equations.items())
+
+
+def _hparams(config: DictConfig) -> dict[str, Any]:
+    """The settings that decide the outcome; fixed keys, so that runs can be compared."""
+    groups = ("formulation", "search", "selection")
+    named = {key: str(config[key]["_target_"]).rpartition(".")[-1] for key in groups}
+    return {
+        "seed": config.seed,
+        "terms": str(list(config.terms)),
+        "n_bootstraps": config.bootstraps.n,
+        **named,
+    }
+
+
+def search_settings(config: DictConfig) -> dict[str, Any]:
+    return {
+        "states": list(config.states),
+        **{key: instantiate(config[key]) for key in ("formulation", "search", "bootstraps")},
+        "selection": instantiate(config.selection),
+        "depth": config.depth,
+        "least_variation": config.least_variation,
+        "seed": config.seed,
+    }
+
+
+def library_of(config: DictConfig, field: xr.Dataset) -> Library:
+    """The terms of the config, without those of optional variables that the field lacks."""
+    lacking = {name for name in config.variables_if_present if name not in field}
+    factors = {
+        name: [variable for variable, _ in split_factors(name)] if name != "1" else []
+        for name in map(str, config.terms)
+    }
+    terms = [name for name, variables in factors.items() if not lacking & set(variables)]
+    used = dict.fromkeys([*config.states, *(v for name in terms for v in factors[name])])
+    return named_terms(list(used), terms)
+
+
+def blocks_key(config: DictConfig) -> str:
+    """What the result of a block depends on: settings, the data's file, this package's code."""
+    settings = cast(dict, OmegaConf.to_container(config, resolve=True))
+    decisive = {key: value for key, value in settings.items() if key not in AFTERWARDS}
+    path = settings["data"].get("path")
+    if path is not None:
+        paths = [Path(path), *sorted(Path(path).rglob("*"))]  # a Zarr store is a folder
+        stats = [each.stat() for each in paths if each.exists()]
+        decisive["stamp"] = [(each.st_size, each.st_mtime_ns) for each in stats]
+    return fingerprint(json.dumps(decisive, sort_keys=True), sources=Path(ep2sindy.__file__).parent)
+
+
+@contextmanager
+def progress_of(folder: RunFolder, n_points: int) -> Iterator[Callable[[int], None]]:
+    """A bar with points per second, and the same in TensorBoard while the run goes on."""
+    begin = time.perf_counter()
+    with (
+        LiveScalars(folder.path / "tensorboard") as live,
+        tqdm(total=n_points, unit="point", disable=None) as bar,
+    ):
+        done = 0
+
+        def progress(n_more: int) -> None:
+            nonlocal done
+            done += n_more
+            bar.update(n_more)
+            per_s = done / max(time.perf_counter() - begin, 1e-9)
+            live.write({"points/done": float(done), "points/per_s": per_s}, step=done)
+
+        yield progress
+
+
+def write_result(path: Path, result: xr.Dataset) -> None:
+    """Write as NetCDF, compressed, whole or not at all."""
+    packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
+    with replacing(path) as temporary:
+        result.to_netcdf(temporary, engine="h5netcdf", encoding=packed)

@@ -1,0 +1,169 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from ep2sindy.io import write_field
+from ep2sindy.studies.regions import TERMS, three_regions
+from experiments import pointwise
+from experiments.run import innermost
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=["+exp=pointwise", *overrides])
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small file on (time, z, r)."""
+    path = tmp_path_factory.mktemp("data") / "grid.nc"
+    write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, path)
+    return path
+
+
+def on_file(path: Path, folder: Path) -> list[str]:
+    return [
+        "data=file",
+        f"data.path={path}",
+        "data.r.name=r",
+        *(f"data.variables.{name}.name={name}" for name in ("u_iz", "u_ir", "R_ion")),
+        f"output={folder}/outputs",
+        f"keep={folder}/kept",
+        "parallel=serial",
+        "bootstraps.n=6",
+        "block_points=5",
+        "max_regimes=3",
+    ]
+
+
+def summary_of(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def toy_run(grid: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return pointwise.run(composed(*on_file(grid, tmp_path_factory.mktemp("run"))))
+
+
+def test_the_summary_counts_the_points(toy_run: Path) -> None:
+    found = summary_of(toy_run)
+    assert found["n_points"] == found["n_valid"] == 30
+    assert found["status"] == {"fitted": 30}
+    assert found["points_per_s"] == pytest.approx(30 / found["wall_s"])
+    assert 1 <= found["regimes"] == len(found["equations"]) <= 3
+    assert set(found["equations"][0]) == {"n_i", "n_n"}
+
+
+def test_the_file_holds_every_map(toy_run: Path) -> None:
+    with xr.open_dataset(toy_run / summary_of(toy_run)["file"]) as result:
+        assert list(result["term"].values) == list(TERMS)
+        for name in ("coef", "inclusion", "weight"):
+            assert result[name].dims == ("equation", "term", "z", "r")
+        for name in ("r2_test", "n_terms"):
+            assert result[name].dims == ("equation", "z", "r")
+        assert result["status"].attrs["flag_meanings"].split()[0] == "fitted"
+        assert int(result["regime"].max()) + 1 == summary_of(toy_run)["regimes"]
+        assert ((result["confidence"] >= 0) & (result["confidence"] <= 1)).all()
+
+
+def test_tables_figures_and_page_are_there(toy_run: Path) -> None:
+    terms = pd.read_csv(toy_run / "tables" / "terms.csv")
+    assert len(terms) == 2 * len(TERMS)
+    assert terms["selected"].between(0, 1).all()
+    page = (toy_run / "report.html").read_text()
+    for name in ("coefficients", "regimes", "quality"):
+        assert (toy_run / "figures" / f"{name}.png").stat().st_size > 1e4
+        assert f"figures/{name}.png" in page
+    events = EventAccumulator(str(toy_run / "tensorboard")).Reload()
+    assert [e.value for e in events.Scalars("points/done")][-1] == 30.0
+    assert {"coefficients", "regimes", "quality"} <= set(events.Tags()["images"])
+
+
+def test_finished_blocks_are_gone_once_the_result_is_written(toy_run: Path) -> None:
+    (kept,) = [path for path in toy_run.parents if (path / "kept").exists()][:1]
+    assert list((kept / "kept").iterdir()) == []
+
+
+def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Path) -> None:
+    line = tmp_path / "line.nc"
+    with xr.open_dataset(grid, decode_times=False) as field:
+        write_field(field.isel(r=2, drop=True).load(), line)
+    overrides = ["data.r.name=null", "data.variables.u_ir.name=null"]
+    folder = pointwise.run(composed(*on_file(line, tmp_path), *overrides))
+    assert summary_of(folder)["n_points"] == 6
+    assert (folder / "figures" / "regimes.png").exists()
+    with xr.open_dataset(folder / "pointwise.nc") as result:
+        assert list(result["term"].values) == [name for name in TERMS if "u_ir" not in name]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("block_points=0", "block_points must be a whole number, one or more: 0 came"),
+        ("max_regimes=0", "max_regimes must be a whole number, one or more: 0 came"),
+        ("terms=[n_i*B]", "unknown variables ['B']; this field has"),
+        ("states=[n_i,n_x]", "unknown variables ['n_x']; this field has"),
+        ("bootstraps.n=0", "a pointwise study needs bootstraps for its spread: n=0 came"),
+        ("bootstraps.block=100000", "no point could be fitted: a block must hold"),
+        ("outline.inner_radius=0.06", "inner_radius must be below outer_radius"),
+        ("+rollout_s=1", "unknown keys ['rollout_s']; there are "),
+        ("least_variation=2.0", "least_variation must lie in [0, 1): 2.0"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(
+    override: str, message: str, grid: Path, tmp_path: Path
+) -> None:
+    with pytest.raises((ValueError, HydraException)) as caught:
+        pointwise.run(composed(*on_file(grid, tmp_path), override))
+    assert message in str(innermost(caught.value))
+
+
+def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:
+    def key(*overrides: str) -> str:
+        return pointwise.blocks_key(composed(*on_file(grid, tmp_path), *overrides))
+
+    same = [key(), key("max_regimes=2"), key("parallel=loky"), key("output=elsewhere")]
+    assert len(set(same)) == 1
+    others = [key("seed=1"), key("bootstraps.n=7"), key("terms=[n_n]"), key("selection=ebic")]
+    assert len({*same, *others}) == 5
+    os.utime(grid, ns=(time.time_ns(), time.time_ns()))
+    assert key() not in same
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_with_the_same_file(grid: Path, tmp_path: Path) -> None:
+    def command(folder: Path) -> list[str]:
+        overrides = [*on_file(grid, folder), "block_points=1", "bootstraps.n=200"]
+        return [sys.executable, "-m", "experiments.run", "+exp=pointwise", *overrides]
+
+    undisturbed = tmp_path / "undisturbed"
+    subprocess.run(command(undisturbed), cwd=ROOT, check=True, capture_output=True)
+    broken = tmp_path / "broken"
+    started = subprocess.Popen(command(broken), cwd=ROOT, stdout=subprocess.DEVNULL)
+    while len(kept := list((broken / "kept").rglob("z*.npz"))) < 5:
+        assert started.poll() is None, "it ended before it could be killed"
+        time.sleep(0.01)
+    started.send_signal(signal.SIGKILL)
+    started.wait()
+    times = {path: path.stat().st_mtime_ns for path in kept}
+    assert {path: path.stat().st_mtime_ns for path in kept} == times
+    subprocess.run(command(broken), cwd=ROOT, check=True, capture_output=True)
+    (one,) = undisturbed.rglob("pointwise.nc")
+    (other,) = broken.rglob("pointwise.nc")
+    assert one.read_bytes() == other.read_bytes()
+    assert np.all(np.diff(sorted(times.values())) >= 0)

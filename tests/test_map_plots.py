@@ -1,0 +1,207 @@
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+
+from ep2sindy.map_plots import ABSENT, GAP, coefficient_maps, quality_maps, regime_map
+from ep2sindy.studies.regimes import Regimes, regimes
+from ep2sindy.thruster.parameters import Thruster
+
+TERMS = ["1", "n_n", "n_i*u_iz"]
+
+
+def study() -> xr.Dataset:
+    """5 x 4 points of z and r, the last row of z without plasma.
+
+    n_i' = -40 n_i u_iz; n_n' = 10^22..10^24 at z < 1 cm, 3e4 n_n beyond.
+    """
+    z, r = np.linspace(0.002, 0.022, 5), np.linspace(0.036, 0.049, 4)
+    coef, weight = np.zeros((2, 2, 3, 5, 4))
+    coef[0, 2], weight[0, 2] = -40.0, -1.0
+    coef[1, 0, :2], weight[1, 0, :2] = np.logspace(22, 24, 8).reshape(2, 4), 1.0
+    coef[1, 1, 2:], weight[1, 1, 2:] = 3e4, 1.0
+    status = np.zeros((5, 4), dtype=np.int8)
+    status[-1] = 1
+    masked = np.where(status == 0, 1.0, np.nan)
+    dims = ("equation", "term", "z", "r")
+    units = [["m^-3 s^-1", "s^-1", "m^-1"]] * 2
+    flags = {
+        "flag_values": [0, 1, 2, 3, 4],
+        "flag_meanings": "fitted no_plasma missing_samples too_little_variation no_fit",
+    }
+    return xr.Dataset(
+        {
+            "coef": (dims, coef * masked),
+            "weight": (dims, weight * masked),
+            "weight_draws": (("draw", *dims), np.stack([weight * masked] * 3)),
+            "r2_train": (("equation", "z", "r"), 0.9 * np.stack([masked] * 2)),
+            "r2_test": (("equation", "z", "r"), np.stack([0.8 * masked, -3.0 * masked])),
+            "n_terms": (("equation", "z", "r"), np.stack([masked] * 2)),
+            "status": (("z", "r"), status, flags),
+        },
+        coords={
+            "equation": ["n_i", "n_n"],
+            "term": TERMS,
+            "coef_units": (dims[:2], units),
+            "z": ("z", z, {"units": "m"}),
+            "r": ("r", r, {"units": "m"}),
+        },
+    )
+
+
+def grouped(result: xr.Dataset) -> Regimes:
+    return regimes(result, rng=np.random.default_rng(0))
+
+
+def maps(figure: Figure) -> list[tuple[Axes, np.ma.MaskedArray]]:
+    """Panels with a map, and its values over (r, z), colour bars left out."""
+    found = []
+    for ax in figure.axes:
+        meshes = [c for c in ax.collections if isinstance(c, QuadMesh)]
+        if meshes and ax.get_label() != "<colorbar>":
+            found.append((ax, np.ma.masked_invalid(np.ma.asarray(meshes[0].get_array()))))
+    return found
+
+
+def legend(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_a_coefficient_shows_its_sign_and_its_exponent() -> None:
+    drawn = [values for _, values in maps(coefficient_maps(study()))]
+    assert len(drawn) == 2 * len(TERMS)
+    by_panel = dict(zip([(e, t) for e in ("n_i", "n_n") for t in TERMS], drawn, strict=True))
+    constant = by_panel["n_n", "1"].filled(np.nan)[:, :2].T.ravel()
+    # From 10^22 at the rim of the middle to 10^24 at the end, even in the logarithm.
+    assert constant == pytest.approx(np.linspace(GAP, 1.0, 8), abs=1e-12)
+    # -40 is log10(40) = 1.6 of the way from 10 to 100.
+    sink = by_panel["n_i", "n_i*u_iz"].compressed()
+    assert sink == pytest.approx(-(GAP + (1.0 - GAP) * (np.log10(40.0) - 1.0)))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_coefficient_below_the_scale_is_not_drawn_as_absent(sign: float) -> None:
+    result = study()
+    result["coef"][1, 0, 0, 0] = sign * 1e3
+    result = result.isel(z=slice(0, 4))
+    ax, values = maps(coefficient_maps(result))[3]
+    (mesh,) = ax.collections
+    least, none = values[0, 0], values[0, -1]
+    assert (abs(least), none) == (GAP, 0.0)
+    assert np.allclose(mesh.to_rgba(none), to_rgba(ABSENT))
+    assert not np.allclose(mesh.to_rgba(least), to_rgba(ABSENT), atol=0.01)
+
+
+def test_masked_cells_are_blank_and_absent_terms_are_not() -> None:
+    for _, values in maps(coefficient_maps(study())):
+        assert np.ma.getmaskarray(values)[:, -1].all()
+        assert not np.ma.getmaskarray(values)[:, :-1].any()
+    absent = maps(coefficient_maps(study()))[0][1]
+    assert (absent.compressed() == 0.0).all()
+
+
+def test_maps_have_the_proportions_of_the_thruster() -> None:
+    for figure in (coefficient_maps(study()), quality_maps(study())):
+        for ax, _ in maps(figure):
+            assert ax.get_aspect() == 1.0
+            assert ax.get_xlim() == pytest.approx((-0.05, 2.45))  # cm: half a cell around
+
+
+def test_the_channel_is_drawn_where_it_is_and_leaves_the_limits() -> None:
+    thruster = Thruster(inner_radius=0.0372)
+    plain, outlined = (coefficient_maps(study(), outline=o) for o in (None, thruster))
+    for (before, _), (after, _) in zip(maps(plain), maps(outlined), strict=True):
+        assert not before.lines
+        points = np.concatenate([line.get_xydata() for line in after.lines])
+        for corner in ((0.0, 3.72), (0.0, 5.0), (2.5, 3.72), (2.5, 5.0)):
+            assert np.abs(points - corner).sum(axis=1).min() == pytest.approx(0.0, abs=1e-9)
+        assert (after.get_xlim(), after.get_ylim()) == (before.get_xlim(), before.get_ylim())
+
+
+def test_terms_that_no_point_selected_have_no_column() -> None:
+    result = study()
+    result["coef"].loc[{"term": "n_n"}] *= 0.0
+    titles = {ax.get_title() for ax, _ in maps(coefficient_maps(result))}
+    assert titles == {"", "$1$", "$n_{i} u_{iz}$"}
+
+
+def test_coefficients_of_no_term_at_all_are_refused() -> None:
+    result = study()
+    result["coef"] *= 0.0
+    with pytest.raises(ValueError, match="no point of the study selected any"):
+        coefficient_maps(result)
+
+
+@pytest.mark.parametrize(("gone", "axis", "places"), [("r", "z", [2.5]), ("z", "r", [3.5, 5.0])])
+def test_over_one_axis_coefficients_are_points_by_sign(
+    gone: str, axis: str, places: list[float]
+) -> None:
+    result = study().isel({gone: 1}, drop=True)
+    coef = result["coef"].isel(term=(np.abs(result["coef"]) > 0.0).any(["equation", axis]).values)
+    panels = np.array(coefficient_maps(result, outline=Thruster()).axes).reshape(2, -1)
+    for row, equation in zip(panels, coef, strict=True):
+        for ax, values in zip(row, equation, strict=True):
+            for line, sign in zip(ax.lines, (1.0, -1.0), strict=False):
+                held = sign * values.values > 0.0
+                assert line.get_xdata() == pytest.approx(100.0 * coef[axis].values[held])
+                assert line.get_ydata() == pytest.approx(np.abs(values.values[held]))
+            assert [line.get_xdata()[0] for line in ax.lines[2:]] == pytest.approx(places)
+
+
+def test_a_regime_map_shows_labels_and_leaves_invalid_points_blank() -> None:
+    found = grouped(study())
+    figure = regime_map(found, outline=Thruster())
+    (_, labels), (_, confidence) = maps(figure)
+    assert ((found.labels.values == -1) == np.ma.getmaskarray(labels).T).all()
+    assert (labels.compressed() == found.labels.values.T[found.labels.values.T >= 0]).all()
+    assert confidence.compressed().tolist() == pytest.approx([1.0] * 16, abs=0.01)
+
+
+def test_a_regime_map_gives_every_regime_its_equations() -> None:
+    entries = legend(regime_map(grouped(study())))
+    assert len(entries) == 2
+    assert {entry.split("\n")[0][:20] for entry in entries} == {
+        "regime 0: 8 points, ",
+        "regime 1: 8 points, ",
+    }
+    assert all(r"$\dot{n}_{i} = - 40 \, n_{i} u_{iz}$" in entry for entry in entries)
+    assert any(r"$\dot{n}_{n} = 3 \cdot 10^{4} \, n_{n}$" in entry for entry in entries)
+
+
+def test_an_equation_without_terms_reads_zero() -> None:
+    result = study()
+    for name in ("coef", "weight", "weight_draws"):
+        result[name].loc[{"equation": "n_i"}] *= 0.0
+    assert all(r"\dot{n}_{i} = 0$" in entry for entry in legend(regime_map(grouped(result))))
+
+
+def test_r2_below_zero_is_drawn_as_zero() -> None:
+    drawn = {ax.get_title(): values for ax, values in maps(quality_maps(study()))}
+    assert (drawn[r"$\dot{n}_{i}$: $R^2$, held-out"].compressed() == 0.8).all()
+    assert (drawn[r"$\dot{n}_{n}$: $R^2$, held-out"].compressed() == 0.0).all()
+
+
+def test_quality_is_of_the_training_rows_where_none_are_held_out() -> None:
+    result = study()
+    result["r2_test"] *= np.nan
+    drawn = {ax.get_title(): values for ax, values in maps(quality_maps(result))}
+    assert (drawn[r"$\dot{n}_{n}$: $R^2$, training"].compressed() == 0.9).all()
+
+
+def test_quality_maps_count_what_became_of_the_points() -> None:
+    assert legend(quality_maps(study())) == ["fitted (16)", "no plasma (4)"]
+
+
+@pytest.mark.parametrize("cut", [{"r": 1}, {"z": 1}, {"z": [1], "r": [1]}, {"r": [1]}], ids=str)
+def test_every_figure_is_drawn_over_any_axes(cut: dict[str, int | list[int]]) -> None:
+    result = study().isel(cut, drop=True)
+    for figure in (
+        coefficient_maps(result, outline=Thruster()),
+        regime_map(grouped(result), outline=Thruster()),
+        quality_maps(result, outline=Thruster()),
+    ):
+        figure.canvas.draw()
+        assert all(ax.has_data() for ax in figure.axes)

@@ -1,0 +1,286 @@
+import errno
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from distributed import LocalCluster
+
+from ep2sindy.discover import discover
+from ep2sindy.fields import point
+from ep2sindy.library import named_terms
+from ep2sindy.parallel import Dask, Loky, Serial
+from ep2sindy.regression import Differential, RandomSplit
+from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps
+from ep2sindy.selection import EBIC, Knee
+from ep2sindy.studies.blocks import Kept, blocks_of
+from ep2sindy.studies.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.weak import Weak
+
+T = np.linspace(0.0, 2.0, 201)
+Z, R = np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.035, 0.04, 0.05])
+LIBRARY = named_terms(["x", "u", "w"], ["1", "x", "u", "w", "u*w"])
+
+
+def parabolas(z: np.ndarray = Z, r: np.ndarray = R) -> xr.Dataset:
+    """x = a(z) t + b(r) t^2 / 2 with u = t, w = cos 5t: x' = a + b u, exact for differences."""
+    a, b = 1.0 + 100.0 * z[:, None], -50.0 * r
+    x = a * T[:, None, None] + b * T[:, None, None] ** 2 / 2.0 + 0.1
+    axes = {"time": ("time", T, {"units": "s"}), "z": ("z", z), "r": ("r", r)}
+    return xr.Dataset(
+        {
+            "x": (("time", "z", "r"), x, {"units": "m^-3"}),
+            "u": (("time",), T, {"units": "m/s"}),
+            "w": (("time", "z"), np.cos(5.0 * T)[:, None] + 0.0 * z, {"units": "1"}),
+        },
+        coords=axes,
+    )
+
+
+def noisy(seed: int = 0) -> xr.Dataset:
+    field = parabolas()
+    rng = np.random.default_rng(seed)
+    return field.assign(x=field["x"] + 0.02 * rng.standard_normal(field["x"].shape))
+
+
+def searching(**changes: object) -> PointSearch:
+    settings = {
+        "states": ["x"],
+        "library": LIBRARY,
+        "formulation": Differential(),
+        "search": BestSubset(max_terms=4),
+        "bootstraps": Bootstraps(n=8, n_culled=0, block=10),
+        "selection": EBIC(),
+    }
+    return PointSearch(**(settings | changes))
+
+
+def bytes_of(result: xr.Dataset) -> dict[str, bytes]:
+    return {str(name): values.values.tobytes() for name, values in result.variables.items()}
+
+
+def test_every_point_gets_its_own_exact_equation() -> None:
+    result = pointwise(parabolas(), searching(), workers=Serial())
+    assert (result["status"] == 0).all()
+    coef = result["coef"].sel(equation="x")
+    expected = {"1": (1.0 + 100.0 * Z)[:, None] + 0.0 * R, "u": -50.0 * R + 0.0 * Z[:, None]}
+    for name in LIBRARY.names:
+        np.testing.assert_allclose(
+            coef.sel(term=name).transpose("z", "r"), expected.get(name, 0.0), rtol=1e-9
+        )
+    assert (result["n_terms"] == 2).all()
+    np.testing.assert_allclose(result["r2_test"], 1.0, rtol=1e-12)
+    np.testing.assert_array_equal(result["inclusion"].sel(term=["1", "u"]), 1.0)
+    np.testing.assert_array_equal(result["inclusion"].sel(term=["x", "w", "u*w"]), 0.0)
+
+
+def test_weights_are_shares_of_the_root_mean_square() -> None:
+    found = searching(formulation=Differential(split=RandomSplit(test_fraction=0.0)))
+    result = pointwise(parabolas(), found, workers=Serial()).isel(z=1, r=2, equation=0)
+    one, u = 1.0 + 100.0 * Z[1], -50.0 * R[2] * np.sqrt(np.square(T).mean())
+    weight = result["weight"].sel(term=["1", "u"]).values
+    np.testing.assert_allclose(weight, np.array([one, u]) / (one - u), rtol=1e-9)
+    np.testing.assert_allclose(np.abs(result["weight"]).sum(), 1.0)
+
+
+@pytest.mark.parametrize("formulation", [Differential(), Weak()], ids=["differential", "weak"])
+def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
+    draws = Bootstraps(n=8, n_culled=0)
+    search = searching(formulation=formulation, search=AdaptiveLasso(), bootstraps=draws)
+    field = noisy()
+    result = pointwise(field, search, workers=Serial()).isel(z=2, r=1)
+    run = point(field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"])
+    found = discover(
+        [run],
+        LIBRARY,
+        formulation=search.formulation,
+        search=search.search,
+        bootstraps=search.bootstraps,
+        selection=search.selection,
+        rng=np.random.default_rng(search.seed),
+    )
+    np.testing.assert_allclose(result["coef"].sel(equation="x"), found.model.coef[:, 0], rtol=1e-12)
+    chosen = found.chosen["x"]
+    assert result["r2_test"].item() == pytest.approx(chosen.r2_test)
+    inclusion = result["inclusion"].sel(equation="x", term=list(chosen.terms))
+    np.testing.assert_allclose(inclusion, chosen.inclusion)
+
+
+@pytest.mark.parametrize("axis", ["z", "r"])
+def test_a_field_may_have_one_axis(axis: str) -> None:
+    other = "r" if axis == "z" else "z"
+    line = parabolas().isel({other: 0}, drop=True)
+    whole = pointwise(parabolas(), searching(), workers=Serial())
+    result = pointwise(line, searching(), workers=Serial())
+    assert result["status"].dims == (axis,)
+    np.testing.assert_array_equal(result["coef"], whole["coef"].isel({other: 0}))
+
+
+def test_a_grid_may_be_one_point() -> None:
+    result = pointwise(parabolas(Z[:1], R[:1]), searching(), workers=Serial())
+    assert result["coef"].sel(term="u").item() == pytest.approx(-50.0 * R[0])
+
+
+@pytest.fixture
+def cluster() -> Iterator[LocalCluster]:
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        yield cluster
+
+
+@pytest.mark.parametrize("block_points", [1, 5, 1000])
+def test_blocks_do_not_show_in_the_result(block_points: int) -> None:
+    whole = pointwise(noisy(), searching(), workers=Serial(), block_points=4)
+    result = pointwise(noisy(), searching(), workers=Serial(), block_points=block_points)
+    assert bytes_of(result) == bytes_of(whole)
+
+
+def test_processes_give_the_same_bits() -> None:
+    serial = pointwise(noisy(), searching(), workers=Serial(), block_points=2)
+    assert bytes_of(
+        pointwise(noisy(), searching(), workers=Loky(n_jobs=2), block_points=2)
+    ) == bytes_of(serial)
+
+
+def test_a_cluster_gives_the_same_bits_even_if_a_worker_is_killed(cluster: LocalCluster) -> None:
+    serial = pointwise(noisy(), searching(), workers=Serial(), block_points=1)
+    pids = [worker.pid for worker in cluster.workers.values()]
+
+    def kill_one(_: int) -> None:
+        if pids:
+            os.kill(pids.pop(), signal.SIGKILL)
+            pids.clear()
+
+    spread = pointwise(
+        noisy(), searching(), workers=Dask(cluster.scheduler_address), block_points=1,
+        progress=kill_one,
+    )  # fmt: skip
+    assert bytes_of(spread) == bytes_of(serial)
+
+
+def test_what_cannot_be_fitted_is_flagged_and_never_zero() -> None:
+    field = parabolas()
+    x = field["x"].values.copy()
+    x[:, 0, 0] = np.nan
+    x[7, 0, 1] = np.nan
+    x[:, 0, 2] = 3.0 + 1e-4 * np.sin(T)
+    x[:, 1, 0] = 0.0
+    x[:, 1, 1] = 1e60 * np.sin(T)  # finite, but not to the sixth
+    field = field.assign(x=(field["x"].dims, x, field["x"].attrs))
+    library = named_terms(["x", "u", "w"], ["1", "x^6", "u"])
+    result = pointwise(field, searching(library=library), workers=Serial())
+    named = [[STATUSES[k] for k in row] for row in result["status"].values]
+    assert named[0] == ["no_plasma", "missing_samples", "too_little_variation"]
+    assert named[1] == ["too_little_variation", "no_fit", "fitted"]
+    for name in ("coef", "inclusion", "weight", "coef_draws", "r2_test", "n_terms"):
+        lost = np.isnan(result[name]).transpose(..., "z", "r").values
+        assert (lost == (result["status"].values != 0)).all()
+
+
+def test_masked_inputs_mask_the_point() -> None:
+    field = parabolas()
+    field = field.assign(w=field["w"].where(field["z"] > 0.015).assign_attrs(units="1"))
+    status = pointwise(field, searching(), workers=Serial())["status"]
+    assert (status.isel(z=0) == STATUSES.index("no_plasma")).all()
+    assert (status.isel(z=slice(1, None)) == 0).all()
+
+
+def test_a_setting_that_fits_nowhere_is_an_error() -> None:
+    few = searching(formulation=Differential(), library=LIBRARY)
+    short = parabolas().isel(time=slice(0, 8))
+    with pytest.raises(ValueError, match="no point could be fitted: smoothing needs at least 11"):
+        pointwise(short, few, workers=Serial())
+
+
+def test_units_of_coefficients_follow_the_field() -> None:
+    result = pointwise(parabolas(), searching(), workers=Serial())
+    assert result["coef_units"].sel(equation="x", term="u").item() == "m^-4"
+    assert result["coef_units"].sel(equation="x", term="x").item() == "s^-1"
+
+
+def test_a_broken_run_goes_on_with_its_finished_blocks(tmp_path: Path) -> None:
+    kept, done = Kept(tmp_path / "blocks"), []
+
+    def stop_after_three(n_points: int) -> None:
+        done.append(n_points)
+        if len(done) == 3:
+            raise KeyboardInterrupt
+
+    def run(progress: object) -> xr.Dataset:
+        return pointwise(
+            noisy(), searching(), workers=Serial(), kept=kept, block_points=2, progress=progress
+        )
+
+    with pytest.raises(KeyboardInterrupt):
+        run(stop_after_three)
+    finished = {path: path.stat().st_mtime_ns for path in kept.folder.iterdir()}
+    assert len(finished) == 3
+    result = run(lambda n_points: None)
+    assert {path: path.stat().st_mtime_ns for path in finished} == finished
+    undisturbed = pointwise(noisy(), searching(), workers=Serial(), block_points=2)
+    assert bytes_of(result) == bytes_of(undisturbed)
+    kept.clear()
+    assert not kept.folder.exists()
+
+
+def test_a_damaged_block_is_computed_again(tmp_path: Path) -> None:
+    kept = Kept(tmp_path)
+    first = pointwise(noisy(), searching(), workers=Serial(), kept=kept, block_points=6)
+    paths = sorted(tmp_path.iterdir())
+    paths[0].write_bytes(paths[0].read_bytes()[:1000])
+    paths[1].write_bytes(b"")
+    again = pointwise(noisy(), searching(), workers=Serial(), kept=kept, block_points=6)
+    assert bytes_of(again) == bytes_of(first)
+
+
+def test_a_full_disk_keeps_the_blocks_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, n_written = np.savez, []
+
+    def full_after_two(path: Path, **arrays: np.ndarray) -> None:
+        if len(n_written) == 2:
+            path.write_bytes(b"half of the b")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        n_written.append(path)
+        write(path, **arrays)
+
+    monkeypatch.setattr(np, "savez", full_after_two)
+    with pytest.raises(OSError, match=r"No space left on device.*blocks before it are kept"):
+        pointwise(noisy(), searching(), workers=Serial(), kept=Kept(tmp_path), block_points=2)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["z0-1_r0-2.npz", "z0-1_r2-3.npz"]
+
+
+def test_blocks_cover_the_grid_once() -> None:
+    field = parabolas()
+    for n_points in range(1, 14):
+        seen = np.zeros((len(Z), len(R)), dtype=np.int64)
+        for block in blocks_of(field, n_points):
+            seen[block.slices["z"], block.slices["r"]] += 1
+            assert block.n_points <= n_points
+        assert (seen == 1).all()
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    field = parabolas()
+    with pytest.raises(ValueError, match=r"unknown variables \['w'\]; this field has"):
+        pointwise(field.drop_vars("w"), searching(), workers=Serial())
+    with pytest.raises(ValueError, match="needs a grid: this field has time alone"):
+        pointwise(field.isel(z=0, r=0, drop=True), searching(), workers=Serial())
+    with pytest.raises(ValueError, match="block_points=0 came"):
+        pointwise(field, searching(), workers=Serial(), block_points=0)
+    with pytest.raises(ValueError, match="needs bootstraps for its spread: n=0"):
+        searching(bootstraps=Bootstraps(n=0))
+    with pytest.raises(ValueError, match=r"least_variation must lie in \[0, 1\)"):
+        searching(least_variation=1.0)
+    with pytest.raises(ValueError, match=r"states must depend on time: \['x'\] do not"):
+        pointwise(field.assign(x=field["x"].isel(time=0, drop=True)), searching(), workers=Serial())
+
+
+def test_rules_that_need_all_fronts_serve_every_point() -> None:
+    result = pointwise(parabolas(), searching(selection=Knee()), workers=Serial())
+    assert (result["n_terms"] >= 1).all()
