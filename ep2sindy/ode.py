@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -140,6 +140,14 @@ class ODE(nn.Module):
 def unconstrained(model: SparseModel) -> Constraint:
     """Every coefficient of a model that is not zero, each free."""
     return build_constraint(model.library, {s: tuple(model.terms(s)) for s in model.states})
+
+
+def held(model: SparseModel) -> Constraint:
+    """Every coefficient of a model that is not zero, none of them free."""
+    every = unconstrained(model)
+    values = _coef(model, every)
+    nothing = np.empty(0, dtype=np.int64)
+    return replace(every, C=np.empty((len(values), 0)), d=values, free=nothing)
 
 
 def _coef(model: SparseModel, relations: Constraint) -> np.ndarray:

@@ -97,11 +97,12 @@ def refine_many(
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
 ) -> list[Refinement]:
-    """Refine models of one structure, each on trajectories of its own; as `refine` for the rest.
+    """Refine models of the same states, each on trajectories of its own; as `refine` for the rest.
 
     points_per_batch: points integrated together, few enough to stay in the processor's cache;
     on a GPU, thousands. A point that has converged leaves its batch.
-    Raises ValueError if the models differ in their terms or the windows in their number.
+    Models may differ in their terms; those of a batch all cost what the largest does.
+    Raises ValueError if the models differ in their variables or the windows in their number.
     """
     found: list[Refinement] = []
     for first in range(0, len(models), points_per_batch):
@@ -217,7 +218,7 @@ def _result(
     refined = replace(model, covariance=None)
     if finite:
         with torch.no_grad():
-            ode.scaling.copy_(torch.tensor(fit.scaling[point]))
+            ode.scaling.copy_(torch.tensor(fit.scaling[point, : len(ode.free0)]))
             values = ode.coef.cpu().numpy()
         refined, order = with_coef(model, constraint, values)
         by_scaling = (constraint.C * ode.free0.cpu().numpy())[order]

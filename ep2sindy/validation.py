@@ -178,45 +178,27 @@ class IntegralScore:
         """Raises ValueError for rows without trajectories, a state without a front, or more than
         max_combinations.
         """
-        places = _combinations(fronts, self.max_combinations)
-        errors, n_independent = self._errors(fronts, places)
-        means = errors.mean(axis=1)
-        limit = _within_one_error(errors, n_independent)
-        n_terms = sum(f.sizes[k] for f, k in zip(fronts, places.T, strict=True))
-        winner = np.lexsort((means, n_terms, means > limit))[0]
-        scores = np.maximum(means, limit)
-        scores[winner] = np.nextafter(limit, 0.0)
-        return [
-            np.array([scores[column == k].min() for k in range(len(front.candidates))])
-            for front, column in zip(fronts, places.T, strict=True)
-        ]
-
-    def _errors(
-        self, fronts: Sequence[ParetoFront], places: Int[np.ndarray, "combinations fronts"]
-    ) -> tuple[Float[np.ndarray, "combinations windows"], float]:
-        """Error of every combination on every window; how many windows would not overlap."""
-        runs, states = _runs_of(fronts), [front.equation for front in fronts]
-        smoothed = [KalmanSmoother().smooth(run.t, run.columns(states)) for run in runs]
-        spread = np.concatenate(smoothed).std(axis=0)
-        centre = np.concatenate(smoothed).mean(axis=0)
-        window_s = self.window_s or _half_period(runs, smoothed)
-        ensemble = _ensemble(fronts, places)
-        n_samples = sum(run.n_samples for run in runs)
-        errors, n_independent = [], 0.0
-        for run, x in zip(runs, smoothed, strict=True):
+        places = combinations(fronts, self.max_combinations)
+        records = records_of(fronts)
+        window_s = self.window_s or _half_period(records)
+        n_samples = sum(run.n_samples for run in records.runs)
+        lengths, starts, n_independent = [], [], 0.0
+        for run in records.runs:
             n_steps = int(np.clip(round(window_s / run.dt_s), 1, run.n_samples - 1))
             n_windows = max(1, round(self.n_windows * run.n_samples / n_samples))
             last = run.n_samples - 1 - n_steps
-            starts = np.unique(np.linspace(0, last, n_windows).round().astype(np.int64))
-            windows = DrivenWindows.of(run, x, states, ensemble.inputs, starts, n_steps)
-            errors.append(ensemble.errors(windows, centre=centre, spread=spread))
-            n_independent += min(len(starts), (run.n_samples - 1) / n_steps)
-        return np.concatenate(errors, axis=1), n_independent
+            starts.append(np.unique(np.linspace(0, last, n_windows).round().astype(np.int64)))
+            lengths.append(n_steps)
+            n_independent += min(len(starts[-1]), (run.n_samples - 1) / n_steps)
+        errors = records.errors(ensemble_of(fronts, places), starts, lengths)
+        limit = _within_one_error(errors, n_independent)
+        return joint_scores(fronts, places, errors.mean(axis=1), limit=limit)
 
 
-def _combinations(
+def combinations(
     fronts: Sequence[ParetoFront], most: int
 ) -> Int[np.ndarray, "combinations fronts"]:
+    """Every choice of one candidate per front, by index. Raises ValueError for more than `most`."""
     counts = [len(front.candidates) for front in fronts]
     if prod(counts) > most:
         raise ValueError(
@@ -226,7 +208,7 @@ def _combinations(
     return np.indices(counts).reshape(len(counts), -1).T
 
 
-def _ensemble(
+def ensemble_of(
     fronts: Sequence[ParetoFront], places: Int[np.ndarray, "combinations fronts"]
 ) -> Ensemble:
     """One model per combination, its states in the order of the fronts."""
@@ -238,7 +220,39 @@ def _ensemble(
     return Ensemble(library, [front.equation for front in fronts], np.stack(coef, axis=1))
 
 
-def _runs_of(fronts: Sequence[ParetoFront]) -> Sequence[Trajectory]:
+@dataclass(frozen=True, eq=False)
+class Records:
+    """The trajectories that equations are judged by, and their states smoothed."""
+
+    runs: Sequence[Trajectory]
+    smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
+
+    def errors(
+        self,
+        ensemble: Ensemble,
+        starts: Sequence[Int[np.ndarray, " _"]],
+        n_steps: Sequence[int],
+    ) -> Float[np.ndarray, "models windows"]:
+        """Error of every model on every window of every run, started from its smoothed sample.
+
+        starts, n_steps: one per run, in samples. The error is that of `Ensemble.errors`, in
+        variances of the smoothed states.
+        """
+        joined = np.concatenate(self.smoothed)
+        centre, spread = joined.mean(axis=0), joined.std(axis=0)
+        errors = []
+        for run, x, at, n in zip(self.runs, self.smoothed, starts, n_steps, strict=True):
+            if at.size:
+                windows = DrivenWindows.of(run, x, ensemble.states, ensemble.inputs, at, n)
+                errors.append(ensemble.errors(windows, centre=centre, spread=spread))
+        return np.concatenate(errors, axis=1)
+
+
+def records_of(fronts: Sequence[ParetoFront]) -> Records:
+    """What stands behind the rows, states in the order of the fronts.
+
+    Raises ValueError for rows without trajectories or a state without a front.
+    """
     runs = fronts[0].problem.trajectories
     if not runs:
         raise ValueError(
@@ -251,11 +265,35 @@ def _runs_of(fronts: Sequence[ParetoFront]) -> Sequence[Trajectory]:
             f"to integrate, every state needs one front: {equations} came for the states "
             f"{list(runs[0].state_names)}"
         )
-    return runs
+    return Records(runs, [KalmanSmoother().smooth(run.t, run.columns(equations)) for run in runs])
 
 
-def _half_period(runs: Sequence[Trajectory], smoothed: Sequence[np.ndarray]) -> float:
+def joint_scores(
+    fronts: Sequence[ParetoFront],
+    places: Int[np.ndarray, "combinations fronts"],
+    errors: Float[np.ndarray, " combinations"],
+    *,
+    limit: float,
+) -> list[Float[np.ndarray, " candidates"]]:
+    """Scores of candidates from the errors of their combinations.
+
+    limit: errors up to there cannot be told from the least; of these the combination of fewest
+    terms wins. A candidate's score is the least error of all combinations with it, no less than
+    the limit; the winner's are a hair below.
+    """
+    n_terms = sum(f.sizes[k] for f, k in zip(fronts, places.T, strict=True))
+    winner = np.lexsort((errors, n_terms, errors > limit))[0]
+    scores = np.maximum(errors, limit)
+    scores[winner] = np.nextafter(limit, 0.0)
+    return [
+        np.array([scores[column == k].min() for k in range(len(front.candidates))])
+        for front, column in zip(fronts, places.T, strict=True)
+    ]
+
+
+def _half_period(records: Records) -> float:
     """Half the dominant period of the first state in the longest trajectory, or all of it."""
-    run, x = max(zip(runs, smoothed, strict=True), key=lambda pair: np.ptp(pair[0].t))
+    pairs = zip(records.runs, records.smoothed, strict=True)
+    run, x = max(pairs, key=lambda pair: np.ptp(pair[0].t))
     frequency_Hz = dominant_frequency(run.t, x[:, 0])
     return 0.5 / frequency_Hz if frequency_Hz > 0.0 else float(np.ptp(run.t))

@@ -46,6 +46,7 @@ ORDER = [
     "ode",
     "integral",
     "refine",
+    "together",
     "refined_score",
     "correction",
     "estimators",

@@ -12,7 +12,7 @@ from ep2sindy.constraints import constraint
 from ep2sindy.integral.batch import cut_windows, dominant_window
 from ep2sindy.integral.descent import GradientDescent, NelderMead
 from ep2sindy.integral.multiple_shooting import MultipleShooting
-from ep2sindy.integral.problem import Iteration
+from ep2sindy.integral.problem import Iteration, Method
 from ep2sindy.integral.single_shooting import SingleShooting
 from ep2sindy.integral.steps import HermiteSimpson, RungeKutta
 from ep2sindy.library import named_terms
@@ -285,6 +285,39 @@ def test_points_refined_together_are_those_refined_alone() -> None:
         assert one.status == other.status == "converged"
         assert len(one.history) == len(other.history)
         np.testing.assert_allclose(one.model.coef, other.model.coef, rtol=1e-10)
+
+
+@pytest.mark.parametrize("method", [MultipleShooting(), SingleShooting()])
+def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Method) -> None:
+    rng = np.random.default_rng(0)
+    library = PREY.model.library
+    terms = [PREY.model.terms(state) for state in PREY.model.states]
+    wider = [terms[0] | {"x^2": 0.01}, terms[1] | {"1": 0.01, "y^2": -0.01}]
+    models = [SparseModel(library, ["x", "y"], coef_matrix(library, t)) for t in (wider, terms)]
+    data = [[noisy(PREY, 0.05, rng)]] * 2
+    settings = {"window": 60, "n_windows": 8, "method": method}
+    together = refine_many(models, data, rng=np.random.default_rng(1), **settings)
+    alone = refine_many(models, data, points_per_batch=1, rng=np.random.default_rng(1), **settings)
+    for one, other in zip(together, alone, strict=True):
+        assert one.status == other.status
+        np.testing.assert_allclose(one.model.coef, other.model.coef, rtol=1e-6)
+        np.testing.assert_allclose(one.model.covariance, other.model.covariance, rtol=1e-4)
+        np.testing.assert_allclose(one.covariance_naive, other.covariance_naive, rtol=1e-4)
+        assert len(one.history[-1].scaling) == np.count_nonzero(one.model.coef)
+    assert together[1].status == "converged"
+
+
+def test_models_of_different_states_are_refused_in_one_batch() -> None:
+    library = named_terms(["x", "y"], ["x", "y"])
+    coef = -np.ones((2, 1))
+    models = [SparseModel(library, [state], coef) for state in ("x", "y")]
+    run = clean(PREY)
+    data = [
+        [Trajectory(run.t, run.columns([a]), [a], run.columns([b]), [b])]
+        for a, b in (("x", "y"), ("y", "x"))
+    ]
+    with pytest.raises(ValueError, match="must share their states and inputs"):
+        refine_many(models, data, window=50, rng=np.random.default_rng(0))
 
 
 def test_bad_input_is_refused() -> None:

@@ -18,6 +18,7 @@ from ep2sindy.integral.shots import least_change, step_maps
 FLAT = 0.95  # share of the loss of a constant from which on a model follows nothing
 WIDE = 0.5  # standard error, relative to the coefficient: its 95 % interval reaches zero
 CLOSED = 1e-9  # largest gap, in std, between the steps of one trajectory
+CLOSING_STEPS = 10  # of Newton's method, until the gaps are
 # A step counts as fine enough when the bias it leaves in a scaling is below either of these.
 BIAS_PER_ERROR, LEAST_BIAS = 0.1, 1e-4
 # A fit counts as stationary when one more Gauss-Newton step would gain less than this share of
@@ -56,7 +57,7 @@ def integrated(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
     start = np.zeros((*nodes.shape[:2], 1, nodes.shape[-1]))
     still = np.zeros_like(fit.scaling)
     open_points = points
-    for _ in range(10):
+    for _ in range(CLOSING_STEPS):
         maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
         with np.errstate(invalid="ignore", over="ignore"):
             gaps = np.abs(maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2)).max(axis=(1, 2, 3))
@@ -73,6 +74,26 @@ def integrated(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
         maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
     finite &= np.isfinite(maps).all(axis=(1, 2, 3, 4))
     return replace(fit, nodes=nodes, finite=finite), maps
+
+
+def closed(problem: Problem, fit: Fit) -> np.ndarray:
+    """Trajectories from the fitted starts, as `integrated` closes them, window by window.
+
+    Returns (points, windows, samples, n_states), NaN in windows that do not close.
+    """
+    nodes, points = fit.nodes.copy(), np.arange(len(fit.nodes))
+    start = np.zeros((*nodes.shape[:2], 1, nodes.shape[-1]))
+    for _ in range(CLOSING_STEPS):
+        maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
+        with np.errstate(invalid="ignore", over="ignore"):
+            gaps = np.abs(maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2)).max(axis=(1, 3))
+        is_open = np.isfinite(gaps) & ~(gaps < CLOSED)
+        if not is_open.any():
+            break
+        change = propagate(maps, nodes, start, np.zeros_like(fit.scaling), nodes.shape[2])
+        nodes[is_open] += change[is_open]
+    nodes[~(gaps < CLOSED)] = np.nan
+    return nodes
 
 
 def rollout(problem: Problem, fit: Fit, *, n_substeps: int = 4) -> np.ndarray:
@@ -116,7 +137,8 @@ def covariances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sandwich with windows as clusters, and the naive s^2 H^-1, of the scalings.
 
-    triangles: (windows, free + 1, free + 1), each window's R with its start eliminated.
+    triangles: (windows, rows, free + 1), each window's R with its start eliminated, the residual
+    that nothing can mend in the last row.
     Residuals of a cluster are those that the other clusters leave (CR3, the jackknife), and the
     quantile of Student's t for their number is put into the covariance. Overlapping windows share
     noise: their scores count together, the less the farther apart. With too few windows for
@@ -126,7 +148,7 @@ def covariances(
     doi:10.2307/1913610 for the weights.
     """
     jacobian, z = triangles[:, :-1, :-1], triangles[:, :-1, -1]
-    n_windows, n_free, _ = jacobian.shape
+    n_windows, n_rows, n_free = jacobian.shape
     inverse = np.linalg.pinv(np.linalg.qr(jacobian.reshape(-1, n_free), mode="r"), rcond=1e-12)
     bread = inverse @ inverse.T
     naive = np.square(triangles[..., -1]).sum() / n_residuals * bread * batch.multiplicity
@@ -134,7 +156,7 @@ def covariances(
         return naive, naive
     leverage = jacobian @ bread @ jacobian.transpose(0, 2, 1)
     # The share keeps a window that alone fixes a direction from dividing by zero.
-    freed = np.linalg.solve((1.0 + 1e-6) * np.eye(n_free) - leverage, z[..., None])
+    freed = np.linalg.solve((1.0 + 1e-6) * np.eye(n_rows) - leverage, z[..., None])
     scores = (jacobian.transpose(0, 2, 1) @ freed)[..., 0]
     window = batch.data.shape[1]
     apart = np.abs(batch.start[:, None] - batch.start) / (2.0 * window)
@@ -159,14 +181,19 @@ def judge(problem: Problem, fit: Fit) -> tuple[Fit, list[Verdict]]:
     bias = step_bias(problem, fit, sound)
     step = least_change(condensed[:, :, None])
     verdicts = []
-    for p, batch in enumerate(problem.batches):
-        residual = np.square(fit.nodes[p] - problem.data[p])
-        n_residuals = residual.size - n_start * len(residual) - fit.scaling.shape[1]
-        robust, naive = covariances(condensed[p], batch, n_residuals=max(n_residuals, 1))
-        verdict = Verdict("converged", residual.mean(axis=(1, 2)), robust, naive, bias[p])
-        gain = np.square(condensed[p, :, :-1, :-1] @ step[p]).sum()
-        share = gain / max(np.square(condensed[p, ..., -1]).sum(), 1e-300)
-        relative = np.abs(step[p] / fit.scaling[p]).max() if fit.scaling[p].all() else np.inf
+    for p, (ode, batch) in enumerate(zip(problem.odes, problem.batches, strict=True)):
+        n_free = len(ode.free0)
+        scaling, own = fit.scaling[p, :n_free], np.append(np.arange(n_free), -1)
+        with np.errstate(invalid="ignore", over="ignore"):
+            residual = np.square(fit.nodes[p] - problem.data[p])
+        n_residuals = residual.size - n_start * len(residual) - n_free
+        triangles = condensed[p][..., own]
+        robust, naive = covariances(triangles, batch, n_residuals=max(n_residuals, 1))
+        losses = residual.mean(axis=(1, 2))
+        verdict = Verdict("converged", losses, robust, naive, bias[p, :n_free])
+        gain = np.square(triangles[..., :-1] @ step[p, :n_free]).sum()
+        share = gain / max(np.square(triangles[..., -1]).sum(), 1e-300)
+        relative = np.abs(step[p, :n_free] / scaling).max() if scaling.all() else np.inf
         stationary = bool(min(share, relative) < STATIONARY)
         verdicts.append(replace(verdict, status=_status(problem, fit, p, verdict, stationary)))
     return fit, verdicts
@@ -182,10 +209,11 @@ def _status(problem: Problem, fit: Fit, p: int, verdict: Verdict, stationary: bo
     if loss > FLAT * np.square(data - level).mean():
         return "flat"
     error = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
-    if (~(error < WIDE * np.abs(fit.scaling[p]))).any():
+    scaling = fit.scaling[p, : len(error)]
+    if (~(error < WIDE * np.abs(scaling))).any():
         return "unidentifiable"
     if not (fit.finished[p] and stationary):
         return "max_iter"
-    if is_coarse(verdict.bias, verdict.covariance, fit.scaling[p]):
+    if is_coarse(verdict.bias, verdict.covariance, scaling):
         return "coarse_step"
     return "converged"

@@ -107,7 +107,7 @@ class MultipleShooting:
             scaling[active] += share[:, None] * change
             nodes[active] += share[:, None, None, None] * moved
             size = np.maximum(np.abs(scaling[active]), 1e-3)
-            relative = np.abs(change / size).max(axis=1)
+            relative = np.abs(change / size).max(axis=1, initial=0.0)
             finished[active] = (share == 1.0) & (relative < tolerance) & (defect < tolerance)
             for i, point in enumerate(active):
                 problem.observe(
@@ -115,7 +115,7 @@ class MultipleShooting:
                         point=int(point),
                         block=block,
                         loss=float(np.square(nodes[point] - problem.data[point]).mean()),
-                        scaling=scaling[point].copy(),
+                        scaling=scaling[point, : len(problem.odes[point].free0)].copy(),
                         step=float(relative[i]),
                         defect=float(defect[i]),
                     )
@@ -129,7 +129,8 @@ class MultipleShooting:
         by_scaling = np.abs(change) / (self.limit * np.maximum(np.abs(scaling), 1.0))
         reach = np.ptp(data, axis=(1, 2))
         by_node = np.abs(moved).max(axis=(1, 2)) / reach
-        return 1.0 / np.maximum(1.0, np.maximum(by_scaling.max(axis=1), by_node.max(axis=1)))
+        largest = np.maximum(by_scaling.max(axis=1, initial=0.0), by_node.max(axis=1))
+        return 1.0 / np.maximum(1.0, largest)
 
 
 def _kept(before: Fit, after: Fit, data: np.ndarray) -> Fit:

@@ -36,7 +36,7 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Models of one structure, a batch of windows for each, on one device.
+    """Models of the same states, a batch of windows for each, on one device.
 
     free_start: each window's initial state is fitted too; else it is the data's.
     n_reweights: passes of weights 1/std of the residuals, after weights 1/std of the data.
@@ -58,7 +58,8 @@ class Problem:
 
     @property
     def n_free(self) -> int:
-        return len(self.odes[0].free0)
+        """Of the model that has the most; scalings beyond a model's own move nothing."""
+        return max(len(ode.free0) for ode in self.odes)
 
     @property
     def device(self) -> torch.device:
@@ -94,8 +95,9 @@ class Problem:
 class Fit:
     """Where a method ended, point by point, before anybody judges it.
 
-    nodes: the fitted trajectories at the samples, in std. weights: last used. finished: the
-    method's own test was met. finite: False where it never was. step: the map of nodes to nodes.
+    scaling: ones beyond a model's own. nodes: the fitted trajectories at the samples, in std.
+    weights: last used. finished: the method's own test was met. finite: False where it never was.
+    step: the map of nodes to nodes.
     """
 
     scaling: Float[np.ndarray, "points free"]
@@ -138,8 +140,12 @@ def single(problem: Problem, point: int) -> Problem:
 
 def joined(fits: Sequence[Fit]) -> Fit:
     """Fits of single points, by one step, as one."""
+    n_free = max(fit.scaling.shape[1] for fit in fits)
+    scaling = np.ones((len(fits), n_free))
+    for fit, row in zip(fits, scaling, strict=True):
+        row[: fit.scaling.shape[1]] = fit.scaling[0]
     return Fit(
-        scaling=np.concatenate([fit.scaling for fit in fits]),
+        scaling=scaling,
         nodes=np.concatenate([fit.nodes for fit in fits]),
         weights=np.concatenate([fit.weights for fit in fits]),
         finished=np.concatenate([fit.finished for fit in fits]),

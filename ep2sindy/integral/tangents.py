@@ -1,4 +1,4 @@
-"""Right-hand sides with forward sensitivities, for many models of one structure in one batch."""
+"""Right-hand sides with forward sensitivities, for many models of the same states in one batch."""
 
 from __future__ import annotations
 
@@ -87,42 +87,50 @@ class Augmented:
 
 
 def augmented(odes: Sequence[ODE]) -> Augmented:
-    """Modules of one structure as one batch of points, on the device of the first.
+    """Modules of the same variables as one batch of points, on the device of the first.
 
-    Raises ValueError for modules that differ in terms or variables, or hold a correction, whose
+    Terms may differ: monomials are those that any module needs, and columns of zeros stand for
+    the scalings that a module has fewer of than the others.
+    Raises ValueError for modules that differ in variables, or hold a correction, whose
     derivatives only autograd knows.
     """
     first = odes[0]
     if any(ode.correction is not None for ode in odes):
         raise ValueError("a learned correction has no tangents here; refine by GradientDescent")
-    if any(
-        ode.library.names != first.library.names or ode.C.shape != first.C.shape for ode in odes
-    ):
-        raise ValueError("models refined in one batch must share their terms and constraints")
-    exponents, transfer, direct = _monomials(first.library.exponents, first.n_states)
+    if any((ode.variables, ode.n_states) != (first.variables, first.n_states) for ode in odes):
+        raise ValueError(
+            "models refined in one batch must share their states and inputs: "
+            f"{sorted({ode.variables for ode in odes})} came"
+        )
+    n, n_free = first.n_states, max(len(ode.free0) for ode in odes)
+    terms = np.unique(np.concatenate([ode.library.exponents for ode in odes]), axis=0)
+    exponents, transfer = _monomials(terms, n)
+    place = {row.tobytes(): k for k, row in enumerate(terms)}
+    size = (len(odes), n, 1 + n + n_free, len(exponents))
+    basis, offset = np.zeros((*size, n_free)), np.zeros(size)
+    for ode, by_point, fixed_point in zip(odes, basis, offset, strict=True):
+        with torch.no_grad():
+            by_scaling, fixed = (part.cpu().numpy() for part in ode.linear_parts())
+        spread = transfer[[place[row.tobytes()] for row in ode.library.exponents]]
+        own = by_scaling.shape[-1]
+        by_point[:, : 1 + n, :, :own] = np.einsum("tcm,tji->jcmi", spread, by_scaling)
+        fixed_point[:, : 1 + n] = np.einsum("tcm,tj->jcm", spread, fixed)
+        fixed_point[:, 1 + n : 1 + n + own] = np.einsum("tm,tji->jim", spread[:, 0], by_scaling)
     device = first.C.device
-    spread = torch.tensor(transfer, device=device)
-    unmixed = torch.tensor(direct, device=device)
-    n, n_free = first.n_states, len(first.free0)
-    bases, offsets = [], []
-    with torch.no_grad():
-        for ode in odes:
-            by_scaling, fixed = ode.linear_parts()
-            basis = torch.einsum("tcm,tji->jcmi", spread, by_scaling)
-            offset = torch.einsum("tcm,tj->jcm", spread, fixed)
-            by_free = torch.einsum("tm,tji->jim", unmixed, by_scaling)
-            none = basis.new_zeros((n, n_free, basis.shape[2], n_free))
-            bases.append(torch.cat([basis, none], dim=1).flatten(0, 1))
-            offsets.append(torch.cat([offset, by_free], dim=1).flatten(0, 1))
     factors = torch.tensor(Library(first.variables, exponents).factors.T, device=device)
-    return Augmented(factors.contiguous(), torch.stack(bases), torch.stack(offsets), n)
+    return Augmented(
+        factors=factors.contiguous(),
+        basis=torch.tensor(basis, device=device).flatten(1, 2),
+        offset=torch.tensor(offset, device=device).flatten(1, 2),
+        n_states=n,
+    )
 
 
-def _monomials(exponents: np.ndarray, n_states: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _monomials(exponents: np.ndarray, n_states: int) -> tuple[np.ndarray, np.ndarray]:
     """Distinct monomials of all terms and of their derivatives by the states.
 
-    Returns their exponents, (terms, 1 + n_states, monomials): each term and its derivatives in
-    these monomials, and (terms, monomials): the terms alone.
+    Returns their exponents, and (terms, 1 + n_states, monomials): each term and its derivatives
+    in these monomials.
     """
     lowered = [exponents]
     for v in range(n_states):
@@ -133,5 +141,4 @@ def _monomials(exponents: np.ndarray, n_states: int) -> tuple[np.ndarray, np.nda
     factors = np.ones(stacked.shape[:2])
     factors[:, 1:] = exponents[:, :n_states]
     kept = np.unique(stacked[factors != 0.0], axis=0)
-    transfer = (stacked[:, :, None] == kept).all(axis=-1) * factors[..., None]
-    return kept, transfer, transfer[:, 0]
+    return kept, (stacked[:, :, None] == kept).all(axis=-1) * factors[..., None]

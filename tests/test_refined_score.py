@@ -1,0 +1,279 @@
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ep2sindy import refined_score
+from ep2sindy.ensemble import MAX_ERROR, Ensemble
+from ep2sindy.integral.batch import WindowBatch, cut_windows
+from ep2sindy.integral.multiple_shooting import MultipleShooting
+from ep2sindy.library import Library, polynomial
+from ep2sindy.model import SparseModel, coef_matrix
+from ep2sindy.pareto import Candidate, ParetoFront
+from ep2sindy.refined_score import RefinedScore, _refined
+from ep2sindy.regression import Regression
+from ep2sindy.selection import FLOOR, Selection, selected
+from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra
+from ep2sindy.together import follow_together, refine_together
+from ep2sindy.trajectory import Trajectory
+from ep2sindy.validation import IntegralScore
+
+PREY = lotka_volterra()
+Terms = dict[str, float]
+# The limit of what follows exactly: two standard errors of one residual above the floor.
+EXACT = 17.0 * FLOOR
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Batches this small only wait for each other."""
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+def fronts_of(
+    runs: list[Trajectory], library: Library, choices: dict[str, list[Terms]]
+) -> list[ParetoFront]:
+    """One front per equation, of given candidates after the empty one."""
+    values = np.concatenate([run.columns(library.variables) for run in runs])
+    problem = Regression(
+        theta=library.evaluate(values),
+        target=np.concatenate([run.states for run in runs]),
+        library=library,
+        equations=runs[0].state_names,
+        groups=np.arange(len(values)),
+        test=np.zeros(len(values), dtype=np.bool_),
+        trajectories=tuple(runs),
+    )
+    fronts = []
+    for equation, given in choices.items():
+        candidates = [
+            Candidate(
+                equation,
+                tuple(coef),
+                np.array(list(coef.values())),
+                1.0 - 0.1**k,
+                np.nan,
+                1.0,
+                np.ones(len(coef)),
+            )
+            for k, coef in enumerate([{}, *sorted(given, key=len)])
+        ]
+        fronts.append(ParetoFront(equation, candidates, problem))
+    return fronts
+
+
+def picked(rule: Selection, fronts: list[ParetoFront]) -> list[set[str]]:
+    scores = rule.scores(fronts)
+    return [set(selected(f, s).terms) for f, s in zip(fronts, scores, strict=True)]
+
+
+def supports(system: System) -> list[set[str]]:
+    return [set(system.model.terms(s)) for s in system.model.states]
+
+
+def next_to_truth(system: System, wrong: dict[str, list[Terms]]) -> dict[str, list[Terms]]:
+    return {s: [system.model.terms(s), *wrong[s]] for s in system.model.states}
+
+
+WRONG = {
+    # One term short, another wrong, one too many.
+    "Lotka-Volterra": {
+        "x": [{"x*y": -0.5}, {"x": 0.66, "x*y": -1.0, "x^2": 0.003}],
+        "y": [{"x*y": 0.4}, {"y": -0.3, "x*y": 1.0, "y^2": 0.01}],
+    },
+    "Lorenz": {
+        "x": [],
+        "y": [{"x": 26.5, "x*z": -0.97}, {"x": 28.0, "y": -1.0, "x*z": -1.0, "z": 1e-3}],
+        "z": [],
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("system", "n_samples"), [(PREY, 600), (lorenz(), 600)], ids=["prey", "Lorenz"]
+)
+def test_the_truth_is_selected_from_exact_samples(system: System, n_samples: int) -> None:
+    run = system.trajectory().window(0, n_samples)
+    fronts = fronts_of([run], system.model.library, next_to_truth(system, WRONG[system.name]))
+    found = RefinedScore().scores(fronts)
+    chosen = [selected(f, scores) for f, scores in zip(fronts, found, strict=True)]
+    assert [set(c.terms) for c in chosen] == supports(system)
+    assert max(scores.min() for scores in found) <= EXACT
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_biased_coefficients_of_the_truth_are_mended(noise: float) -> None:
+    # Unrefined, a needless term with good coefficients beats the truth with poor ones.
+    run = PREY.trajectory(noise=noise, rng=np.random.default_rng(0))
+    poor = {
+        s: {name: c * (1.0 + 0.2 * (-1) ** k) for k, (name, c) in enumerate(terms.items())}
+        for s, terms in ((s, PREY.model.terms(s)) for s in PREY.model.states)
+    }
+    good = {s: PREY.model.terms(s) | {"1": 1e-4} for s in PREY.model.states}
+    fronts = fronts_of([run], PREY.model.library, {s: [poor[s], good[s]] for s in poor})
+    assert picked(IntegralScore(), fronts) == [set(good[s]) for s in good]
+    assert picked(RefinedScore(), fronts) == supports(PREY)
+
+
+def test_equations_without_terms_take_part_and_can_win() -> None:
+    t = np.linspace(0.0, 6.0, 300)
+    rng = np.random.default_rng(0)
+    states = np.stack([np.ones(300), np.exp(-t)], axis=1) + 0.02 * rng.standard_normal((300, 2))
+    run = Trajectory(t, states, ["x", "y"])
+    choices = {"x": [{"x": 0.01}], "y": [{"y": -0.8}]}
+    fronts = fronts_of([run], polynomial(["x", "y"], degree=1), choices)
+    assert picked(RefinedScore(), fronts) == [set(), {"y"}]
+    nothing = fronts_of([run], polynomial(["x", "y"], degree=1), {"x": [], "y": []})
+    x, y = RefinedScore(window_s=1.0).scores(nothing)
+    assert x == y
+    assert 0.0 < float(x[0]) < MAX_ERROR
+
+
+def test_inputs_drive_the_refinement() -> None:
+    # x' = u - x with u = 2 cos t: x = cos t + sin t; samples at unequal steps.
+    t = np.sort(np.random.default_rng(0).uniform(0.0, 30.0, 600))
+    run = Trajectory(t, (np.cos(t) + np.sin(t))[:, None], ["x"], 2.0 * np.cos(t)[:, None], ["u"])
+    choices = {"x": [{"u": 1.0}, {"u": 0.7, "x": -1.2}]}
+    library = polynomial(["u", "x"], degree=1)  # the library's order is its own
+    assert picked(RefinedScore(), fronts_of([run], library, choices)) == [{"u", "x"}]
+
+
+def test_units_do_not_matter_to_the_refined_score() -> None:
+    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1))
+    library, choices = PREY.model.library, next_to_truth(PREY, WRONG["Lotka-Volterra"])
+    degree = dict(zip(library.names, library.exponents.sum(axis=1), strict=True))
+    dense = Trajectory(run.t * 1e-6, run.states * 1e18, run.state_names)
+    converted = {
+        s: [{n: c * 1e6 * 1e18 ** (1.0 - degree[n]) for n, c in terms.items()} for terms in given]
+        for s, given in choices.items()
+    }
+    plain = RefinedScore().scores(fronts_of([run], library, choices))
+    scaled = RefinedScore().scores(fronts_of([dense], library, converted))
+    for a, b in zip(plain, scaled, strict=True):
+        assert b == pytest.approx(a, rel=1e-4)
+
+
+def test_a_combination_that_diverges_gets_the_largest_error() -> None:
+    system = damped_oscillator()
+    library = polynomial(["x", "v"], degree=3)
+    choices = {"x": [{"v": 1.0}, {"1": 1e200, "x^3": 1e200}], "v": [{"x": -9.0, "v": -0.6}]}
+    run = system.trajectory().window(0, 600)
+    scores = RefinedScore(window_s=0.5).scores(fronts_of([run], library, choices))
+    assert scores[0][2] == MAX_ERROR
+    assert scores[0][1] <= EXACT
+
+
+def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
+    halves: list[list[Trajectory]] = []
+
+    def seen(runs: list[Trajectory], **settings: object) -> WindowBatch:
+        halves.append(runs)
+        return cut_windows(runs, **settings)
+
+    monkeypatch.setattr(refined_score, "cut_windows", seen)
+    run = PREY.trajectory()
+    # The last is too short for a pair.
+    parts = [run.window(0, 450), run.window(600, 990), run.window(990, 1000)]
+    choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
+    fronts = fronts_of(parts, PREY.model.library, choices)
+    assert picked(RefinedScore(window_s=5.0, n_windows=10), fronts) == supports(PREY)
+    first, second = (np.concatenate([piece.t for piece in half]) for half in halves)
+    assert len(first) == len(second) == 5 * 51
+    assert len(np.unique(np.append(first, second))) == len(first) + len(second)
+
+
+def models_of_different_terms() -> list[SparseModel]:
+    library = PREY.model.library
+    given: list[list[Terms]] = [
+        [{"x": 0.6, "x*y": -0.9}, {"y": -0.3, "x*y": 0.9}],
+        [{"1": 0.1, "x": 0.5, "x*y": -0.9, "x^2": 0.01}, {"y": -0.3, "x*y": 0.9, "y^2": 0.01}],
+        [{"x": 0.6, "x*y": -0.9}, {"1": 0.01, "y": -0.3, "x*y": 0.9}],
+    ]
+    return [SparseModel(library, ["x", "y"], coef_matrix(library, terms)) for terms in given]
+
+
+def test_models_of_different_terms_refined_together_are_those_refined_alone() -> None:
+    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(0))
+    batch = cut_windows(
+        [run], states=("x", "y"), inputs=(), n_windows=4, window=100, rng=np.random.default_rng(1)
+    )
+    models = models_of_different_terms()
+    method = MultipleShooting()
+    together, finished = refine_together(models, batch, method=method)
+    alone, _ = refine_together(models, batch, method=method, points_per_batch=1)
+    assert finished[0]
+    for one, other, before in zip(together, alone, models, strict=True):
+        np.testing.assert_allclose(one.coef, other.coef, rtol=1e-6)
+        assert ((one.coef != 0.0) == (before.coef != 0.0)).all()
+    assert not np.allclose(together[1].coef, models[1].coef, rtol=1e-3)
+    paths = follow_together(together, batch, method=method)
+    for k, model in enumerate(together):
+        (path,) = follow_together([model], batch, method=method)
+        np.testing.assert_allclose(paths[k], path, rtol=1e-8, equal_nan=True)
+    # A fit of the starts alone is one of the noise alone, where the model is right.
+    assert np.square(paths[0] - batch.data).mean() == pytest.approx(0.05**2 * 2.0, rel=0.5)
+
+
+def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() -> None:
+    library = polynomial(["x", "y"], degree=4)
+    truth = {s: PREY.model.terms(s) for s in ("x", "y")}
+    wild = SparseModel(library, ["x", "y"], coef_matrix(library, [{"x^2*y^2": 1e200}, {"y": 1e3}]))
+    sound = SparseModel(library, ["x", "y"], coef_matrix(library, list(truth.values())))
+    batch = cut_windows(
+        [PREY.trajectory()], states=("x", "y"), inputs=(), n_windows=3, window=50,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    (kept, good), finished = refine_together([wild, sound], batch, method=MultipleShooting())
+    assert finished.tolist() == [False, True]
+    np.testing.assert_array_equal(kept.coef, wild.coef)
+    np.testing.assert_allclose(good.coef, sound.coef, rtol=1e-5, atol=1e-12)
+    paths = follow_together([wild, sound], batch, method=MultipleShooting())
+    assert np.isnan(paths[0]).all()
+    assert np.square(paths[1] - batch.data).mean() < 1e-8
+
+
+def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    off = replace(PREY.model, coef=1.2 * PREY.model.coef)
+
+    def unfinished(models: list[SparseModel], *_: object, **__: object) -> tuple:
+        better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
+        return [better, worse], np.zeros(2, dtype=np.bool_)
+
+    monkeypatch.setattr("ep2sindy.refined_score.refine_together", unfinished)
+    run = PREY.trajectory()
+    batch = cut_windows(
+        [run], states=("x", "y"), inputs=(), n_windows=3, window=50, rng=np.random.default_rng(0)
+    )
+    both = Ensemble(PREY.model.library, ["x", "y"], np.repeat(off.coef[:, :, None], 2, axis=2))
+    found = _refined(both, batch)
+    np.testing.assert_array_equal(found.coef[:, :, 0], PREY.model.coef)
+    np.testing.assert_array_equal(found.coef[:, :, 1], off.coef)
+
+
+def test_what_cannot_be_judged_is_refused() -> None:
+    run = PREY.trajectory()
+    choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
+    fronts = fronts_of([run], PREY.model.library, choices)
+    with pytest.raises(ValueError, match=r"at most 3 combinations .* make 4; lower depth"):
+        RefinedScore(max_combinations=3).scores(fronts)
+    with pytest.raises(ValueError, match=r"every state needs one front: \['x'\] came"):
+        RefinedScore().scores(fronts[:1])
+    alone = [replace(f, problem=replace(f.problem, trajectories=())) for f in fronts]
+    with pytest.raises(ValueError, match="the rows must know their trajectories"):
+        RefinedScore().scores(alone)
+    with pytest.raises(ValueError, match="2 x 502 were asked of at most 1000; change window_s"):
+        RefinedScore(window_s=50.1).scores(fronts)
+    short = fronts_of([run.window(0, 9)], PREY.model.library, choices)
+    with pytest.raises(ValueError, match="2 x 4 were asked of at most 9; .* longer records"):
+        RefinedScore().scores(short)
+    with pytest.raises(ValueError, match="window_s must be positive: 0"):
+        RefinedScore(window_s=0.0)
+    with pytest.raises(ValueError, match="n_windows must be at least 2: 1 came"):
+        RefinedScore(n_windows=1)
