@@ -13,6 +13,7 @@ from tqdm import tqdm
 from ep2sindy.library import polynomial
 from ep2sindy.parametric_plots import trends_figure
 from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
+from ep2sindy.studies.joint_points import searched_jointly
 from ep2sindy.studies.parametric import REFINED, PointResult, parametric_study
 from ep2sindy.studies.trends import laws
 from experiments.build import started_run
@@ -20,6 +21,7 @@ from experiments.checks import check_counts
 from experiments.model_view import coefficients
 from experiments.parametric_setup import opened_point, point_configs, study_of
 from experiments.parametric_tables import (
+    ALL_POINTS,
     EACH_POINT,
     Outcome,
     estimates_table,
@@ -27,6 +29,7 @@ from experiments.parametric_tables import (
     points_table,
     published_table,
     supports_table,
+    tied_table,
     trends_table,
 )
 from experiments.parametric_view import page, print_outcome
@@ -54,27 +57,29 @@ def run(config: DictConfig) -> Path:
         # Everything but the data is built first: a misspelt key must not cost a simulation.
         study = study_of(config)
         names = [str(name) for name in config.parameters]
-        law_library = polynomial(names, degree=config.law.degree)
         check_views(config, names)
+        law_library = polynomial(names, degree=config.law.degree)
+        tying = polynomial(names, degree=config.law.tied_degree)
         thesis = config.thesis and OmegaConf.to_container(config.thesis)
         published = published_table(thesis, names)
         workers = instantiate(config.parallel)
         configs = point_configs(config)
         points = in_order(_watched(workers.run(opened_point, configs), len(configs), "opened"))
 
-        found = parametric_study(
-            points, study, workers=workers, rng=np.random.default_rng(config.seed)
-        )
+        alone, together = np.random.default_rng(config.seed).spawn(2)
+        found = parametric_study(points, study, workers=workers, rng=alone)
         with LiveScalars(folder.path / "tensorboard") as live:
             results = in_order(_told(_watched(found, len(points), "fitted"), live))
+        joint = searched_jointly(points, results, study, tying, rng=together)
+        searches = {EACH_POINT: [result.searched for result in results]}
         outcome = Outcome(
             title=config.experiment,
             study=study,
             parameters=names,
             results=results,
             laws=laws(results, law_library, max_terms=config.law.max_terms),
-            # Another search adds its model at every point here, such as one support for all.
-            searches={EACH_POINT: [result.searched for result in results]},
+            searches=searches | ({ALL_POINTS: joint.fitted} if joint else {}),
+            joint=joint,
             trends=[(str(each.along), dict(each.at)) for each in config.trends],
             published=published,
         )
@@ -89,8 +94,10 @@ def in_order(numbered: Iterable[tuple[int, Any]]) -> list[Any]:
 
 def check_views(config: DictConfig, names: list[str]) -> None:
     """Raise ValueError unless laws, trends and panels can be made of what there is."""
-    if set(config.law) != {"degree", "max_terms"}:
-        raise ValueError(f"law must have degree and max_terms: {list(config.law)} came")
+    if set(config.law) != {"degree", "max_terms", "tied_degree"}:
+        raise ValueError(
+            f"law must have degree, max_terms and tied_degree: {list(config.law)} came"
+        )
     check_counts(config.law, *(["max_terms"] if config.law.max_terms is not None else []))
     for each in config.trends:
         if set(each) != {"along", "at"} or {each.along, *each.at} != set(names):
@@ -143,6 +150,7 @@ def _write(folder: RunFolder, config: DictConfig, outcome: Outcome) -> None:
         "supports": supports_table(outcome),
         "laws": laws_table(outcome),
         "trends": trends_table(outcome),
+        "tied": tied_table(outcome),
         "coefficients": coefficients(models, heading="model"),
     }
     for name, table in tables.items():
@@ -214,6 +222,28 @@ def _summary(config: DictConfig, outcome: Outcome) -> dict[str, Any]:
             for fit, by_quantity in outcome.laws.items()
         },
         "trends": trends_table(outcome).to_dict("records"),
+        "joint": _joint_summary(outcome),
+    }
+
+
+def _joint_summary(outcome: Outcome) -> dict[str, Any] | None:
+    """The support for all points, and its coefficients as polynomials of the parameters."""
+    joint = outcome.joint
+    if joint is None:
+        return None
+    tied = joint.tied
+    return {
+        "terms": {state: list(terms) for state, terms in joint.found.chosen.items()},
+        "tied": {
+            state: {
+                term: dict(zip(tied.law.names, row.tolist(), strict=True))
+                for term, row in zip(equation.terms, equation.coef, strict=True)
+            }
+            for state, equation in tied.equations.items()
+        }
+        if tied
+        else None,
+        "why_not_tied": joint.why_not_tied or None,
     }
 
 

@@ -9,10 +9,11 @@ import pandas as pd
 
 from ep2sindy.control_law import ControlLaw
 from ep2sindy.model import equation_text
+from ep2sindy.studies.joint_points import JointResult
 from ep2sindy.studies.parametric import Fitted, PointResult, Study
 from ep2sindy.studies.trends import exponent, trends
 
-EACH_POINT = "each point"
+EACH_POINT, ALL_POINTS = "each point", "all points"
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class Outcome:
     """What the tables, the figures and the page are made from.
 
     searches: what a search chose, one entry per point, None where there was nothing to fit.
+    joint: the search over all points at once; None where there was none.
     trends: (parameter, those held). published: as `published_table` makes it.
     """
 
@@ -29,6 +31,7 @@ class Outcome:
     results: Sequence[PointResult]
     laws: Mapping[str, Mapping[str, ControlLaw]]
     searches: Mapping[str, Sequence[Fitted | None]]
+    joint: JointResult | None
     trends: Sequence[tuple[str, Mapping[str, float]]]
     published: pd.DataFrame
 
@@ -117,6 +120,19 @@ def supports_table(outcome: Outcome) -> pd.DataFrame:
                 text = equation_text(state, terms)
                 rows.append(row | {"n_terms": len(terms), "r2": fitted.r2[state], "text": text})
     columns = [*outcome.parameters, "search", "state", "n_terms", "r2", "text"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def tied_table(outcome: Outcome) -> pd.DataFrame:
+    """What it costs to tie the coefficients of the support for all points: R2 at each of them."""
+    columns = ["state", "terms", "point", "r2_free", "r2_tied"]
+    if outcome.joint is None or outcome.joint.tied is None:
+        return pd.DataFrame(columns=columns)
+    rows = [
+        (state, ", ".join(equation.terms), point, r2, equation.r2_tied[point])
+        for state, equation in outcome.joint.tied.equations.items()
+        for point, r2 in equation.r2_free.items()
+    ]
     return pd.DataFrame(rows, columns=columns)
 
 

@@ -17,6 +17,7 @@ from experiments.parametric_tables import (
     estimates_table,
     laws_table,
     supports_table,
+    tied_table,
     trends_table,
 )
 
@@ -32,6 +33,7 @@ def print_outcome(screen: Screen, outcome: Outcome) -> None:
     screen.print(f"{INTERVALS}\n")
     for title, table in (
         ("terms found, beside those given", supports_table(outcome)),
+        (TIED, tied_table(outcome)),
         (TRENDS, _readable_trends(outcome)),
         (LAWS, _readable_laws(outcome)),
     ):
@@ -130,6 +132,7 @@ INTERVALS = (
     "refinements from their covariance. It says how far another stretch of the same record would "
     "move a value, not how far the model is from the discharge: compare R2, and the fits."
 )
+TIED = "one support for all points: R2 with coefficients of its own at each, and tied by a law"
 TRENDS = "exponents: quantity ~ parameter^p, the other parameters held"
 LAWS = "control laws, with the RMS error at points left out, over the mean"
 LEFT_OUT = (
@@ -163,6 +166,7 @@ def page(outcome: Outcome, figures: Mapping[str, Figure]) -> str:
     body.append(f"<p>{INTERVALS}</p>")
     for title, table in (
         ("Terms found, beside those given", supports_table(outcome)),
+        (f"O{TIED[1:]}", tied_table(outcome)),
         (f"Trends: {TRENDS}", _readable_trends(outcome)),
         (f"C{LAWS[1:]}", _readable_laws(outcome)),
     ):

@@ -15,8 +15,8 @@ from experiments.build import check_overrides
 CONF = Path(__file__).resolve().parents[1] / "conf"
 # Modules of this package; only the one asked for is imported, for some take seconds.
 STUDIES = (
-    "libraries", "benchmark", "weak", "weak_windows", "frontier", "constrained", "ils", "parametric",
-    "pointwise",
+    "libraries", "benchmark", "weak", "weak_windows", "frontier", "constrained", "ils",
+    "parametric", "pointwise",
 )  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def test_the_summary_has_every_point(folder: Path) -> None:
             assert set(point["r2"][case]) == {"n_i", "n_n"}
             refined = point["refined"][case]
             assert set(refined) == names | {"status", "loss", "ci95", "r2"}
-        assert set(point["searched"]) == {"each point"}
+        assert set(point["searched"]) == {"each point", "all points"}
         assert set(point["searched"]["each point"]) == {"n_i", "n_n"}
     assert points[2]["constrained"]["g_inj"] < points[1]["constrained"]["g_inj"]
     assert set(summary["laws"]["constrained"]) == ESTIMATES["constrained"]
@@ -91,6 +91,22 @@ def test_quantities_are_the_coefficients_of_the_models(folder: Path) -> None:
         shared = SparseModel.load(folder / "models" / f"point_{number}_constrained.json")
         assert point["constrained"]["eps"] == shared.terms("n_i")["n_i*n_n*R_ion"]
         assert point["constrained"]["eps"] == -shared.terms("n_n")["n_i*n_n*R_ion"]
+
+
+def test_one_support_serves_all_points(folder: Path) -> None:
+    summary = summary_of(folder)
+    joint = summary["joint"]
+    for point in summary["points"]:
+        terms = point["searched"]["all points"]
+        assert {state: sorted(of) for state, of in terms.items()} == {
+            state: sorted(of) for state, of in joint["terms"].items()
+        }
+    # Three points fix three coefficients of a law: it passes through all of them.
+    tied = pd.read_csv(folder / "tables" / "tied.csv")
+    assert len(tied) == 2 * 3
+    np.testing.assert_allclose(tied["r2_tied"], tied["r2_free"], rtol=1e-6)
+    law = joint["tied"]["n_n"]
+    assert all(set(of) == {"1", "V_D_V", "mdot_mg_s"} for of in law.values())
 
 
 def test_each_point_is_simulated_where_it_operates(folder: Path) -> None:
@@ -113,7 +129,7 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
     assert row["low"] < row["exponent"] < row["high"]
     assert row["thesis"] == pytest.approx(0.98, abs=0.01)
     supports = pd.read_csv(folder / "tables" / "supports.csv")
-    assert set(supports["search"]) == {"given", "each point"}
+    assert set(supports["search"]) == {"given", "each point", "all points"}
     for name in ("points", "laws", "coefficients"):
         assert len(pd.read_csv(folder / "tables" / f"{name}.csv"))
     assert (folder / "figures" / "trends.png").is_file()
@@ -227,7 +243,7 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
         (["figures.panels=[[L]]"], "figures.panels names ['L']; there are ["),
         (["+laws=1"], "unknown keys ['laws']"),
         (["law.max_terms=0"], "max_terms must be a whole number, one or more: 0 came"),
-        (["+law.terms=3"], "law must have degree and max_terms"),
+        (["+law.terms=3"], "law must have degree, max_terms and tied_degree"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

@@ -13,9 +13,10 @@ from ep2sindy.model import SparseModel, coef_matrix
 from ep2sindy.parallel import Loky, Serial
 from ep2sindy.regression import Differential, RandomSplit, Regression
 from ep2sindy.resampling import moving_block_counts
-from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps
 from ep2sindy.selection import Knee
 from ep2sindy.smoothing import NoSmoothing
+from ep2sindy.studies.joint_points import searched_jointly
 from ep2sindy.studies.operating_points import PointData, oscillation
 from ep2sindy.studies.parametric import (
     Case,
@@ -144,6 +145,48 @@ def test_quantities_of_every_point_come_back(results: list[PointResult]) -> None
                 assert result.usable(fit)
             assert result.fits[name].r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-6)
         assert result.fits["free_refined"].loss < 1e-8
+
+
+def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
+    points: list[PointData], results: list[PointResult]
+) -> None:
+    law, rng = polynomial(["V"], degree=1), np.random.default_rng(0)
+    plane = [replace(p, parameters={"V": p.parameters["V"]}) for p in points]
+    joint = searched_jointly(plane, results, study(), law, rng=rng)
+    assert joint is not None
+    assert [fitted is None for fitted in joint.fitted] == [False, False, False, True]
+    assert joint.found.chosen["x"] == ("x*u", "x*y*R")
+    assert joint.found.chosen["y"] == ("1", "x*y*R")
+    for truth, fitted in zip(TRUTHS, joint.fitted, strict=False):
+        assert fitted is not None
+        assert fitted.model.terms("y") == pytest.approx(
+            {"1": truth["g"], "x*y*R": -truth["eps"]}, rel=1e-4
+        )
+        assert fitted.r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-6)
+    # g = 2 + V / 100 lies on the law; eps does not.
+    assert joint.tied is not None
+    assert joint.tied.law.names == ("1", "V")
+    assert all(set(e.r2_tied) == set(e.r2_free) for e in joint.tied.equations.values())
+
+
+def test_a_joint_search_says_why_it_ties_nothing(
+    points: list[PointData], results: list[PointResult]
+) -> None:
+    law = polynomial(["V", "m"], degree=2)
+    joint = searched_jointly(points, results, study(), law, rng=np.random.default_rng(0))
+    assert joint is not None
+    assert joint.tied is None
+    assert "a law of 6 terms needs as many points: 3 came" in joint.why_not_tied
+
+
+def test_there_is_no_joint_search_of_one_point_or_without_best_subsets(
+    points: list[PointData], results: list[PointResult]
+) -> None:
+    law, rng = polynomial(["V", "m"], degree=1), np.random.default_rng(0)
+    alone = [points[0], points[3]], [results[0], results[3]]
+    assert searched_jointly(*alone, study(), law, rng=rng) is None
+    lasso = replace(study(), searching=replace(SEARCHING, search=AdaptiveLasso()))
+    assert searched_jointly(points, results, lasso, law, rng=rng) is None
 
 
 def test_a_relation_holds_exactly_in_fits_refinements_and_draws(
