@@ -24,11 +24,12 @@ from sklearn.linear_model import lasso_path
 from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import cpu_s
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.io import read_field
 from ep2sindy.library import named_terms
 from ep2sindy.parallel import Serial
 from ep2sindy.regression import Differential, Regression
-from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import Knee
 from ep2sindy.studies.blocks import blocks_of
 from ep2sindy.studies.pointwise import PointSearch, pointwise

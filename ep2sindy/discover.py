@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.ambiguity import Ambiguity, ambiguities
+from ep2sindy.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.errors_in_variables import reweighted
 from ep2sindy.library import Library
 from ep2sindy.model import SparseModel, assemble_model
 from ep2sindy.pareto import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression import Formulation
-from ep2sindy.search import Bootstraps, Search, pooled_supports
+from ep2sindy.search import Search
 from ep2sindy.selection import Selection, selected
 from ep2sindy.trajectory import Trajectory
 

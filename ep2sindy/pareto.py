@@ -9,9 +9,9 @@ from itertools import groupby
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.bootstraps import Supports
 from ep2sindy.kernels import solve_masks
 from ep2sindy.regression import Regression
-from ep2sindy.search import Supports
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.library import Library
 from ep2sindy.parallel import Loky
 from ep2sindy.regression import Differential
-from ep2sindy.search import STLSQ, AdaptiveLasso, Bootstraps
+from ep2sindy.search import STLSQ, AdaptiveLasso
 from ep2sindy.selection import Knee
 from ep2sindy.studies.benchmark import (
     Finding,

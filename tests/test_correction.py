@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import nn
 
+from ep2sindy.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.constraints import constraint
 from ep2sindy.correction import Corrected, refine_with_correction
 from ep2sindy.integral.descent import GradientDescent
@@ -14,7 +15,7 @@ from ep2sindy.library import Library, named_terms, polynomial
 from ep2sindy.model import SparseModel, coef_matrix
 from ep2sindy.pareto import Candidate, pareto_front
 from ep2sindy.regression import Regression
-from ep2sindy.search import BestSubset, Bootstraps, pooled_supports
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import LogKnee, selected
 from ep2sindy.systems import lotka_volterra
 from ep2sindy.trajectory import Trajectory

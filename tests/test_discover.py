@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.discover import discover
 from ep2sindy.library import polynomial
 from ep2sindy.names import split_factors
 from ep2sindy.regression import Differential
-from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps
+from ep2sindy.search import AdaptiveLasso, BestSubset
 from ep2sindy.selection import Knee
 from ep2sindy.systems import lotka_volterra
 from ep2sindy.trajectory import Trajectory

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from benchmarks.intervals import held
+from ep2sindy.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.discover import discover
 from ep2sindy.errors_in_variables import WeightedWeak, reweighted, whitened_rows
 from ep2sindy.library import named_terms, polynomial
 from ep2sindy.pareto import Candidate, fit_support, pareto_front
 from ep2sindy.regression import RandomSplit, Regression
-from ep2sindy.search import BestSubset, Bootstraps, pooled_supports
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import EBIC
 from ep2sindy.studies.benchmark import realization
 from ep2sindy.systems import System, lorenz, lotka_volterra

@@ -5,13 +5,14 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.discover import discover
 from ep2sindy.errors_in_variables import WeightedWeak
 from ep2sindy.joint import JointDiscovery, discover_jointly
 from ep2sindy.library import Library, named_terms, polynomial
 from ep2sindy.parallel import Serial
 from ep2sindy.regression import Differential, Formulation, RandomSplit, Regression
-from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps, Search
+from ep2sindy.search import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection import BIC, EBIC, AICc, Knee, Selection, log_supports
 from ep2sindy.studies.joint_family import (
     LAW,

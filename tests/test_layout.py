@@ -30,6 +30,7 @@ ORDER = [
     "weak",
     "ambiguity",
     "search",
+    "bootstraps",
     "pareto",
     "errors_in_variables",
     "selection",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.constrained import constrained_fit
 from ep2sindy.constraints import constraint
 from ep2sindy.library import named_terms, polynomial
@@ -13,7 +14,7 @@ from ep2sindy.model import SparseModel, coef_matrix
 from ep2sindy.parallel import Loky, Serial
 from ep2sindy.regression import Differential, RandomSplit, Regression
 from ep2sindy.resampling import moving_block_counts
-from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps
+from ep2sindy.search import AdaptiveLasso, BestSubset
 from ep2sindy.selection import Knee
 from ep2sindy.smoothing import NoSmoothing
 from ep2sindy.studies.joint_points import searched_jointly

@@ -9,12 +9,13 @@ import pytest
 import xarray as xr
 from distributed import LocalCluster
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.discover import discover
 from ep2sindy.fields import point
 from ep2sindy.library import named_terms
 from ep2sindy.parallel import Dask, Loky, Serial
 from ep2sindy.regression import Differential, RandomSplit
-from ep2sindy.search import AdaptiveLasso, BestSubset, Bootstraps
+from ep2sindy.search import AdaptiveLasso, BestSubset
 from ep2sindy.selection import EBIC, Knee
 from ep2sindy.studies.blocks import Kept, blocks_of
 from ep2sindy.studies.pointwise import STATUSES, PointSearch, pointwise

@@ -5,9 +5,10 @@ import pytest
 import xarray as xr
 from sklearn.metrics import adjusted_rand_score
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.parallel import Serial
 from ep2sindy.regression import Differential
-from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import EBIC
 from ep2sindy.studies.pointwise import PointSearch, pointwise
 from ep2sindy.studies.regimes import Regimes, group_points, regimes

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.regression import Differential
 from ep2sindy.resampling import moving_block_counts
-from ep2sindy.search import Bootstraps
 from ep2sindy.systems import lorenz
 
 

@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.library import named_terms, polynomial
 from ep2sindy.pareto import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression import Regression
-from ep2sindy.search import BestSubset, Bootstraps, pooled_supports
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import BIC, EBIC, AICc, Knee, LogKnee, Selection, log_supports, selected
 from ep2sindy.systems import lorenz
 

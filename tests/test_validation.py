@@ -4,12 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.discover import discover
 from ep2sindy.ensemble import MAX_ERROR, DrivenWindows, Ensemble
 from ep2sindy.library import Library, named_terms, polynomial
 from ep2sindy.pareto import Candidate, ParetoFront, fit_support, pareto_front
 from ep2sindy.regression import Regression
-from ep2sindy.search import BestSubset, Bootstraps, pooled_supports
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import FLOOR, Selection, selected
 from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 from ep2sindy.trajectory import Trajectory

@@ -3,11 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.discover import Discovery, discover
 from ep2sindy.library import Library, polynomial
 from ep2sindy.names import split_factors
 from ep2sindy.regression import BlockSplit, RandomSplit, Regression
-from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import EBIC
 from ep2sindy.smoothing import NoSmoothing
 from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol

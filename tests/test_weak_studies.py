@@ -4,8 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.regression import Differential, RandomSplit
-from ep2sindy.search import BestSubset, Bootstraps
+from ep2sindy.search import BestSubset
 from ep2sindy.selection import Knee
 from ep2sindy.studies.benchmark import SearchVariant
 from ep2sindy.studies.frontier import identification_frontier

@@ -14,11 +14,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import pandas as pd
 
+from ep2sindy.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.library import Library
 from ep2sindy.parallel import ONE_BY_ONE, Workers
 from ep2sindy.pareto import pareto_front
 from ep2sindy.regression import Formulation
-from ep2sindy.search import Bootstraps, Search, pooled_supports
+from ep2sindy.search import Search
 from ep2sindy.selection import Selection, selected
 from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 from ep2sindy.trajectory import Trajectory

@@ -11,12 +11,13 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.ambiguity import usable_terms
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.discover import Discovery, discover
 from ep2sindy.library import Library
 from ep2sindy.model import Rollout, SparseModel, assemble_model, equation_text
 from ep2sindy.pareto import Candidate, ParetoFront, fit_support
 from ep2sindy.regression import Formulation
-from ep2sindy.search import Bootstraps, Search
+from ep2sindy.search import Search
 from ep2sindy.selection import Selection, selected
 from ep2sindy.spectrum import dominant_frequency
 from ep2sindy.trajectory import Trajectory

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.bootstraps import Bootstraps
 from ep2sindy.constrained import constrained_fit
 from ep2sindy.constraints import Constraint
 from ep2sindy.discover import discover
@@ -20,7 +21,7 @@ from ep2sindy.parallel import Workers
 from ep2sindy.pareto import r2
 from ep2sindy.refine import refine
 from ep2sindy.regression import Formulation, Regression
-from ep2sindy.search import Bootstraps, Search
+from ep2sindy.search import Search
 from ep2sindy.selection import Selection
 from ep2sindy.spectrum import dominant_frequency
 from ep2sindy.studies.operating_points import (

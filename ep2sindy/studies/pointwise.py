@@ -10,13 +10,14 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ep2sindy.bootstraps import Bootstraps, pooled, resamples
 from ep2sindy.errors_in_variables import reweighted
 from ep2sindy.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.library import Library
 from ep2sindy.parallel import Workers
 from ep2sindy.pareto import pareto_front
 from ep2sindy.regression import Formulation
-from ep2sindy.search import Bootstraps, Search, pooled, resamples
+from ep2sindy.search import Search
 from ep2sindy.selection import Selection, selected
 from ep2sindy.studies.blocks import Block, Kept, blocks_of
 from ep2sindy.trajectory import Trajectory
