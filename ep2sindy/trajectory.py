@@ -128,9 +128,9 @@ class Trajectory:
             raise ValueError("a trajectory needs at least one state; name one in state_names")
 
     def _check_variation(self) -> None:
-        spread = np.ptp(self.states, axis=0)
+        columns = np.ascontiguousarray(self.states.T)  # along rows of few columns this is slow
         for name, width, level in zip(
-            self.state_names, spread, np.abs(self.states).max(axis=0), strict=True
+            self.state_names, np.ptp(columns, axis=1), np.abs(columns).max(axis=1), strict=True
         ):
             # Below rounding the derivative is noise of the number format, not of the system.
             if width <= 1e-12 * level:

@@ -197,27 +197,27 @@ def _searched(search: PointSearch, block: xr.Dataset) -> tuple[dict[str, np.ndar
 
 def _columns(
     block: xr.Dataset, names: Sequence[str]
-) -> Float[np.ndarray, "points samples variables"]:
-    """All variables at all points, each point's samples in one stretch of memory."""
+) -> Float[np.ndarray, "points variables samples"]:
+    """All variables at all points, each one's samples in one stretch of memory."""
     shape = (block.sizes["time"], *(block.sizes.get(axis, 1) for axis in SPACE))
-    columns = np.empty((shape[1] * shape[2], shape[0], len(names)))
+    columns = np.empty((shape[1] * shape[2], len(names), shape[0]))
     for j, name in enumerate(names):
         values = np.broadcast_to(grid_values(block[name]), shape)
-        columns[:, :, j] = values.reshape(shape[0], -1).T
+        columns[:, j] = values.reshape(shape[0], -1).T
     return columns
 
 
-def _status(values: Float[np.ndarray, "samples variables"], search: PointSearch) -> int:
+def _status(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
     """What can be said before a fit; 0 where one is worth trying."""
     lost = ~np.isfinite(values)
-    if lost.all(axis=0).any():
+    if lost.all(axis=1).any():
         return STATUSES.index("no_plasma")
     if lost.any():
         return STATUSES.index("missing_samples")
-    states = values[:, : len(search.states)]
-    largest = np.abs(states).max(axis=0)
+    states = values[: len(search.states)]
+    largest = np.abs(states).max(axis=1, keepdims=True)
     scaled = states / np.where(largest > 0.0, largest, 1.0)
-    still = scaled.std(axis=0) <= search.least_variation * np.sqrt(np.square(scaled).mean(axis=0))
+    still = scaled.std(axis=1) <= search.least_variation * np.sqrt(np.square(scaled).mean(axis=1))
     return STATUSES.index("too_little_variation") if still.any() else 0
 
 
@@ -227,9 +227,9 @@ def _trajectory(
     n = len(search.states)
     return Trajectory(
         t=t,
-        states=values[:, :n],
+        states=values[:n].T,
         state_names=search.states,
-        inputs=values[:, n:],
+        inputs=values[n:].T,
         input_names=search.variables[n:],
         units={name: str(block[name].attrs["units"]) for name in search.variables},
     )
