@@ -50,7 +50,7 @@ def constrained_fit(
         (place_of(library, names, state, term, f"the sign of {(state, term)}"), sign)
         for (state, term), sign in (signs or {}).items()
     ]
-    equations = _equations(problems, constraint)
+    equations = weighted_equations(problems, constraint)
     coef, covariance = _solved(equations, constraint, _bounds(constraint, signed))
     for k, sign in signed:
         if sign * coef[k] <= ROUNDING * abs(constraint.d[k]):
@@ -102,7 +102,7 @@ def _bounds(
 
 
 @dataclass(frozen=True, eq=False)
-class _Equation:
+class WeightedEquation:
     """The rows of one equation.
 
     at: which of the constraint's coefficients are its own; terms: their places in the library.
@@ -142,7 +142,9 @@ def _whitened(
     return whitened_rows(problem, mask, full, n_steps=n_steps)
 
 
-def _equations(problems: Sequence[Regression], constraint: Constraint) -> list[_Equation]:
+def weighted_equations(
+    problems: Sequence[Regression], constraint: Constraint
+) -> list[WeightedEquation]:
     """Those of the constraint's equations that free coefficients have a part in."""
     places = {name: (p, k) for p in problems for k, name in enumerate(p.equations)}
     equations = []
@@ -158,7 +160,9 @@ def _equations(problems: Sequence[Regression], constraint: Constraint) -> list[_
     return equations
 
 
-def _fitted_alone(problem: Regression, number: int, at: np.ndarray, terms: np.ndarray) -> _Equation:
+def _fitted_alone(
+    problem: Regression, number: int, at: np.ndarray, terms: np.ndarray
+) -> WeightedEquation:
     theta = problem.train_rows[:, terms]
     target = problem.train_rows[:, len(problem.library) + number]
     start = np.linalg.lstsq(theta, target, rcond=None)[0]
@@ -168,7 +172,7 @@ def _fitted_alone(problem: Regression, number: int, at: np.ndarray, terms: np.nd
         white = _whitened(problem, terms, start, n_steps=8)
         problem = replace(problem, noisy=replace(problem.noisy, smoothed=white.corrected))
         start = np.linalg.lstsq(white.theta[:, terms], white.target, rcond=None)[0]
-    return _Equation(
+    return WeightedEquation(
         problem=problem,
         number=number,
         at=at,
@@ -179,7 +183,9 @@ def _fitted_alone(problem: Regression, number: int, at: np.ndarray, terms: np.nd
 
 
 def _solved(
-    equations: Sequence[_Equation], constraint: Constraint, bounds: Float[np.ndarray, "2 free"]
+    equations: Sequence[WeightedEquation],
+    constraint: Constraint,
+    bounds: Float[np.ndarray, "2 free"],
 ) -> tuple[Float[np.ndarray, " coefs"], Float[np.ndarray, "coefs coefs"]]:
     """All coefficients and their covariance, in SI; noisy rows are weighted anew in each pass."""
     C, d = constraint.C, constraint.d
