@@ -31,6 +31,9 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.operating_points
 	$(BIN)/python -m benchmarks.refine
 	$(BIN)/python -m benchmarks.intervals
+	$(BIN)/python -m benchmarks.pointwise
+	$(BIN)/python -m benchmarks.joint
+	$(BIN)/python -m benchmarks.trajectory_scores
 
 clean:
 	rm -rf .venv .cache .mypy_cache .ruff_cache .pytest_cache

@@ -140,19 +140,40 @@ def by_hand(batch: WindowBatch, coef: np.ndarray, scaling: np.ndarray) -> np.nda
     return np.stack([odeint(rhs, data[0], t) for data in batch.data])
 
 
+def forced_by_hand(batch: WindowBatch, coef: np.ndarray, scaling: np.ndarray) -> np.ndarray:
+    """The same for the forced model, its inputs from the cubics of every segment."""
+    a, b, g, d = (float(value) for value in coef * scaling)
+
+    def rhs(x: np.ndarray, t: float, cubics: list) -> tuple[float, float]:
+        k = min(max(int(t), 0), len(cubics) - 1)
+        s = t - k
+        (u3, R3), (u2, R2), (u1, R1), (u0, R0) = cubics[k]
+        u, R = ((u3 * s + u2) * s + u1) * s + u0, ((R3 * s + R2) * s + R1) * s + R0
+        n_i, n_n = float(x[0]), float(x[1])
+        burn = n_i * n_n * R
+        return a * n_i * u + b * burn, g + d * burn
+
+    t = np.arange(batch.data.shape[1], dtype=np.float64)
+    paths = zip(batch.data, batch.inputs.tolist(), strict=True)
+    return np.stack([odeint(rhs, data[0], t, args=(cubics,)) for data, cubics in paths])
+
+
 def by_model(work: Problem, model: SparseModel, scaling: np.ndarray) -> np.ndarray:
-    """Trajectories by scipy's odeint on the model's own right-hand side, without inputs."""
+    """Trajectories by scipy's odeint on the model's own right-hand side."""
     batch = work.batches[0]
     coef = np.zeros_like(model.coef.T)
     coef[model.coef.T != 0.0] = model.coef.T[model.coef.T != 0.0] * scaling
     scaled = replace(model, coef=coef.T)
-    scale, none = batch.scale, np.empty(0)
+    scale, of_inputs = np.split(batch.scale, [len(model.states)])
 
-    def rhs(x: np.ndarray, _: float) -> np.ndarray:
-        return batch.step_s * scaled.derivative(x * scale, none) / scale
+    def rhs(x: np.ndarray, t: float, cubics: np.ndarray) -> np.ndarray:
+        k = min(max(int(t), 0), len(cubics) - 1)
+        inputs = of_inputs * ((t - k) ** np.arange(3, -1, -1) @ cubics[k])
+        return batch.step_s * scaled.derivative(x * scale, inputs) / scale
 
     t = np.arange(batch.data.shape[1], dtype=np.float64)
-    return np.stack([odeint(rhs, data[0], t) for data in batch.data])
+    paths = zip(batch.data, batch.inputs, strict=True)
+    return np.stack([odeint(rhs, data[0], t, args=(cubics,)) for data, cubics in paths])
 
 
 def simplex_s(
@@ -227,36 +248,41 @@ def compare(case: Case) -> None:
         "torchdiffeq, L-BFGS": descent_s(work, GradientDescent(), goal=goal),
     }
     data, n_free = work.data[0], work.n_free
-    if case.name == "predator-prey":
-        unit = (work.odes[0].free0 * work.odes[0].unit).numpy()
-        paths = partial(by_hand, work.batches[0], unit)
-        others["simplex, odeint, by hand"] = simplex_s(paths, data, n_free=n_free, goal=goal)
-        paths = partial(by_model, work, case.start)
-        others["simplex, odeint, model.derivative"] = simplex_s(
-            paths, data, n_free=n_free, goal=goal
-        )
-    generic = partial(window_paths, work)
-    others["simplex, odeint, lean library"] = simplex_s(generic, data, n_free=n_free, goal=goal)
+    unit = (work.odes[0].free0 * work.odes[0].unit).numpy()
+    hand = by_hand if case.name == "predator-prey" else forced_by_hand
+    for name, paths in {
+        "by hand": partial(hand, work.batches[0], unit),
+        "lean library": partial(window_paths, work),
+        "model.derivative": partial(by_model, work, case.start),
+    }.items():
+        others[f"simplex, odeint, {name}"] = simplex_s(paths, data, n_free=n_free, goal=goal)
     for name, value in others.items():
         print(f"  {name:<38} {value:9.4f} s, {value / base:.0f} times")
 
 
-def many(n_points: int, rng: np.random.Generator) -> None:
+def many(n_points: int, rng: np.random.Generator, *, points_per_batch: int) -> None:
     """A grid of points with 10 windows each, all from the same start."""
     t, states = breathing_states(1500)
     data = [[Trajectory(t, contaminated(states, t, rng), STATES)] for _ in range(n_points)]
     begin = time.process_time()
-    found = refine_many([START] * n_points, data, n_windows=10, window=WINDOW, rng=rng)
+    found = refine_many(
+        [START] * n_points, data, n_windows=10, window=WINDOW, points_per_batch=points_per_batch,
+        rng=rng,
+    )  # fmt: skip
     each_ms = 1e3 * (time.process_time() - begin) / n_points
     n_converged = sum(each.status == "converged" for each in found)
-    print(f"{n_points} points x 10 windows: {each_ms:.2f} ms each, {n_converged} converged")
+    print(
+        f"{n_points} points x 10 windows, {points_per_batch} in a batch: {each_ms:.2f} ms each, "
+        f"{n_converged} converged"
+    )
 
 
 def main() -> None:
     torch.set_num_threads(1)
     with threadpool_limits(limits=1):
         compare(breathing(np.random.default_rng(0)))
-        many(2009, np.random.default_rng(1))
+        for points_per_batch in (8, 2009):
+            many(2009, np.random.default_rng(1), points_per_batch=points_per_batch)
         compare(forced(np.random.default_rng(2)))
 
 

@@ -1,0 +1,76 @@
+"""Selecting by trajectories: refined, as the regression left them, and by EBIC beside them.
+
+    python -m benchmarks.trajectory_scores --n 12
+
+Realizations of Lotka-Volterra and Lorenz as the synthetic benchmark draws them; weighted weak form,
+the two best subsets of every size up to four terms, depth 2.
+"""
+
+import argparse
+import time
+from functools import partial
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.errors_in_variables import WeightedWeak
+from ep2sindy.parallel import Loky
+from ep2sindy.pareto import ParetoFront, pareto_front
+from ep2sindy.refined_score import RefinedScore
+from ep2sindy.search import BestSubset
+from ep2sindy.selection import EBIC, Selection, selected
+from ep2sindy.studies.benchmark import realization
+from ep2sindy.validation import IntegralScore
+
+CASES = (("lotka_volterra", 0.05), ("lotka_volterra", 0.2), ("lorenz", 0.05), ("lorenz", 0.2))
+RULES: dict[str, Selection] = {
+    "RefinedScore": RefinedScore(),
+    "IntegralScore": IntegralScore(),
+    "EBIC": EBIC(),
+}
+
+
+def judged(number: int, *, name: str, noise: float) -> dict[str, float]:
+    """Was the truth on the fronts, and which rule selected all of it? CPU seconds of each."""
+    system, runs = realization(name, noise, number, n_trajectories=1, seed=7)
+    rng = np.random.default_rng(number)
+    fronts: list[ParetoFront] = [
+        pareto_front(problem, found, depth=2)
+        for problem in WeightedWeak().assemble(runs, system.model.library, rng=rng)
+        for found in pooled_supports(
+            problem, BestSubset(max_terms=4, n_best=2), Bootstraps(n=0), rng=rng
+        )
+    ]
+    truth = [set(system.model.terms(front.equation)) for front in fronts]
+    row = {
+        "on the front": float(
+            all(
+                any(set(c.terms) == terms for c in front.candidates)
+                for front, terms in zip(fronts, truth, strict=True)
+            )
+        )
+    }
+    for rule, how in RULES.items():
+        begin = time.process_time()
+        scores = how.scores(fronts)
+        row[f"{rule}, s"] = time.process_time() - begin
+        chosen = [set(selected(f, s).terms) for f, s in zip(fronts, scores, strict=True)]
+        row[rule] = float(chosen == truth)
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="selection by trajectories")
+    parser.add_argument("--n", type=int, default=12, help="realizations per system and noise")
+    n = parser.parse_args().n
+    for name, noise in CASES:
+        rows = dict(Loky().run(partial(judged, name=name, noise=noise), range(n))).values()
+        table = pd.DataFrame(rows)
+        counts = ", ".join(f"{key} {table[key].sum():.0f}" for key in ("on the front", *RULES))
+        cost = ", ".join(f"{rule} {table[f'{rule}, s'].mean():.2g} s" for rule in RULES)
+        print(f"{name}, {noise:.0%}: of {n}, {counts}; CPU: {cost}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
