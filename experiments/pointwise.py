@@ -21,7 +21,7 @@ from ep2sindy.model import equation_text
 from ep2sindy.names import split_factors
 from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
 from ep2sindy.studies.blocks import Kept
-from ep2sindy.studies.pointwise import PointSearch, pointwise
+from ep2sindy.studies.pointwise import STATUSES, PointSearch, pointwise
 from ep2sindy.studies.regimes import regimes
 from ep2sindy.thruster import Thruster
 from experiments.build import open_prepared_field, started_run
@@ -94,7 +94,7 @@ def _write(
     }
     folder.write_figures(figures)
     found = summary(outcome)
-    counts = {f"points/{name}": float(n) for name, n in found["status"].items()}
+    counts = {f"points/{name}": float(found["status"].get(name, 0)) for name in STATUSES}
     write_tensorboard(
         folder.path / "tensorboard",
         figures=figures,

@@ -197,6 +197,13 @@ def test_a_setting_that_fits_nowhere_is_an_error() -> None:
         pointwise(short, few, workers=Serial())
 
 
+def test_a_field_without_plasma_is_an_error() -> None:
+    field = parabolas()
+    empty = field.assign(x=field["x"].where(field["z"] > 1.0).assign_attrs(units="m^-3"))
+    with pytest.raises(ValueError, match="fitted: of 12 points 12 with no plasma; see to the mask"):
+        pointwise(empty, searching(), workers=Serial())
+
+
 def test_units_of_coefficients_follow_the_field() -> None:
     result = pointwise(parabolas(), searching(), workers=Serial())
     assert result["coef_units"].sel(equation="x", term="u").item() == "m^-4"
@@ -224,6 +231,10 @@ def test_a_broken_run_goes_on_with_its_finished_blocks(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
     undisturbed = pointwise(noisy(), searching(), workers=Serial(), block_points=2)
     assert bytes_of(result) == bytes_of(undisturbed)
+    (kept.folder / "of_another_run").touch()
+    kept.clear()
+    assert [path.name for path in kept.folder.iterdir()] == ["of_another_run"]
+    (kept.folder / "of_another_run").unlink()
     kept.clear()
     assert not kept.folder.exists()
 

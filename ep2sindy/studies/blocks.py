@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -75,10 +76,14 @@ class Kept:
             ) from error
 
     def clear(self) -> None:
-        """Remove the finished blocks, once the result that they make is written."""
+        """Remove the finished blocks, once the result that they make is written.
+
+        Another run of the same study may be at work in the folder: then that stays.
+        """
         for path in self.folder.glob("*.npz"):
-            path.unlink()
-        self.folder.rmdir()
+            path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.folder.rmdir()
 
     def _path(self, block: Block) -> Path:
         return self.folder / f"{block.name}.npz"

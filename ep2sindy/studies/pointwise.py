@@ -84,7 +84,7 @@ def pointwise(
     kept: where finished blocks are found again by a run that takes up a broken one.
     progress: told of the points of every finished block.
     Raises ValueError for a field without space, a variable it lacks, or where no point could be
-    fitted and a fit failed, the first reason.
+    fitted, with the first reason.
     """
     _check(field, search)
     part = field[list(search.variables)]
@@ -106,9 +106,17 @@ def pointwise(
         _place(result, waiting[number], done)
         reasons += [reason] if reason else []
         progress(waiting[number].n_points)
-    if reasons and not (result["status"] == 0).any():
-        raise ValueError(f"no point could be fitted: {min(reasons)}")
+    if not (result["status"] == 0).any():
+        raise ValueError(f"no point could be fitted: {_why_none(result, reasons)}")
     return result
+
+
+def _why_none(result: xr.Dataset, reasons: Sequence[str]) -> str:
+    if reasons:
+        return min(reasons)
+    counts = {name: int((result["status"] == k).sum()) for k, name in enumerate(STATUSES)}
+    found = ", ".join(f"{n} with {name.replace('_', ' ')}" for name, n in counts.items() if n)
+    return f"of {result['status'].size} points {found}; see to the mask and to least_variation"
 
 
 def _check(field: xr.Dataset, search: PointSearch) -> None:
