@@ -21,8 +21,9 @@ class Bootstraps:
 
     Each of the `n` draws takes, with replacement, a random share of the training groups
     between `smallest` and `largest`, and leaves out `n_culled` random terms.
-    block: groups drawn together, side by side; 1 draws them one by one, as the thesis does, and
-    then says too little of a time series, whose neighbours are alike.
+    block: training groups drawn together, side by side; 1 draws them one by one, as the thesis
+    does, and then says too little of a time series, whose neighbours are alike. Above 1 for one
+    trajectory only. A draw of fewer rows than there are varies more than the whole record would.
     n = 0: one search on all training rows and terms. Source: the thesis, II-C and II-H.
     """
 
@@ -56,6 +57,11 @@ class Bootstraps:
             raise ValueError(
                 f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
                 "or use a larger library"
+            )
+        if self.block > 1 and len(problem.trajectories) > 1:
+            raise ValueError(
+                f"blocks of {self.block} would cross from one trajectory to the next: "
+                f"{len(problem.trajectories)} trajectories came; use block=1"
             )
         _, group = np.unique(problem.groups[~problem.test], return_inverse=True)
         n_groups = int(group.max()) + 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Protocol, runtime_checkable
@@ -10,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
-# Pieces handed to a cluster ahead of their turn, per worker: they queue there with their data.
+# Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
 AHEAD = 2
 
 
@@ -63,7 +64,8 @@ class Loky:
     def run(
         self, function: Callable[[Any], Any], pieces: Iterable[Any]
     ) -> Iterator[tuple[int, Any]]:
-        workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered")
+        # Pieces are pickled as they are: joblib would keep a copy of every large array on disk.
+        workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
         yield from workers(delayed(_on_one_thread)(function, each) for each in enumerate(pieces))
 
 
@@ -74,7 +76,7 @@ class Dask:
     A piece whose worker dies is given to another, as often as the scheduler allows (three times,
     unless it was told otherwise). Workers need this package, and see the same files under the
     same paths. Needs the extra `cluster`.
-    Raises OSError when nobody answers at the address within timeout_s.
+    Raises OSError when no scheduler answers at the address, or none has a worker, within timeout_s.
     """
 
     address: str
@@ -84,15 +86,26 @@ class Dask:
         self, function: Callable[[Any], Any], pieces: Iterable[Any]
     ) -> Iterator[tuple[int, Any]]:
         distributed = _distributed()
+        with self._client(distributed) as client:
+            yield from self._run(client, distributed.as_completed, function, pieces)
+
+    @contextmanager
+    def _client(self, distributed: Any) -> Iterator[Any]:
+        """A connection to a scheduler that has a worker, and that nobody else uses by default."""
+        client = None
         try:
-            client = distributed.Client(self.address, timeout=self.timeout_s)
+            client = distributed.Client(self.address, timeout=self.timeout_s, set_as_default=False)
+            client.wait_for_workers(1, timeout=self.timeout_s)
         except (OSError, ValueError) as error:
+            if client is not None:
+                client.close()
             raise OSError(
-                f"a dask scheduler must answer at {self.address!r} within {self.timeout_s:g} s: "
-                f"{error}; start one with `dask scheduler`, or choose parallel=loky"
+                f"a dask scheduler with a worker must answer at {self.address!r} within "
+                f"{self.timeout_s:g} s: {error}; start `dask scheduler` and `dask worker`, or "
+                "choose parallel=loky"
             ) from error
         with client:
-            yield from self._run(client, distributed.as_completed, function, pieces)
+            yield client
 
     def _run(
         self,
@@ -101,21 +114,27 @@ class Dask:
         function: Callable[[Any], Any],
         pieces: Iterable[Any],
     ) -> Iterator[tuple[int, Any]]:
-        waiting = enumerate(pieces)
+        waiting, n_running = enumerate(pieces), 0
 
-        def submitted(count: int) -> list[Any]:
+        def submitted() -> list[Any]:
+            """What keeps all threads busy, of workers that have joined since, too."""
+            n_threads = max(1, sum(client.nthreads().values()))
             return [
                 client.submit(_on_one_thread, function, each, pure=False)
-                for each in islice(waiting, count)
+                for each in islice(waiting, max(0, AHEAD * n_threads - n_running))
             ]
 
-        n_workers = max(1, len(client.scheduler_info()["workers"]))
-        running = as_completed(submitted(AHEAD * n_workers))
-        for future in running:
+        running = as_completed(loop=client.loop)
+        while True:
+            following = submitted()
+            running.update(following)
+            n_running += len(following)
+            if not n_running:
+                return
+            future = next(running)
+            n_running -= 1
             result = future.result()
             future.release()
-            for following in submitted(1):
-                running.add(following)
             yield result
 
 

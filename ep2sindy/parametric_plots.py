@@ -43,7 +43,17 @@ def trends_figure(
             here = [_at(table, at) for table in (estimates, published)]
             for k, fit in enumerate(fits):
                 offset = APART * (k - 0.5 * (len(fits) - 1))
-                _series(ax, here, laws.get(fit, {}), along, at, panel, fit, COLOURS[k], offset)
+                _series(
+                    ax,
+                    here,
+                    laws.get(fit, {}),
+                    along,
+                    at,
+                    panel,
+                    fit,
+                    COLOURS[k % len(COLOURS)],
+                    offset,
+                )
             _ticks(ax, here, along)
         row[0].set_ylabel(", ".join(_label(name, labels) for name in panel))
     for column, (along, at) in zip(axes.T, trends, strict=True):

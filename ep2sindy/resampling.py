@@ -11,6 +11,7 @@ def moving_block_counts(
 ) -> Int[np.ndarray, " rows"]:
     """How often each row comes in one draw of `n_drawn` rows, taken as runs of `block` rows.
 
+    A row may stand for a group of rows, which come together.
     Every run lies within the rows; the last one is cut to length. block: 1 draws single rows;
     for a time series, long enough that rows farther apart are unrelated.
     Raises ValueError for a block that is not between one row and all of them.
@@ -18,8 +19,8 @@ def moving_block_counts(
     """
     if not 1 <= block <= n_rows:
         raise ValueError(
-            f"a block must hold between one row and all {n_rows}: {block} came; shorten it, or use "
-            "more data"
+            f"a block must hold between one and all {n_rows} groups of training rows: {block} "
+            "came; shorten it, or use more data"
         )
     n_blocks = -(-n_drawn // block)
     first = rng.integers(n_rows - block + 1, size=n_blocks)

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from ep2sindy.library import polynomial
+from ep2sindy.model import SparseModel
 from ep2sindy.parametric_plots import trends_figure
 from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
 from ep2sindy.studies.joint_points import searched_jointly
@@ -83,8 +84,9 @@ def run(config: DictConfig) -> Path:
             trends=[(str(each.along), dict(each.at)) for each in config.trends],
             published=published,
         )
+        _write_numbers(folder, outcome)
         print_outcome(screen, outcome)
-        _write(folder, config, outcome)
+        _write_views(folder, config, outcome)
     return folder.path
 
 
@@ -134,16 +136,11 @@ def _told(
         yield number, result
 
 
-def _write(folder: RunFolder, config: DictConfig, outcome: Outcome) -> None:
-    figures = _figures(config, outcome)
+def _write_numbers(folder: RunFolder, outcome: Outcome) -> None:
+    """What no view may lose: models and tables."""
     for number, result in enumerate(outcome.results):
         for name, fit in result.fits.items():
             folder.write_model(f"point_{number}_{name}", fit.model)
-    models = {
-        f"point {number}, {name}": fit.model
-        for number, result in enumerate(outcome.results)
-        for name, fit in result.fits.items()
-    }
     tables = {
         "points": points_table(outcome),
         "quantities": estimates_table(outcome),
@@ -151,15 +148,27 @@ def _write(folder: RunFolder, config: DictConfig, outcome: Outcome) -> None:
         "laws": laws_table(outcome),
         "trends": trends_table(outcome),
         "tied": tied_table(outcome),
-        "coefficients": coefficients(models, heading="model"),
+        "coefficients": coefficients(_models(outcome), heading="model"),
     }
     for name, table in tables.items():
         folder.write_table(name, table)
+
+
+def _models(outcome: Outcome) -> dict[str, SparseModel]:
+    return {
+        f"point {number}, {name}": fit.model
+        for number, result in enumerate(outcome.results)
+        for name, fit in result.fits.items()
+    }
+
+
+def _write_views(folder: RunFolder, config: DictConfig, outcome: Outcome) -> None:
+    figures = _figures(config, outcome)
     folder.write_figures(figures)
     write_tensorboard(
         folder.path / "tensorboard",
         figures=figures,
-        texts={name: f"    {model.text()}" for name, model in models.items()},
+        texts={name: f"    {model.text()}" for name, model in _models(outcome).items()},
         hparams=_hparams(config),
         metrics=_metrics(outcome),
     )
@@ -168,9 +177,9 @@ def _write(folder: RunFolder, config: DictConfig, outcome: Outcome) -> None:
 
 
 def _figures(config: DictConfig, outcome: Outcome) -> dict[str, Figure]:
-    """None where no point oscillates: an empty figure says nothing."""
+    """None where no point oscillates or no trend was asked for: an empty figure says nothing."""
     estimates = estimates_table(outcome)
-    if estimates.empty:
+    if estimates.empty or not outcome.trends or not config.figures.panels:
         return {}
     drawn = {fit: laws for fit, laws in outcome.laws.items() if not fit.endswith(REFINED)}
     figure = trends_figure(

@@ -39,6 +39,8 @@ def print_outcome(screen: Screen, outcome: Outcome) -> None:
     ):
         if len(table):
             screen.print(_rich(title, table))
+    if outcome.joint and outcome.joint.why_not_tied:
+        screen.print(f"not tied by a law: {outcome.joint.why_not_tied}")
     screen.print(LEFT_OUT)
 
 

@@ -75,10 +75,10 @@ def run(config: DictConfig) -> Path:
         )
         result = result.assign(regime=found.labels, confidence=found.confidence)
         write_result(folder.path / "pointwise.nc", result)
-        kept.clear()
         outcome = Outcome(config.experiment, result, found, wall_s)
         print_outcome(screen, outcome)
         _write(folder, config, outcome, outline)
+        kept.clear()
     return folder.path
 
 
@@ -88,10 +88,11 @@ def _write(
     folder.write_table("terms", terms_table(outcome.result))
     folder.write_table("regimes", outcome.regimes.table)
     figures = {
-        "coefficients": coefficient_maps(outcome.result, outline=outline),
         "regimes": regime_map(outcome.regimes, outline=outline),
         "quality": quality_maps(outcome.result, outline=outline),
     }
+    if (outcome.result["n_terms"] > 0).any():
+        figures |= {"coefficients": coefficient_maps(outcome.result, outline=outline)}
     folder.write_figures(figures)
     found = summary(outcome)
     counts = {f"points/{name}": float(found["status"].get(name, 0)) for name in STATUSES}
@@ -149,15 +150,28 @@ def library_of(config: DictConfig, field: xr.Dataset) -> Library:
 
 
 def blocks_key(config: DictConfig) -> str:
-    """What the result of a block depends on: settings, the data's file, this package's code."""
+    """What the result of a block depends on: settings, the files they name, the code."""
     settings = cast(dict, OmegaConf.to_container(config, resolve=True))
     decisive = {key: value for key, value in settings.items() if key not in AFTERWARDS}
-    path = settings["data"].get("path")
-    if path is not None:
-        paths = [Path(path), *sorted(Path(path).rglob("*"))]  # a Zarr store is a folder
-        stats = [each.stat() for each in paths if each.exists()]
-        decisive["stamp"] = [(each.st_size, each.st_mtime_ns) for each in stats]
-    return fingerprint(json.dumps(decisive, sort_keys=True), sources=Path(ep2sindy.__file__).parent)
+    decisive["files"] = [
+        (str(path), each.stat().st_size, each.stat().st_mtime_ns)
+        for path in files_named({key: settings[key] for key in ("data", "prepare")})
+        for each in (path, *sorted(path.rglob("*")))  # a Zarr store is a folder
+    ]
+    found = json.dumps(decisive, sort_keys=True)
+    for package in (Path(ep2sindy.__file__).parent, Path(__file__).parent):
+        found = fingerprint(found, sources=package)
+    return found
+
+
+def files_named(settings: object) -> list[Path]:
+    """Every text among some settings that is the path of a file or folder, but the cache."""
+    if isinstance(settings, dict):
+        settings = [value for key, value in settings.items() if key != "cache"]
+    if isinstance(settings, list):
+        return [path for each in settings for path in files_named(each)]
+    is_path = isinstance(settings, str) and settings and Path(settings).exists()
+    return [Path(str(settings))] if is_path else []
 
 
 @contextmanager

@@ -44,6 +44,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "regimes": regimes.n_regimes,
         "file": "pointwise.nc",
         "status": status_counts(outcome),
+        "no_fit": outcome.result.attrs["no_fit"] or None,
         "equations": [regimes.equations(k) for k in range(regimes.n_regimes)],
     }
 

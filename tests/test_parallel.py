@@ -1,6 +1,7 @@
 import os
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,9 +79,26 @@ def test_pieces_of_a_dead_worker_are_done_by_another(address: str, tmp_path: obj
 
 def test_a_silent_scheduler_is_named() -> None:
     begin = time.monotonic()
-    with pytest.raises(OSError, match=r"must answer at 'tcp://127.0.0.1:9' within 0.5 s"):
+    with pytest.raises(OSError, match=r"must answer at 'tcp://127.0.0.1:9' within 0.5 s: .*start "):
         list(Dask("tcp://127.0.0.1:9", timeout_s=0.5).run(total, PIECES))
     assert time.monotonic() - begin < 30.0
+
+
+def test_a_scheduler_without_workers_is_named() -> None:
+    with (
+        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=None) as empty,
+        pytest.raises(OSError, match="a dask scheduler with a worker must answer"),
+    ):
+        list(Dask(empty.scheduler_address, timeout_s=0.5).run(total, PIECES))
+
+
+def test_large_pieces_are_not_kept_on_disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(tmp_path))
+    sizes = []
+    pieces = (np.full(500_000, float(k)) for k in range(4))
+    for _ in Loky(n_jobs=2).run(total, pieces):
+        sizes.append(sum(path.stat().st_size for path in tmp_path.rglob("*.pkl")))
+    assert max(sizes) == 0
 
 
 def test_an_address_must_be_one() -> None:

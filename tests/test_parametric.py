@@ -457,10 +457,6 @@ def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
             ),
             "the quantity of 'x: 1': '1' is not in the support of 'x'",
         ),
-        (
-            lambda: trends([power_law(0.0, 1.0), power_law(1.0, 1.0)], along="V", at={}),
-            "an exponent needs parameters above zero: 0 came",
-        ),
     ],
 )
 def test_settings_that_cannot_work_are_refused(make: object, message: str) -> None:

@@ -16,9 +16,10 @@ from ep2sindy.library import named_terms
 from ep2sindy.parallel import Dask, Loky, Serial
 from ep2sindy.regression import Differential, RandomSplit
 from ep2sindy.search import AdaptiveLasso, BestSubset
-from ep2sindy.selection import EBIC, Knee
+from ep2sindy.selection import EBIC
 from ep2sindy.studies.blocks import Kept, blocks_of
 from ep2sindy.studies.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.validation import IntegralScore
 from ep2sindy.weak import Weak
 
 T = np.linspace(0.0, 2.0, 201)
@@ -177,6 +178,7 @@ def test_what_cannot_be_fitted_is_flagged_and_never_zero() -> None:
     named = [[STATUSES[k] for k in row] for row in result["status"].values]
     assert named[0] == ["no_plasma", "missing_samples", "too_little_variation"]
     assert named[1] == ["too_little_variation", "no_fit", "fitted"]
+    assert "every term must be finite on every row: 'x^6'" in result.attrs["no_fit"]
     for name in ("coef", "inclusion", "weight", "coef_draws", "r2_test", "n_terms"):
         lost = np.isnan(result[name]).transpose(..., "z", "r").values
         assert (lost == (result["status"].values != 0)).all()
@@ -190,11 +192,13 @@ def test_masked_inputs_mask_the_point() -> None:
     assert (status.isel(z=slice(1, None)) == 0).all()
 
 
-def test_a_setting_that_fits_nowhere_is_an_error() -> None:
+def test_a_setting_that_fits_nowhere_is_an_error(tmp_path: Path) -> None:
     few = searching(formulation=Differential(), library=LIBRARY)
     short = parabolas().isel(time=slice(0, 8))
-    with pytest.raises(ValueError, match="no point could be fitted: smoothing needs at least 11"):
-        pointwise(short, few, workers=Serial())
+    kept = Kept(tmp_path)
+    for _ in range(2):  # the second time from kept blocks
+        with pytest.raises(ValueError, match="could be fitted: smoothing needs at least 11"):
+            pointwise(short, few, workers=Serial(), kept=kept)
 
 
 def test_a_field_without_plasma_is_an_error() -> None:
@@ -293,6 +297,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         pointwise(field.assign(x=field["x"].isel(time=0, drop=True)), searching(), workers=Serial())
 
 
-def test_rules_that_need_all_fronts_serve_every_point() -> None:
-    result = pointwise(parabolas(), searching(selection=Knee()), workers=Serial())
-    assert (result["n_terms"] >= 1).all()
+def test_rules_that_integrate_all_equations_serve_every_point() -> None:
+    field = parabolas(Z[:1], R[:1])
+    result = pointwise(field, searching(selection=IntegralScore()), workers=Serial())
+    assert result["n_terms"].item() == 2

@@ -36,7 +36,7 @@ def test_single_rows_are_drawn_as_plain_integers() -> None:
 
 @pytest.mark.parametrize("block", [0, 31])
 def test_a_block_must_fit(block: int) -> None:
-    with pytest.raises(ValueError, match=f"between one row and all 30: {block} came"):
+    with pytest.raises(ValueError, match=f"all 30 groups of training rows: {block} came"):
         moving_block_counts(30, n_drawn=10, block=block, rng=np.random.default_rng(0))
 
 
@@ -51,6 +51,17 @@ def test_bootstraps_draw_neighbours_together() -> None:
     whole = Bootstraps(n=2, n_culled=0, smallest=1.0, largest=1.0, block=n_train)
     grams, _ = whole.draw(problem, terms, np.random.default_rng(0))
     np.testing.assert_allclose(grams.xx, np.repeat(problem.train_gram.xx, 2, axis=0), rtol=1e-12)
+
+
+def test_blocks_never_cross_trajectories() -> None:
+    system = lorenz()
+    run = system.trajectory()
+    (problem,) = Differential().assemble(
+        [run, run], system.model.library, rng=np.random.default_rng(0)
+    )
+    terms = np.ones(len(system.model.library), dtype=np.bool_)
+    with pytest.raises(ValueError, match="cross from one trajectory to the next: 2 trajectories"):
+        Bootstraps(block=2).draw(problem, terms, np.random.default_rng(0))
 
 
 def test_a_block_of_a_bootstrap_is_a_whole_number() -> None:

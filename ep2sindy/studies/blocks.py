@@ -71,8 +71,8 @@ class Kept:
         except OSError as error:
             raise OSError(
                 f"a finished block must be kept on disk: writing to {self.folder} failed with "
-                f"{error.strerror or error!r}; the blocks before it are kept, so free some space "
-                "and start the same run again"
+                f"{error.strerror or error!r}; the blocks before it are kept: mend that, and start "
+                "the same run again"
             ) from error
 
     def clear(self) -> None:
@@ -80,7 +80,7 @@ class Kept:
 
         Another run of the same study may be at work in the folder: then that stays.
         """
-        for path in self.folder.glob("*.npz"):
+        for path in self.folder.glob("[!.]*.npz"):  # not what is being written
             path.unlink(missing_ok=True)
         with suppress(OSError):
             self.folder.rmdir()

@@ -160,8 +160,8 @@ def parametric_study(
 ) -> Iterator[tuple[int, PointResult]]:
     """Every point on its own samples: all cases fitted and refined, and terms searched for.
 
-    Yields (number of the point, result) in any order; a result depends neither on the workers nor
-    on the other points.
+    Yields (number of the point, result) in any order; a result depends on its data and its place
+    in the list, not on the workers or on what the other points are.
     Raises ValueError for points that lack a state or a variable, or differ in its unit.
     """
     variables = [*study.library.variables, *study.searching.library.variables]
@@ -210,7 +210,7 @@ def _least_squares(
     """The case's fit, its intervals and covariance from rows redrawn in blocks of time."""
     provenance = {"formulation": repr(study.formulation), "trajectories": run.label}
     model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
-    n_groups = len(np.unique(np.concatenate([problem.groups for problem in problems])))
+    n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
     group_s = (run.t[-1] - run.t[0]) / n_groups
     draws = resampled_coefficients(
         problems,

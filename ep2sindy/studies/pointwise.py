@@ -23,7 +23,8 @@ from ep2sindy.studies.blocks import Block, Kept, blocks_of
 from ep2sindy.trajectory import Trajectory
 from ep2sindy.units import unit_product
 
-STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", "no_fit")
+NO_FIT = "no_fit"
+STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,8 @@ def pointwise(
     whose support of that size held the term; weight, coef times the root mean square of its term,
     with its sign, as a share of all terms of the equation (not the variance: the constant has
     none); coef_draws and weight_draws, the same in every bootstrap; r2_train, r2_test, n_terms
-    per equation; status per point. Where the status is not 0, the others are NaN.
+    per equation; status per point. Where the status is not 0, the others are NaN. The attribute
+    no_fit holds a reason why a fit failed, if one did.
     Only the block at work is in memory where the field is open lazily.
     kept: where finished blocks are found again by a run that takes up a broken one.
     progress: told of the points of every finished block.
@@ -99,21 +101,19 @@ def pointwise(
             _place(result, block, done)
             progress(block.n_points)
     pieces = (part.isel(block.slices) for block in waiting)
-    reasons = []
-    for number, (done, reason) in workers.run(partial(_searched, search), pieces):
+    for number, done in workers.run(partial(_searched, search), pieces):
         if kept:
             kept.write(waiting[number], done)
         _place(result, waiting[number], done)
-        reasons += [reason] if reason else []
         progress(waiting[number].n_points)
     if not (result["status"] == 0).any():
-        raise ValueError(f"no point could be fitted: {_why_none(result, reasons)}")
+        raise ValueError(f"no point could be fitted: {_why_none(result)}")
     return result
 
 
-def _why_none(result: xr.Dataset, reasons: Sequence[str]) -> str:
-    if reasons:
-        return min(reasons)
+def _why_none(result: xr.Dataset) -> str:
+    if result.attrs[NO_FIT]:
+        return str(result.attrs[NO_FIT])
     counts = {name: int((result["status"] == k).sum()) for k, name in enumerate(STATUSES)}
     found = ", ".join(f"{n} with {name.replace('_', ' ')}" for name, n in counts.items() if n)
     return f"of {result['status'].size} points {found}; see to the mask and to least_variation"
@@ -159,6 +159,7 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
             "coef_units": (("equation", "term"), coef_units),
             **{axis: (axis, grid_points(field, axis), {"units": "m"}) for axis in axes},
         },
+        attrs={NO_FIT: ""},
     )
 
 
@@ -176,13 +177,16 @@ LAYOUT: Mapping[str, tuple[str, ...]] = {
 
 
 def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> None:
-    for name, values in done.items():
-        target = result[name].isel(block.slices)
+    reasons = {str(result.attrs[NO_FIT]), str(done[NO_FIT])} - {""}
+    result.attrs[NO_FIT] = min(reasons, default="")  # whichever block came first
+    for name in (*LAYOUT, "status"):
+        values, target = done[name], result[name].isel(block.slices)
         target.values[...] = values.reshape(target.shape)
 
 
-def _searched(search: PointSearch, block: xr.Dataset) -> tuple[dict[str, np.ndarray], str]:
+def _searched(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
     """Every point of a block, points along the last axis; why a fit failed, if one did."""
+    block = block.load(scheduler="synchronous")  # in chunks, if at all, on this thread
     t = grid_points(block, "time")
     columns = _columns(block, search.variables)
     status = np.array([_status(values, search) for values in columns], dtype=np.int8)
@@ -195,12 +199,11 @@ def _searched(search: PointSearch, block: xr.Dataset) -> tuple[dict[str, np.ndar
             try:
                 point = _at_point(_trajectory(t, values, block, search), search)
             except ValueError as error:
-                status[k], reason = STATUSES.index("no_fit"), reason or str(error)
+                status[k], reason = STATUSES.index(NO_FIT), reason or str(error)
         for name, value in point.items():
             found[name].append(value)
-    return {name: np.stack(each, axis=-1) for name, each in found.items()} | {
-        "status": status
-    }, reason
+    stacked = {name: np.stack(each, axis=-1) for name, each in found.items()}
+    return stacked | {"status": status, NO_FIT: np.array(reason)}
 
 
 def _columns(

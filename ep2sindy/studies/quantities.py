@@ -84,13 +84,17 @@ def drawn_estimates(
 ) -> tuple[dict[str, Estimate], dict[str, Float[np.ndarray, " draws"]]]:
     """Estimates whose intervals are percentiles of draws, and the draws of every quantity.
 
+    The reciprocal of a coefficient whose own interval holds zero may be anything.
     coef, draws: in the order of the constraint's coefficients.
     """
     estimates, drawn = {}, {}
     for name, quantity in quantities.items():
         k = quantity.place(constraint, library)
         drawn[name] = quantity.of(draws[:, k])
-        low, high = np.percentile(drawn[name], (50 * (1 - LEVEL), 50 * (1 + LEVEL)))
+        ends = (50 * (1 - LEVEL), 50 * (1 + LEVEL))
+        low, high = np.percentile(drawn[name], ends)
+        if quantity.power < 0 and np.prod(np.sign(np.percentile(draws[:, k], ends))) <= 0:
+            low, high = -np.inf, np.inf
         estimates[name] = Estimate(float(quantity.of(coef[k : k + 1])[0]), float(low), float(high))
     return estimates, drawn
 

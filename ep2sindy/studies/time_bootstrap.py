@@ -32,10 +32,15 @@ def resampled_coefficients(
     model: of `constrained_fit` on these problems. block: groups that are drawn side by side.
     Returns one column per coefficient of the constraint. Draws are moved so that their mean is
     the fit: blocks seldom reach the ends of the record, which would shift them.
-    Raises ValueError for blocks that leave fewer than five to draw from.
+    Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for
     Dependent Data, 2.5, for the centre.
     """
+    if len(problems[0].trajectories) > 1:
+        raise ValueError(
+            "a bootstrap over time needs one trajectory, or blocks would cross from one to the "
+            f"next: {len(problems[0].trajectories)} came"
+        )
     equations = weighted_equations(problems, constraint)
     coef = np.array([_coefficient(model, *name) for name in constraint.coefficients])
     rows = [_free_rows(equation, constraint, coef) for equation in equations]

@@ -63,14 +63,9 @@ def trends(results: Sequence[PointResult], *, along: str, at: Mapping[str, float
 
 
 def exponent(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]) -> float:
-    """Slope of log |values| by log x, by least squares; NaN where x is not two numbers or more.
-
-    Raises ValueError for a parameter that is not above zero.
-    """
-    if len(x) < 2 or np.ptp(x) == 0.0:
+    """Slope of log |values| by log x, by least squares; NaN unless x is two numbers above zero."""
+    if len(x) < 2 or np.ptp(x) == 0.0 or x.min() <= 0.0:
         return float("nan")
-    if x.min() <= 0.0:
-        raise ValueError(f"an exponent needs parameters above zero: {x.min():g} came")
     centred = np.log(x) - np.log(x).mean()
     return float(centred @ np.log(np.abs(values)) / np.square(centred).sum())
 
