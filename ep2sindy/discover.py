@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -28,10 +28,10 @@ class Discovery:
     ambiguities: terms that these data cannot tell apart.
     """
 
-    fronts: Mapping[str, ParetoFront]
-    scores: Mapping[str, Float[np.ndarray, " candidates"]]
+    fronts: Mapping[str, ParetoFront] = field(repr=False)
+    scores: Mapping[str, Float[np.ndarray, " candidates"]] = field(repr=False)
     chosen: Mapping[str, Candidate]
-    model: SparseModel
+    model: SparseModel = field(repr=False)
     ambiguities: Sequence[Ambiguity]
 
 

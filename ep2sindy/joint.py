@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -43,11 +43,11 @@ class JointDiscovery:
     ambiguities: by point, terms that its data cannot tell apart.
     """
 
-    fronts: Mapping[str, JointFront]
-    scores: Mapping[str, Float[np.ndarray, " supports"]]
+    fronts: Mapping[str, JointFront] = field(repr=False)
+    scores: Mapping[str, Float[np.ndarray, " supports"]] = field(repr=False)
     chosen: Mapping[str, tuple[str, ...]]
-    models: Mapping[str, SparseModel]
-    ambiguities: Mapping[str, Sequence[Ambiguity]]
+    models: Mapping[str, SparseModel] = field(repr=False)
+    ambiguities: Mapping[str, Sequence[Ambiguity]] = field(repr=False)
 
 
 def discover_jointly(

@@ -10,11 +10,20 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap, Normalize
+from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from ep2sindy.fields import SPACE, cell_edges
+from ep2sindy.map_panels import (
+    CM,
+    COUNTS,
+    SHARES,
+    draw_map,
+    draw_values,
+    finish_panels,
+    map_figure,
+    space_axes,
+)
 from ep2sindy.model import latex_term
 from ep2sindy.names import latex_derivative, latex_term_name
 from ep2sindy.plots import COLOURS, DATA, unit_text
@@ -22,12 +31,11 @@ from ep2sindy.setting_plots import MORE_COLOURS
 from ep2sindy.studies.regimes import Regimes
 from ep2sindy.thruster.parameters import Thruster
 
-CM = 100.0  # per m
 ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
 GAP = 0.12  # half width of the colour bar's middle, where terms are absent
 SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
+MEDIANS = "terms that act, with medians over the regime's points that have them"
 STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
-PANEL_WIDTH = 1.9  # inches
 
 
 def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
@@ -43,9 +51,9 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     if not terms:
         raise ValueError("coefficient maps need a term: no point of the study selected any")
     coef = result["coef"].sel(term=terms)
-    flat = len(_space(coef)) == 1
+    flat = len(space_axes(coef)) == 1
     shape = coef.sizes["equation"], len(terms)
-    figure = _figure(coef, shape, extra=1.1)
+    figure = map_figure(coef, shape, extra=1.1)
     axes = figure.subplots(*shape, squeeze=False, sharex=True, sharey="col" if flat else True)
     for column, term in zip(axes.T, terms, strict=True):
         column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=10)
@@ -58,7 +66,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
         row[0].annotate(
             name, (-0.42, 0.5), xycoords="axes fraction", fontsize=12, ha="right", va="center"
         )
-    _finish(axes, coef, outline)
+    finish_panels(axes, coef, outline)
     entries = {"source (+)": SOURCE, "sink (−)": SINK} | ({} if flat else {"not selected": ABSENT})
     figure.legend(
         handles=[Patch(color=colour, label=label) for label, colour in entries.items()],
@@ -72,7 +80,9 @@ def _signed_maps(figure: Figure, column: Sequence[Axes], coef: xr.DataArray) -> 
     low, high = _decades(coef.values)
     scale = _signed_colours()
     for ax, values in zip(column, coef, strict=True):
-        _map(ax, values.copy(data=_signed_log(values.values, low, high)), scale, Normalize(-1, 1))
+        draw_map(
+            ax, values.copy(data=_signed_log(values.values, low, high)), scale, Normalize(-1, 1)
+        )
     bar = figure.colorbar(
         ScalarMappable(Normalize(-1, 1), scale), ax=column, location="bottom", aspect=14,
         pad=0.02, shrink=0.95,
@@ -127,7 +137,7 @@ def _signed_colours() -> ListedColormap:
 
 def _signed_points(column: Sequence[Axes], coef: xr.DataArray) -> None:
     """Magnitudes of one term in all equations along the one axis, sources and sinks apart."""
-    (axis,) = _space(coef)
+    (axis,) = space_axes(coef)
     for ax, values in zip(column, coef, strict=True):
         for sign, colour, marker in ((1, SOURCE, "^"), (-1, SINK, "v")):
             chosen = sign * values.values > 0
@@ -139,32 +149,33 @@ def _signed_points(column: Sequence[Axes], coef: xr.DataArray) -> None:
 
 
 def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
-    """Where each regime lies, how sure that is, and the equations of every regime.
+    """Where each regime lies, how sure that is, and the terms that act in it.
 
-    White: points without equations.
+    Coefficients are medians over the regime's points that have the term, so no point need have
+    the equation as it stands. White: points without equations.
     """
     n, n_equations = regimes.n_regimes, regimes.table["equation"].nunique()
     colours = MORE_COLOURS if n <= len(MORE_COLOURS) else colormaps["tab20"](np.arange(n) % 20)
-    flat = len(_space(regimes.labels)) == 1
+    flat = len(space_axes(regimes.labels)) == 1
     n_columns = 1 if flat or n <= 3 else 2
     text = -(-n // n_columns) * (0.15 * (1 + n_equations) + 0.12)
     shape = (2, 1) if flat else (1, 2)
-    figure = _figure(regimes.labels, shape, scale=2.2, extra=text + 0.5)
+    figure = map_figure(regimes.labels, shape, scale=2.2, extra=text + 0.75)
     heights = [1, 2] if flat else None
     axes = figure.subplots(
         *shape, squeeze=False, sharex=True, sharey=not flat, height_ratios=heights
     )
     labels = regimes.labels.where(regimes.labels >= 0)
     norm = BoundaryNorm(np.arange(n + 1) - 0.5, n)
-    _map(axes.flat[0], labels, ListedColormap(list(colours[:n])), norm)
+    draw_map(axes.flat[0], labels, ListedColormap(list(colours[:n])), norm)
     axes.flat[0].set_title("regime", fontsize=10)
-    _values(figure, axes.flat[1], regimes.confidence, "Greens", Normalize(0.0, 1.0))
+    draw_values(figure, axes.flat[1], regimes.confidence, SHARES, Normalize(0.0, 1.0))
     axes.flat[1].set_title("confidence", fontsize=10)
-    _finish(axes, regimes.labels, outline)
+    finish_panels(axes, regimes.labels, outline)
     figure.legend(
         handles=[Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)],
         loc="outside lower center", ncols=n_columns, frameon=False, fontsize=8, labelspacing=0.8,
-        handlelength=1.2,
+        handlelength=1.2, title=MEDIANS, title_fontsize=9,
     )  # fmt: skip
     return figure
 
@@ -186,7 +197,7 @@ def _equation_latex(state: str, terms: Mapping[str, float]) -> str:
 
 
 def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
-    """R2 and number of terms of every equation, and what became of every point.
+    """R2 and number of terms of every equation; what became of the points, unless all are fitted.
 
     R2 is that of the held-out rows, or of the training rows where none were held out; below 0 is
     drawn as 0.
@@ -194,23 +205,25 @@ def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figu
     held_out = bool(np.isfinite(result["r2_test"]).any())
     r2 = result["r2_test" if held_out else "r2_train"]
     n_equations = result.sizes["equation"]
-    figure = _figure(r2, (n_equations, 3), scale=1.4, extra=0.9)
-    axes = figure.subplots(n_equations, 3, squeeze=False, sharex=True)
+    n_columns = 3 if (result["status"] != 0).any() else 2
+    figure = map_figure(r2, (n_equations, n_columns), scale=1.4, extra=0.9)
+    axes = figure.subplots(n_equations, n_columns, squeeze=False, sharex=True)
     most = max(1, int(result["n_terms"].max()))
     counts = BoundaryNorm(np.arange(most + 2) - 0.5, 256)
     for row, equation in zip(axes, result["equation"].values, strict=True):
         name = latex_derivative(str(equation))
-        _values(
-            figure, row[0], r2.sel(equation=equation).clip(min=0.0), "Blues", Normalize(0.0, 1.0)
+        draw_values(
+            figure, row[0], r2.sel(equation=equation).clip(min=0.0), SHARES, Normalize(0.0, 1.0)
         )
         row[0].set_title(f"${name}$: $R^2$, {'held-out' if held_out else 'training'}", fontsize=9)
-        _values(figure, row[1], result["n_terms"].sel(equation=equation), "Purples", counts)
+        draw_values(figure, row[1], result["n_terms"].sel(equation=equation), COUNTS, counts)
         row[1].set_title(f"${name}$: number of terms", fontsize=9)
-    _status(figure, axes[0, 2], result["status"])
-    for ax in axes[1:, 2]:
-        ax.remove()
-    _finish(axes[:, :2], r2, outline)
-    _finish(axes[:1, 2:], r2, outline)
+    finish_panels(axes[:, :2], r2, outline)
+    if n_columns == 3:
+        _status(figure, axes[0, 2], result["status"])
+        for ax in axes[1:, 2]:
+            ax.remove()
+        finish_panels(axes[:1, 2:], r2, outline)
     return figure
 
 
@@ -218,7 +231,7 @@ def _status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
     meanings = str(status.attrs["flag_meanings"]).split()
     found = [k for k in range(len(meanings)) if (status == k).any()]
     norm = BoundaryNorm(np.arange(len(meanings) + 1) - 0.5, len(meanings))
-    _map(ax, status.astype(float), ListedColormap(list(STATUS_COLOURS)), norm)
+    draw_map(ax, status.astype(float), ListedColormap(list(STATUS_COLOURS)), norm)
     ax.set_title("status of the points", fontsize=9)
     figure.legend(
         handles=[
@@ -230,97 +243,3 @@ def _status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
         ],
         loc="outside lower center", ncols=len(found), frameon=False, fontsize=8,
     )  # fmt: skip
-
-
-def _space(array: xr.DataArray | xr.Dataset) -> list[str]:
-    return [axis for axis in SPACE if axis in array.dims]
-
-
-def _figure(
-    array: xr.DataArray, shape: tuple[int, int], *, scale: float = 1.0, extra: float
-) -> Figure:
-    """A canvas whose panels come out at the field's own proportions; extra: inches around them."""
-    n_rows, n_columns = shape
-    spans = [float(np.ptp(_edges(array, axis))) for axis in _space(array)]
-    width = scale * PANEL_WIDTH
-    height = width * min(max(spans[1] / spans[0], 0.25), 2.0) if len(spans) == 2 else 1.3
-    return Figure(
-        figsize=(max(n_columns * (width + 0.35) + 0.8, 5.5), n_rows * (height + 0.45) + extra),
-        layout="constrained",
-    )
-
-
-def _edges(array: xr.DataArray, axis: str) -> Float[np.ndarray, " edges"]:
-    """Edges of the cells in m; a single point gets a millimetre to either side."""
-    points = array[axis].values.astype(np.float64)
-    return cell_edges(points) if len(points) > 1 else points[0] + np.array([-1e-3, 1e-3])
-
-
-def _map(ax: Axes, values: xr.DataArray, colours: Colormap, norm: Normalize) -> None:
-    """Cells by colour; over one axis, a strip."""
-    space = _space(values)
-    z = CM * _edges(values, space[0])
-    if len(space) == 1:
-        ax.pcolormesh(z, [0.0, 1.0], values.values[None], cmap=colours, norm=norm)
-        ax.set_yticks([])
-        return
-    r = CM * _edges(values, "r")
-    ax.pcolormesh(z, r, values.transpose("r", "z").values, cmap=colours, norm=norm)
-    ax.set_aspect("equal")
-
-
-def _values(figure: Figure, ax: Axes, values: xr.DataArray, colours: str, norm: Normalize) -> None:
-    """A map with its colour bar; over one axis, points on an ordinate."""
-    space = _space(values)
-    if len(space) == 1:
-        ax.plot(CM * values[space[0]].values, values.values, ".", color=DATA, ms=4)
-        low, high = norm.vmin or 0.0, norm.vmax or 0.0
-        ax.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
-        if isinstance(norm, BoundaryNorm):
-            ax.set_yticks(_middles(norm))
-        return
-    shades = ListedColormap(colormaps[colours](np.linspace(0.2, 0.95, 256)))
-    _map(ax, values, shades, norm)
-    bar = figure.colorbar(ScalarMappable(norm, shades), ax=ax, shrink=0.7, aspect=12, pad=0.02)
-    if isinstance(norm, BoundaryNorm):
-        bar.set_ticks(_middles(norm))
-    bar.ax.tick_params(labelsize=7)
-
-
-def _middles(norm: BoundaryNorm) -> list[float]:
-    return list(np.add(norm.boundaries[1:], norm.boundaries[:-1]) / 2)
-
-
-def _finish(axes: np.ndarray, array: xr.DataArray, outline: Thruster | None) -> None:
-    """Labels at the rim, and the channel."""
-    space = _space(array)
-    for ax in axes.flat:
-        ax.tick_params(labelsize=8)
-        if outline is not None:
-            _outline(ax, space, outline)
-    for ax in axes[-1]:
-        ax.set_xlabel(f"{space[0]} (cm)", fontsize=9)
-    if len(space) == 2:
-        for ax in axes[:, 0]:
-            ax.set_ylabel("r (cm)", fontsize=9)
-
-
-def _outline(ax: Axes, space: Sequence[str], thruster: Thruster) -> None:
-    """Walls, anode and front face as one line, the exit plane dashed; the limits stay."""
-    length, inner, outer = (
-        CM * x for x in (thruster.channel_length, thruster.inner_radius, thruster.outer_radius)
-    )
-    limits = ax.get_xlim(), ax.get_ylim()
-    if len(space) == 1:
-        for place in [length] if space == ["z"] else [inner, outer]:
-            ax.axvline(place, color=DATA, lw=0.8, ls="--")
-    else:
-        ax.plot([length, length], [inner, outer], color=DATA, lw=0.8, ls="--")
-        bottom, top = limits[1]
-        ax.plot(
-            [length, length, 0.0, 0.0, length, length],
-            [min(bottom, inner), inner, inner, outer, outer, max(top, outer)],
-            color=DATA,
-            lw=1.2,
-        )
-    ax.set(xlim=limits[0], ylim=limits[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 
 import numpy as np
@@ -53,7 +53,7 @@ class ParetoFront:
 
     equation: str
     candidates: Sequence[Candidate]
-    problem: Regression
+    problem: Regression = field(repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", tuple(self.candidates))

@@ -16,11 +16,12 @@ from tqdm import tqdm
 import ep2sindy
 from ep2sindy.files import fingerprint, replacing
 from ep2sindy.library import Library, named_terms
-from ep2sindy.map_plots import coefficient_maps, quality_maps, regime_map
+from ep2sindy.map_plots import MEDIANS, coefficient_maps, quality_maps, regime_map
 from ep2sindy.model import equation_text
 from ep2sindy.names import split_factors
-from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
-from ep2sindy.studies.blocks import Kept
+from ep2sindy.parallel import Workers
+from ep2sindy.report import LiveScalars, RunFolder, Screen, write_tensorboard
+from ep2sindy.studies.blocks import Kept, blocks_of
 from ep2sindy.studies.pointwise import STATUSES, PointSearch, pointwise
 from ep2sindy.studies.regimes import regimes
 from ep2sindy.thruster import Thruster
@@ -57,10 +58,42 @@ def run(config: DictConfig) -> Path:
         outline = instantiate(config.outline)
         field = open_prepared_field(config)
         search = PointSearch(library=library_of(config, field), **settings)
+        left_out = [name for name in config.terms if name not in search.library.names]
+        if left_out:
+            screen.print(f"terms left out, for this field lacks their variables: {left_out}")
         kept = Kept(Path(config.keep) / blocks_key(config))
-        n_points = int(np.prod([field.sizes.get(axis, 1) for axis in ("z", "r")]))
         begin = time.perf_counter()
-        with progress_of(folder, n_points) as progress:
+        result, n_before = _searched(config, field, search, workers, kept, folder, screen)
+        wall_s = time.perf_counter() - begin
+        found = regimes(
+            result, rng=np.random.default_rng(config.seed), max_regimes=config.max_regimes
+        )
+        result = result.assign(regime=found.labels, confidence=found.confidence)
+        write_result(folder.path / "pointwise.nc", result)
+        outcome = Outcome(config.experiment, result, found, wall_s, n_before)
+        print_outcome(screen, outcome)
+        _write(folder, config, outcome, outline)
+        kept.clear()
+    return folder.path
+
+
+def _searched(
+    config: DictConfig,
+    field: xr.Dataset,
+    search: PointSearch,
+    workers: Workers,
+    kept: Kept,
+    folder: RunFolder,
+    screen: Screen,
+) -> tuple[xr.Dataset, int]:
+    """The study, from where an earlier run was broken off; points that it had done."""
+    blocks = blocks_of(field, config.block_points)
+    n_before = sum(block.n_points for block in blocks if kept.holds(block))
+    n_points = sum(block.n_points for block in blocks)
+    if n_before:
+        screen.print(f"going on with {n_before} of {n_points} points that a broken run had done")
+    try:
+        with progress_of(folder, n_points, n_before) as progress:
             result = pointwise(
                 field,
                 search,
@@ -69,17 +102,12 @@ def run(config: DictConfig) -> Path:
                 block_points=config.block_points,
                 progress=progress,
             )
-        wall_s = time.perf_counter() - begin
-        found = regimes(
-            result, rng=np.random.default_rng(config.seed), max_regimes=config.max_regimes
+    except KeyboardInterrupt:
+        screen.print(
+            f"finished blocks are kept in {kept.folder}: the same command goes on with them"
         )
-        result = result.assign(regime=found.labels, confidence=found.confidence)
-        write_result(folder.path / "pointwise.nc", result)
-        outcome = Outcome(config.experiment, result, found, wall_s)
-        print_outcome(screen, outcome)
-        _write(folder, config, outcome, outline)
-        kept.clear()
-    return folder.path
+        raise
+    return result, n_before
 
 
 def _write(
@@ -99,7 +127,9 @@ def _write(
     write_tensorboard(
         folder.path / "tensorboard",
         figures=figures,
-        texts={f"regime_{k}": f"    {_text(outcome, k)}" for k in range(found["regimes"])},
+        texts={
+            f"regime_{k}": f"    {MEDIANS}: {_text(outcome, k)}" for k in range(found["regimes"])
+        },
         hparams=_hparams(config),
         metrics={key: float(found[key]) for key in ("n_points", "n_valid", "regimes")} | counts,
     )
@@ -175,8 +205,11 @@ def files_named(settings: object) -> list[Path]:
 
 
 @contextmanager
-def progress_of(folder: RunFolder, n_points: int) -> Iterator[Callable[[int], None]]:
-    """A bar with points per second, and the same in TensorBoard while the run goes on."""
+def progress_of(folder: RunFolder, n_points: int, n_before: int) -> Iterator[Callable[[int], None]]:
+    """A bar with points per second, and the same in TensorBoard while the run goes on.
+
+    n_before: points that were done already, and come first.
+    """
     begin = time.perf_counter()
     with (
         LiveScalars(folder.path / "tensorboard") as live,
@@ -188,7 +221,7 @@ def progress_of(folder: RunFolder, n_points: int) -> Iterator[Callable[[int], No
             nonlocal done
             done += n_more
             bar.update(n_more)
-            per_s = done / max(time.perf_counter() - begin, 1e-9)
+            per_s = max(done - n_before, 0) / max(time.perf_counter() - begin, 1e-9)
             live.write({"points/done": float(done), "points/per_s": per_s}, step=done)
 
         yield progress

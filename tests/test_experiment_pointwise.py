@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ep2sindy.io import write_field
+from ep2sindy.studies.blocks import Block, Kept
 from ep2sindy.studies.regions import TERMS, three_regions
 from experiments import pointwise
 from experiments.run import innermost
@@ -106,6 +107,7 @@ def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Pat
     overrides = ["data.r.name=null", "data.variables.u_ir.name=null"]
     folder = pointwise.run(composed(*on_file(line, tmp_path), *overrides))
     assert summary_of(folder)["n_points"] == 6
+    assert "lacks their variables: ['n_i*u_ir']" in (folder / "run.log").read_text()
     assert (folder / "figures" / "regimes.png").exists()
     with xr.open_dataset(folder / "pointwise.nc") as result:
         assert list(result["term"].values) == [name for name in TERMS if "u_ir" not in name]
@@ -169,6 +171,27 @@ def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:
     assert len({*same, *others}) == 5
     os.utime(grid, ns=(time.time_ns(), time.time_ns()))
     assert key() not in same
+
+
+def test_an_interrupted_run_says_how_to_go_on(
+    grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    write, overrides = Kept.write, on_file(grid, tmp_path)
+
+    def interrupted(self: Kept, block: Block, done: dict) -> None:
+        if len(list(self.folder.glob("z*"))) == 2:
+            raise KeyboardInterrupt
+        write(self, block, done)
+
+    monkeypatch.setattr(Kept, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pointwise.run(composed(*overrides))
+    assert "the same command goes on" in " ".join(capsys.readouterr().out.split())
+    monkeypatch.undo()
+    folder = pointwise.run(composed(*overrides))
+    assert "going on with 10 of 30 points" in (folder / "run.log").read_text()
+    found = summary_of(folder)
+    assert found["points_per_s"] == pytest.approx(20 / found["wall_s"])
 
 
 @pytest.mark.slow

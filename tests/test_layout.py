@@ -56,6 +56,7 @@ ORDER = [
     "setting_plots",
     "weak_plots",
     "study_plots",
+    "map_panels",
     "map_plots",
     "parametric_plots",
     "report",
@@ -72,6 +73,7 @@ ALLOWED = {
         "report",
         "setting_plots",
         "weak_plots",
+        "map_panels",
         "map_plots",
     },
 }

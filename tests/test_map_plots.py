@@ -6,6 +6,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
+from ep2sindy.map_panels import COUNTS, SHARES
 from ep2sindy.map_plots import ABSENT, GAP, coefficient_maps, quality_maps, regime_map
 from ep2sindy.studies.regimes import Regimes, regimes
 from ep2sindy.thruster.parameters import Thruster
@@ -193,6 +194,47 @@ def test_quality_is_of_the_training_rows_where_none_are_held_out() -> None:
 
 def test_quality_maps_count_what_became_of_the_points() -> None:
     assert legend(quality_maps(study())) == ["fitted (16)", "no plasma (4)"]
+
+
+def test_where_every_point_is_fitted_there_is_no_panel_for_it() -> None:
+    figure = quality_maps(study().isel(z=slice(0, 4)))
+    titles = {ax.get_title() for ax, _ in maps(figure)}
+    assert len(titles) == 4
+    assert "status of the points" not in titles
+    assert not figure.legends
+
+
+@pytest.mark.parametrize("cut", [{}, {"r": 1}], ids=str)
+def test_the_status_of_the_points_has_its_scale(cut: dict[str, int]) -> None:
+    figure = quality_maps(study().isel(cut, drop=True))
+    figure.canvas.draw()
+    (ax,) = (ax for ax in figure.axes if ax.get_title() == "status of the points")
+    assert any(label.get_visible() and label.get_text() for label in ax.get_xticklabels())
+
+
+def test_no_value_is_drawn_in_a_shade_near_white() -> None:
+    for scale in (SHARES, COUNTS):
+        assert scale(np.linspace(0.0, 1.0, 50))[:, :3].min(axis=1).max() < 0.8
+    figure = regime_map(grouped(study()))
+    (ax, _) = maps(figure)[1]
+    assert ax.collections[0].get_cmap() == SHARES
+
+
+def test_the_figure_says_that_coefficients_are_medians() -> None:
+    (found,) = regime_map(grouped(study())).legends
+    assert found.get_title().get_text().startswith("terms that act, with medians over the")
+
+
+@pytest.mark.parametrize(("cut", "ends"), [({"r": 1}, (-0.05, 2.45)), ({"z": 1}, (3.383, 5.117))])
+def test_over_one_axis_every_panel_ends_with_the_outermost_cells(
+    cut: dict[str, int], ends: tuple[float, float]
+) -> None:
+    result = study().isel(cut, drop=True)
+    for draw in (coefficient_maps, quality_maps):
+        for ax in draw(result).axes:
+            assert ax.get_xlim() == pytest.approx(ends, abs=1e-3)
+    for ax in regime_map(grouped(result)).axes:
+        assert ax.get_xlim() == pytest.approx(ends, abs=1e-3)
 
 
 @pytest.mark.parametrize("cut", [{"r": 1}, {"z": 1}, {"z": [1], "r": [1]}, {"r": [1]}], ids=str)

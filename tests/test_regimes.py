@@ -205,6 +205,24 @@ def test_axes_may_come_in_any_order() -> None:
     assert found_in(turned).labels.equals(found_in(patched()).labels)
 
 
+def test_regimes_tell_whether_they_are_as_many_as_allowed() -> None:
+    limits = {
+        n: regimes(patched(), rng=np.random.default_rng(0), max_regimes=n).at_limit
+        for n in (1, 2, 3)
+    }
+    assert limits == {1: True, 2: True, 3: False}
+
+
+def test_the_table_counts_the_points_that_are_unsure() -> None:
+    draws = np.array(patched()["weight_draws"].values)
+    draws[:, 0, 1, 3, 2] = 1.0  # all say source, where the whole says sink
+    found = found_in(patched(weight_draws=draws))
+    assert (found.confidence.values < 0.5).sum() == 1
+    unsure = found.table.groupby("regime")["unsure"].first()
+    assert unsure[found.labels.values[3, 2]] == pytest.approx(1 / 5)
+    assert unsure.sum() == pytest.approx(1 / 5)
+
+
 def points(n: int = 60) -> tuple[np.ndarray, np.ndarray]:
     """Weights of three terms, in three groups by which two of them act, and their draws."""
     rng = np.random.default_rng(3)

@@ -55,6 +55,9 @@ class Kept:
 
     folder: Path
 
+    def holds(self, block: Block) -> bool:
+        return self._path(block).exists()
+
     def read(self, block: Block) -> dict[str, np.ndarray] | None:
         """A finished block, or None where there is none that can be read."""
         try:

@@ -28,6 +28,7 @@ from ep2sindy.fields import SPACE
 
 N_STARTS = 20  # of the mixture's iteration, which may end in a poor optimum
 COARSENING = 100.0  # points after which evidence stops growing
+UNSURE = 0.5  # a confidence below
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,19 +41,25 @@ class Regimes:
     table: one row per regime, equation and term: acts, whether the median of |weight| reaches
     `least`; in_support, share of the regime's points whose support holds the term; weight, the
     median; coef, coef_low and coef_high, median, 16 % and 84 % of the points that hold the term,
-    in the unit of the column coef_units; n_points and confidence (mean) of the regime.
+    in the unit of the column coef_units; n_points, confidence (mean) and unsure (share of the
+    points whose confidence is below UNSURE) of the regime.
+    at_limit: whether there are as many as max_regimes allowed; the points may bear more.
     """
 
     labels: xr.DataArray
     confidence: xr.DataArray
     table: pd.DataFrame
+    at_limit: bool
 
     @property
     def n_regimes(self) -> int:
         return int(self.labels.max()) + 1
 
     def equations(self, regime: int) -> dict[str, dict[str, float]]:
-        """Median coefficients of the terms that act in a regime, by equation and term."""
+        """Terms that act in a regime, with their medians over the points that have them.
+
+        No point need have the equation as it stands: see in_support and the spread in the table.
+        """
         if not 0 <= regime < self.n_regimes:
             raise ValueError(f"regimes run from 0 to {self.n_regimes - 1}: {regime} came")
         rows = self.table[self.table["regime"] == regime]
@@ -75,7 +82,7 @@ def regimes(
 
     result: as `studies.pointwise` gives it; used are weight, weight_draws and coef, with the
     dimensions equation, term, draw, and z and r as far as the field has them.
-    max_regimes: where as many come out, the points would bear more.
+    max_regimes: where as many come out, the points may bear more.
     Raises ValueError where no point has equations, or no bootstraps stand behind them.
     """
     if not result.sizes["draw"]:
@@ -105,6 +112,7 @@ def regimes(
         labels=xr.DataArray(labels.reshape(grid.shape), grid.coords, space, "regime"),
         confidence=xr.DataArray(confidence.reshape(grid.shape), grid.coords, space, "confidence"),
         table=_table(result, labels, confidence, weights, coef, least),
+        at_limit=int(labels.max()) + 1 == max_regimes,
     )
 
 
@@ -217,6 +225,7 @@ def _table(
                         "coef_units": str(result["coef_units"].values[e, k]),
                         "n_points": int(inside.sum()),
                         "confidence": float(confidence[inside].mean()),
+                        "unsure": float((confidence[inside] < UNSURE).mean()),
                     }
                 )
     return pd.DataFrame(rows)

@@ -111,22 +111,18 @@ def three_regions(
     inputs = _inputs(half_t, z_points, r_points)
     states = _integrate(library, np.einsum("kp,kte->pte", share, coef), inputs, dt_s)
     values = np.concatenate([states, inputs[::2]], axis=2).reshape(n_samples, n_z, n_r, -1)
-    coords = {
-        "time": ("time", half_t[::2], {"units": "s"}),
-        "z": ("z", channel.channel_length * z, {"units": "m"}),
-        "r": ("r", channel.inner_radius + channel.gap * r, {"units": "m"}),
-    }
     variables = {
         name: (("time", "z", "r"), values[..., k], {"units": UNITS[name]})
         for k, name in enumerate([*STATES, *INPUTS])
     }
+    places = {
+        "z": ("z", channel.channel_length * z, {"units": "m"}),
+        "r": ("r", channel.inner_radius + channel.gap * r, {"units": "m"}),
+    }
+    shares = share.reshape(3, n_z, n_r), {"region": list(regions), **places}
     return RegionField(
-        field=xr.Dataset(variables, coords),
-        share=xr.DataArray(
-            share.reshape(3, n_z, n_r),
-            {"region": list(regions), "z": coords["z"], "r": coords["r"]},
-            ("region", "z", "r"),
-        ),
+        field=xr.Dataset(variables, {"time": ("time", half_t[::2], {"units": "s"}), **places}),
+        share=xr.DataArray(*shares, ("region", "z", "r")),
         library=library,
     )
 

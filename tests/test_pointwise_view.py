@@ -1,0 +1,145 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+
+from ep2sindy.report import WIDTH, Screen
+from ep2sindy.studies.regimes import regimes
+from experiments.pointwise_view import Outcome, page, print_outcome, summary
+
+TERMS = ["1", "n_n", "n_i*u_iz"]
+
+
+def study() -> xr.Dataset:
+    """12 points: n_i' = -40 n_i u_iz, but 0 at two of them; n_n' = 10^22..10^23 or 3e4 n_n.
+
+    A quarter of the points with n_n has a small constant beside it. The last point is no plasma.
+    """
+    coef, weight = np.zeros((2, 2, 3, 12))
+    coef[0, 2], weight[0, 2] = -40.0, -1.0
+    coef[0, 2, [1, 4]] = weight[0, 2, [1, 4]] = 0.0
+    coef[1, 0, :3], weight[1, 0, :3] = 1e22, 1.0
+    coef[1, 0, 1] = 1e23
+    coef[1, 1, 3:], weight[1, 1, 3:] = 3e4, 1.0
+    coef[1, 0, 5:7], weight[1, 0, 5:7], weight[1, 1, 5:7] = 1e20, 0.05, 0.95
+    status = np.zeros(12, dtype=np.int8)
+    status[-1] = 1
+    valid = np.where(status == 0, 1.0, np.nan)
+    draws = np.stack([weight] * 2)
+    draws[:, 1, :, 0] = [0.0, 1.0, 0.0]  # the bootstraps put this point into the other regime
+    dims = ("equation", "term", "z", "r")
+    on_grid = {name: (v * valid).reshape(*v.shape[:-1], 4, 3) for name, v in (
+        ("coef", coef), ("weight", weight), ("inclusion", np.abs(weight)), ("weight_draws", draws),
+        ("n_terms", (coef != 0.0).sum(axis=1)),
+    )}  # fmt: skip
+    return xr.Dataset(
+        {
+            **{name: (dims, on_grid[name]) for name in ("coef", "weight", "inclusion")},
+            "weight_draws": (("draw", *dims), on_grid["weight_draws"]),
+            "n_terms": (("equation", "z", "r"), on_grid["n_terms"]),
+            "status": (("z", "r"), status.reshape(4, 3)),
+        },
+        coords={
+            "equation": ["n_i", "n_n"],
+            "term": TERMS,
+            "coef_units": (dims[:2], [["m^-3 s^-1", "s^-1", "m^-1"]] * 2),
+            "z": np.linspace(0.0, 0.03, 4),
+            "r": np.linspace(0.04, 0.05, 3),
+        },
+        attrs={"no_fit": ""},
+    )
+
+
+def outcome(result: xr.Dataset, *, max_regimes: int = 4) -> Outcome:
+    found = regimes(result, rng=np.random.default_rng(0), max_regimes=max_regimes)
+    return Outcome("a study", result, found, wall_s=1.0, n_before=0)
+
+
+def printed(found: Outcome, folder: Path) -> str:
+    screen = Screen(folder / "run.log")
+    print_outcome(screen, found)
+    screen.close()
+    return (folder / "run.log").read_text()
+
+
+def test_equations_without_terms_are_counted(tmp_path: Path) -> None:
+    found = outcome(study())
+    assert summary(found)["no_terms"] == {"n_i": 2}
+    for text in (printed(found, tmp_path), page(found, {})):
+        assert "11 fitted, 1 no plasma; no term in n_i' at 2" in text
+
+
+@pytest.mark.parametrize(("most", "limited"), [(1, True), (8, False)])
+def test_as_many_regimes_as_allowed_is_said(most: int, limited: bool, tmp_path: Path) -> None:
+    found = outcome(study(), max_regimes=most)
+    assert summary(found)["at_limit"] is limited
+    for text in (printed(found, tmp_path), page(found, {})):
+        assert ("as many as max_regimes allows" in text) == limited
+
+
+def test_medians_come_with_their_spread_and_the_share_of_points(tmp_path: Path) -> None:
+    found = outcome(study())
+    text = printed(found, tmp_path)
+    (console,) = (line for line in text.splitlines() if "7.12e+22" in line)
+    cells = [cell.strip() for cell in console.split("│")]
+    assert cells == [
+        "", "", "", "", "n_n' =", "1", "100%", "1e+22", "1e+22 to 7.12e+22", "m^-3 s^-1",
+    ]  # fmt: skip
+    html = page(found, {})
+    row = "<td>n_n'</td><td>1</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>m^-3 s^-1</td>"
+    assert '<tr class="selected">' + row.format("100%", "1e+22", "1e+22", "7.12e+22") in html
+    # Two of seven points have it, and it does not act: in the page alone, and not bold.
+    assert "<tr>" + row.format("29%", "1e+20", "1e+20", "1e+20") in html
+    for said in (text, html):
+        assert "terms that act, with medians over the regime's points that have them" in said
+
+
+def test_an_equation_in_which_no_term_acts_is_zero(tmp_path: Path) -> None:
+    rows = printed(outcome(study()), tmp_path).splitlines()
+    assert any(row.split("│")[4:6] == [" n_i' = ", " 0        "] for row in rows)
+
+
+def test_the_table_of_regimes_fits_the_log(tmp_path: Path) -> None:
+    result = study()
+    result["coef"][1, 0, 0] = [-1.23e22, -3.45e22, -4.57e22]
+    result = result.assign_coords(term=["1", "n_n", "n_i*n_n*R_ion"])
+    lines = printed(outcome(result), tmp_path).splitlines()
+    assert max(map(len, lines)) <= WIDTH
+    assert any("-4.21e+22 to -1.94e+22 │ m^-3 s^-1" in line for line in lines)
+
+
+def test_points_of_low_confidence_are_counted(tmp_path: Path) -> None:
+    found = outcome(study())
+    text, html = printed(found, tmp_path), page(found, {})
+    for said in (text, html):
+        assert "3 regimes; confidence below 0.5 at 9% of points" in said
+    assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33%" in html
+    assert any(line.split("│")[2:4] == [" 0.67       ", " 33%   "] for line in text.splitlines())
+
+
+def test_the_page_says_that_a_regime_need_not_be_connected() -> None:
+    assert "need not be connected" in page(outcome(study()), {})
+
+
+@pytest.mark.parametrize(
+    ("cut", "own", "other"),
+    [({}, "Grey: the term is not in", "No mark:"), ({"r": 1}, "No mark:", "Grey:")],
+    ids=str,
+)
+def test_a_caption_describes_the_figure_over_the_axes(
+    cut: dict[str, int], own: str, other: str
+) -> None:
+    html = page(outcome(study().isel(cut, drop=True)), {"coefficients": Figure()})
+    assert own in html
+    assert other not in html
+
+
+def test_a_study_without_any_term_has_no_table_of_them() -> None:
+    result = study()
+    for name in ("coef", "weight", "weight_draws", "n_terms"):
+        result[name] *= 0.0
+    found = outcome(result)
+    assert summary(found)["no_terms"] == {"n_i": 11, "n_n": 11}
+    assert "points that have it</th>" not in page(found, {})
