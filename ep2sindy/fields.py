@@ -192,7 +192,7 @@ def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
 
 def zone_average(
     field: xr.Dataset,
-    zone: Zone,
+    zone: Zone | None,
     *,
     states: Sequence[str],
     inputs: Sequence[str] = (),
@@ -200,7 +200,7 @@ def zone_average(
     axisymmetric: bool = True,
     label: str = "",
 ) -> Trajectory:
-    """Average variables over the grid points inside a zone, at each time.
+    """Average variables over the grid points inside a zone (None: the whole field), at each time.
 
     Weights are the sizes of the cells: length in z and, where the field has r, annulus area
     (length if not axisymmetric). One set of cells serves all variables of the call: those
@@ -215,7 +215,7 @@ def zone_average(
     columns |= {f"<{p.replace(' ', '')}>": split_factors(p) for p in products}
     used = list(dict.fromkeys(name for factors in columns.values() for name, _ in factors))
     _check_names(field, used, [*states, *inputs, *products])
-    slices = zone_slices(field, zone)
+    slices = zone_slices(field, zone or Zone())
     part = field[used].assign_coords({axis: field[axis] for axis in field.dims}).isel(slices)
     masks = {name: masked_cells(part[name]) for name in used}
     weights = _zone_weights(field, slices, masks, axisymmetric=axisymmetric)
@@ -264,7 +264,7 @@ def point(
                 f"from {ends[0]:g} to {ends[1]:g} m"
             )
         nearest[axis] = [int(np.argmin(np.abs(points - place)))]
-    return zone_average(field.isel(nearest), Zone(), states=states, inputs=inputs, label=label)
+    return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
 
 
 def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str]) -> None:

@@ -14,7 +14,9 @@ from ep2sindy.control_law import ControlLaw
 from ep2sindy.names import latex_name
 from ep2sindy.plots import COLOURS
 
-MARKERS = ("o", "^", "v", "D", "P", "X")  # of the quantities that share a panel
+# Of the quantities that share a panel: their points, and the lines of their laws.
+MARKERS = ("o", "^", "v", "D", "P", "X")
+LINES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 3)))
 APART = 0.016  # between fits at one point, of the axis: error bars must not hide each other
 
 
@@ -58,7 +60,7 @@ def trends_figure(
         row[0].set_ylabel(", ".join(_label(name, labels) for name in panel))
     for column, (along, at) in zip(axes.T, trends, strict=True):
         column[-1].set_xlabel(_label(along, labels))
-        held = ", ".join(f"{_label(name, labels)}: {value:g}" for name, value in at.items())
+        held = ", ".join(_equals(_label(name, labels), value) for name, value in at.items())
         column[0].set_title(held, fontsize=10)
     entries = _legend(fits, panels, labels, published=len(published) > 0, lines=bool(laws))
     figure.legend(handles=entries, loc="outside upper center", ncols=5, frameon=False, fontsize=9)
@@ -85,7 +87,7 @@ def _series(
     """One fit in one panel: estimates, what was published, and the law's line."""
     x = pd.concat([table[along] for table in tables])
     width = float(np.ptp(x)) if len(x) else 0.0
-    for marker, name in zip(MARKERS, panel, strict=False):
+    for marker, style, name in zip(MARKERS, LINES, panel, strict=False):
         ours, theirs = (
             table[(table["fit"] == fit) & (table["quantity"] == name)] for table in tables
         )
@@ -102,7 +104,7 @@ def _series(
                 for variable in laws[name].library.variables
             ]
             predicted = laws[name].predict(np.column_stack(parameters))
-            ax.plot(line, predicted, color=colour, lw=0.9, alpha=0.6)
+            ax.plot(line, predicted, color=colour, ls=style, lw=1.1, alpha=0.7)
 
 
 def _ticks(ax: Axes, tables: Sequence[pd.DataFrame], along: str) -> None:
@@ -110,6 +112,12 @@ def _ticks(ax: Axes, tables: Sequence[pd.DataFrame], along: str) -> None:
     ax.set_xticks(values, [f"{value:g}" for value in values])
     ax.margins(x=0.08)
     ax.grid(alpha=0.3)
+
+
+def _equals(label: str, value: float) -> str:
+    """`$V_D$ (V)` at 300 -> `$V_D$ = 300 V`."""
+    symbol, _, unit = label.removesuffix(")").rpartition(" (")
+    return f"{symbol} = {value:g} {unit}" if symbol else f"{label} = {value:g}"
 
 
 def _label(name: str, labels: Mapping[str, str]) -> str:
@@ -124,7 +132,7 @@ def _legend(
     published: bool,
     lines: bool,
 ) -> list[Line2D]:
-    """Colours are fits; where quantities share a panel, markers tell them apart."""
+    """Colours are fits; where quantities share a panel, markers and lines tell them apart."""
 
     def entry(label: str, **style: object) -> Line2D:
         return Line2D([], [], **({"color": "#555555", "ls": "none"} | style), label=label)  # type: ignore[arg-type]
@@ -136,8 +144,8 @@ def _legend(
     for panel in panels:
         if len(panel) > 1:
             entries += [
-                entry(_label(name, labels), marker=marker)
-                for name, marker in zip(panel, MARKERS, strict=False)
+                entry(_label(name, labels), marker=marker, ls=style if lines else "none")
+                for name, marker, style in zip(panel, MARKERS, LINES, strict=False)
             ]
     entries += (
         [entry(labels.get("published", "published"), marker="o", mfc="none")] if published else []

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
 from ep2sindy.constraints import constraint
 from ep2sindy.library import Library, polynomial
-from ep2sindy.studies.operating_points import OSCILLATING, PointData, point_label
+from ep2sindy.studies.operating_points import OSCILLATING, STEADY, PointData, point_label
 from ep2sindy.studies.parametric import Case, Searching, Study
 from experiments.build import (
     check_library,
@@ -20,7 +20,8 @@ from experiments.build import (
 )
 
 STUDIES = "ep2sindy.studies"
-WITHOUT_OSCILLATION = ("steady", "decaying", "diverged")  # what a simulation says of itself
+CONSTANT = "a state must vary"  # how a trajectory begins to refuse one
+WITHOUT_OSCILLATION = (STEADY, "decaying", "diverged")  # what a simulation says of itself
 
 
 def study_of(config: DictConfig) -> Study:
@@ -36,7 +37,7 @@ def study_of(config: DictConfig) -> Study:
         library=library,
         cases=_cases(config, library, terms),
         formulation=instantiate(config.formulation),
-        bootstrap=instantiate(config.bootstrap, _target_=f"{STUDIES}.parametric.TimeBootstrap"),
+        bootstrap=instantiate(config.bootstrap, _target_=f"{STUDIES}.time_bootstrap.TimeBootstrap"),
         refining=instantiate(config.refining, _target_=f"{STUDIES}.parametric.Refining"),
         searching=Searching(
             library=_searched_library(config),
@@ -130,7 +131,10 @@ def parameters_of(point: DictConfig, names: list[str]) -> dict[str, float]:
 
 
 def opened_point(config: DictConfig) -> PointData:
-    """Open or simulate one operating point; what does not oscillate comes without trajectory."""
+    """Open or simulate one operating point; what does not oscillate comes without trajectory.
+
+    A state that stays exactly where it is makes a point steady: no trajectory may hold it.
+    """
     parameters = cast(dict[str, float], OmegaConf.to_container(config.point))
     libraries = [terms_of(config.model, states=config.trajectory.states)[0]]
     inputs = inputs_of(config, [*libraries, _searched_library(config)])
@@ -144,4 +148,6 @@ def opened_point(config: DictConfig) -> PointData:
     except (ValueError, OSError, HydraException) as error:
         # What a constructor raised reaches us wrapped; other processes hand on plain errors alone.
         own = error.__cause__ if isinstance(error, HydraException) else None
+        if str(own or error).startswith(CONSTANT):
+            return PointData(parameters, None, STEADY)
         raise ValueError(f"operating point {label}: {own or error}") from error

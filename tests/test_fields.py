@@ -49,6 +49,12 @@ def test_unequal_cells_weigh_by_their_length() -> None:
     assert column(run, "n_i")[0] == pytest.approx((1.5 * 1 + 3 * 4) / 4.5, rel=1e-15)
 
 
+def test_no_zone_is_the_whole_field() -> None:
+    field = masked_field()
+    whole = zone_average(field, Zone(), states=["n_i"])
+    assert np.array_equal(zone_average(field, None, states=["n_i"]).values, whole.values)
+
+
 def test_annuli_weigh_by_their_area() -> None:
     # The mean of 1/r over a disk of radius 3 is 2/3; midpoint cells integrate r * 1/r exactly.
     r = np.array([0.5, 1.5, 2.5])

@@ -26,12 +26,11 @@ from ep2sindy.studies.parametric import (
     Refining,
     Searching,
     Study,
-    TimeBootstrap,
     parametric_study,
 )
 from ep2sindy.studies.quantities import Estimate, Quantity, drawn_estimates, propagated_estimates
-from ep2sindy.studies.time_bootstrap import resampled_coefficients
-from ep2sindy.studies.trends import laws, trends
+from ep2sindy.studies.time_bootstrap import TimeBootstrap, resampled_coefficients
+from ep2sindy.studies.trends import laws, power_law_r2, trends
 from ep2sindy.trajectory import Trajectory
 from ep2sindy.weak import Weak
 
@@ -418,6 +417,7 @@ def test_trends_are_exponents_with_the_other_parameters_held() -> None:
     results = [power_law(V, m) for V, m in ((200, 5), (300, 2), (300, 5), (300, 6), (400, 5))]
     (row,) = trends(results, along="m", at={"V": 300.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (3, pytest.approx(-0.3))
+    assert row["r2"] == pytest.approx(1.0)
     (row,) = trends(results, along="V", at={"m": 5.0}).to_dict("records")
     assert (row["n_points"], row["exponent"]) == (3, pytest.approx(0.5))
     # The k-th draws of all points are off by one factor, which moves no slope.
@@ -425,6 +425,22 @@ def test_trends_are_exponents_with_the_other_parameters_held() -> None:
     lost = [*results, power_law(300, 9, status="max_iter")]
     (row,) = trends(lost, along="m", at={"V": 300.0}).to_dict("records")
     assert row["n_points"] == 3
+
+
+def test_two_points_say_nothing_of_how_good_a_power_law_is() -> None:
+    results = [power_law(V, 5) for V in (200, 400)]
+    (row,) = trends(results, along="V", at={"m": 5.0}).to_dict("records")
+    assert (row["n_points"], row["exponent"]) == (2, pytest.approx(0.5))
+    assert np.isnan([row["low"], row["high"], row["r2"]]).all()
+
+
+def test_r2_says_whether_points_lie_on_a_power_law() -> None:
+    # Logarithms 0, 1, 0 over 0, 1, 2: the line is flat at 1/3, and explains nothing.
+    x, bent = np.exp([0.0, 1.0, 2.0]), np.exp([0.0, 1.0, 0.0])
+    assert power_law_r2(x, bent) == pytest.approx(0.0, abs=1e-12)
+    # Logarithms 0, 1, 1: the line 1/6 + x/2 leaves 1/6 of 2/3.
+    assert power_law_r2(x, -np.exp([0.0, 1.0, 1.0])) == pytest.approx(0.75)
+    assert np.isnan(power_law_r2(x, np.ones(3)))
 
 
 def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
@@ -467,6 +483,8 @@ def test_settings_that_cannot_work_are_refused(make: object, message: str) -> No
 def test_a_record_of_few_blocks_is_refused(points: list[PointData]) -> None:
     how = replace(study(weak=False), bootstrap=TimeBootstrap(n_draws=60, periods=6.0))
     with pytest.raises(
-        ValueError, match="needs 5 blocks or more: blocks of 600 were asked of 2000"
+        ValueError,
+        match=r"operating point V=100, m=1: .* needs 5 blocks or more: blocks of 600 were asked of "
+        r"2000 groups of rows; use fewer periods per block \(bootstrap\.periods\)",
     ):
         results_of(points[:1], how)

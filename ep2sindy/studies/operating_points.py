@@ -12,7 +12,7 @@ from ep2sindy.regression import check_agreement
 from ep2sindy.spectrum import dominant_frequency, power_spectrum
 from ep2sindy.trajectory import Trajectory
 
-OSCILLATING = "oscillating"
+OSCILLATING, STEADY = "oscillating", "steady"
 LEAST_SPREAD = 0.01  # of every state, in means, in the second half of the record
 LEAST_SHARE = 0.5  # of the first half's standard deviation that is left in the second
 LEAST_PERIODS = 4.0  # in the record: fewer may be a drift
@@ -51,7 +51,7 @@ def oscillation(run: Trajectory) -> str:
     """
     first, second = np.array_split(run.states, 2)
     if (spread(second) < LEAST_SPREAD).any():
-        return "steady"
+        return STEADY
     if (second.std(axis=0) < LEAST_SHARE * first.std(axis=0)).any():
         return "decaying"
     frequency, power = power_spectrum(run.t, run.states[:, 0])

@@ -29,6 +29,7 @@ from ep2sindy.studies.operating_points import (
     PointData,
     check_points,
     oscillation,
+    point_label,
     spread,
 )
 from ep2sindy.studies.quantities import (
@@ -37,26 +38,11 @@ from ep2sindy.studies.quantities import (
     drawn_estimates,
     propagated_estimates,
 )
-from ep2sindy.studies.time_bootstrap import resampled_coefficients
+from ep2sindy.studies.time_bootstrap import TimeBootstrap, resampled_coefficients
 from ep2sindy.trajectory import Trajectory
 
 FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
 REFINED = "_refined"  # ends the name of a case's refinement
-
-
-@dataclass(frozen=True)
-class TimeBootstrap:
-    """Intervals of least squares: draws of blocks that last `periods` of the oscillation."""
-
-    n_draws: int
-    periods: float
-
-    def __post_init__(self) -> None:
-        if self.n_draws < 40 or self.periods <= 0.0:
-            raise ValueError(
-                "a 95 % interval needs 40 draws or more, and blocks some length: "
-                f"n_draws={self.n_draws}, periods={self.periods} came"
-            )
 
 
 @dataclass(frozen=True)
@@ -162,7 +148,8 @@ def parametric_study(
 
     Yields (number of the point, result) in any order; a result depends on its data and its place
     in the list, not on the workers or on what the other points are.
-    Raises ValueError for points that lack a state or a variable, or differ in its unit.
+    Raises ValueError, naming the point, where one lacks a state or a variable, differs in its
+    unit, or is too short a record.
     """
     variables = [*study.library.variables, *study.searching.library.variables]
     check_points(points, list(dict.fromkeys(variables)))
@@ -171,8 +158,15 @@ def parametric_study(
 
 
 def _fitted_point(piece: tuple[PointData, np.random.Generator], *, study: Study) -> PointResult:
-    """All that is made of one operating point."""
+    """All that is made of one operating point, whose name goes before what cannot work."""
     point, rng = piece
+    try:
+        return _point_result(point, study, rng=rng)
+    except ValueError as error:
+        raise ValueError(f"operating point {point_label(point.parameters)}: {error}") from error
+
+
+def _point_result(point: PointData, study: Study, *, rng: np.random.Generator) -> PointResult:
     run = point.trajectory
     if run is None:
         return PointResult(point.parameters, point.status)

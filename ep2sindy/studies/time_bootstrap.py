@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +15,21 @@ from ep2sindy.regression import Regression
 from ep2sindy.resampling import moving_block_counts
 
 MIN_BLOCKS = 5  # in a record: fewer draws of blocks than these differ too little from another
+
+
+@dataclass(frozen=True)
+class TimeBootstrap:
+    """Intervals of least squares: draws of blocks that last `periods` of the oscillation."""
+
+    n_draws: int
+    periods: float
+
+    def __post_init__(self) -> None:
+        if self.n_draws < 40 or self.periods <= 0.0:
+            raise ValueError(
+                "a 95 % interval needs 40 draws or more, and blocks some length: "
+                f"n_draws={self.n_draws}, periods={self.periods} came"
+            )
 
 
 def resampled_coefficients(
@@ -46,11 +62,7 @@ def resampled_coefficients(
     rows = [_free_rows(equation, constraint, coef) for equation in equations]
     groups = [e.problem.groups[~e.problem.test] for e in equations]
     numbers = np.unique(np.concatenate(groups))
-    if len(numbers) < MIN_BLOCKS * block:
-        raise ValueError(
-            f"a bootstrap over time needs {MIN_BLOCKS} blocks or more: blocks of {block} were "
-            f"asked of {len(numbers)} groups of rows; use fewer periods per block, or more data"
-        )
+    _check_blocks(len(numbers), block)
     scale = np.linalg.norm(np.concatenate(rows), axis=0)
     scale[scale == 0.0] = 1.0
     sums = np.zeros((len(numbers), len(scale), len(scale)))
@@ -68,6 +80,15 @@ def resampled_coefficients(
     z = np.linalg.solve(grams[:, :-1, :-1], grams[:, :-1, -1:])[:, :, 0]
     z *= scale[-1] / scale[:-1]
     return (z - z.mean(axis=0) + coef[constraint.free]) @ constraint.C.T + constraint.d
+
+
+def _check_blocks(n_groups: int, block: int) -> None:
+    if n_groups < MIN_BLOCKS * block:
+        raise ValueError(
+            f"a bootstrap over time needs {MIN_BLOCKS} blocks or more: blocks of {block} were "
+            f"asked of {n_groups} groups of rows; use fewer periods per block "
+            "(bootstrap.periods), or a longer record"
+        )
 
 
 def _coefficient(model: SparseModel, state: str, term: str) -> float:

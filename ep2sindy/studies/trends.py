@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ep2sindy.control_law import ControlLaw, control_law
 from ep2sindy.library import Library
+from ep2sindy.pareto import r2
 from ep2sindy.studies.parametric import PointResult
 
 
@@ -42,8 +43,10 @@ def trends(results: Sequence[PointResult], *, along: str, at: Mapping[str, float
     """Exponents p of |quantity| ~ parameter^p along one parameter, the others held.
 
     One row per fit and quantity: the slope of logarithms, by least squares over the points.
+    r2: of that line, whether the points are a power law at all; near zero, too, without a trend.
     low and high: its 95 % interval by the bootstraps of least-squares fits, points independent;
-    it says how well the slope is known, not whether points lie on a line. NaN for refined fits.
+    it says how well the slope is known, not whether points lie on a line.
+    Two points are always on a line: r2, low and high are NaN, as low and high of refined fits.
     """
     held = [each for each in results if all(each.parameters[k] == v for k, v in at.items())]
     rows = []
@@ -52,12 +55,13 @@ def trends(results: Sequence[PointResult], *, along: str, at: Mapping[str, float
         x = np.array([each.parameters[along] for each in usable])
         for name in usable[0].fits[fit].estimates if usable else ():
             low, high = np.nan, np.nan
-            if all(each.fits[fit].draws for each in usable):
+            if len(usable) > 2 and all(each.fits[fit].draws for each in usable):
                 draws = np.stack([each.fits[fit].draws[name] for each in usable], axis=1)
                 slopes = [exponent(x, draw) for draw in draws]
                 low, high = np.percentile(slopes, (2.5, 97.5))
             row = {"fit": fit, "quantity": name, "along": along, "n_points": len(usable)}
-            row["exponent"] = exponent(x, _values(usable, fit, name))
+            values = _values(usable, fit, name)
+            row |= {"exponent": exponent(x, values), "r2": power_law_r2(x, values)}
             rows.append(row | {"low": low, "high": high})
     return pd.DataFrame(rows)
 
@@ -68,6 +72,15 @@ def exponent(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points
         return float("nan")
     centred = np.log(x) - np.log(x).mean()
     return float(centred @ np.log(np.abs(values)) / np.square(centred).sum())
+
+
+def power_law_r2(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]) -> float:
+    """R2 of the line through logarithms; NaN for under three points, or values all alike."""
+    slope, logs = exponent(x, values), np.log(np.abs(values))
+    if len(x) < 3 or np.isnan(slope) or np.ptp(logs) == 0.0:
+        return float("nan")
+    line = logs.mean() + slope * (np.log(x) - np.log(x).mean())
+    return float(r2(truth=logs, prediction=line[None])[0])
 
 
 def _values(usable: Sequence[PointResult], fit: str, name: str) -> np.ndarray:
