@@ -18,6 +18,10 @@ def read_only(values: np.ndarray) -> np.ndarray:
     return copy
 
 
+class ConstantStateError(ValueError):
+    """A state that never changes shows no dynamics."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Time series of the modelled states and of the inputs that drive them.
@@ -134,7 +138,7 @@ class Trajectory:
         ):
             # Below rounding the derivative is noise of the number format, not of the system.
             if width <= 1e-12 * level:
-                raise ValueError(
+                raise ConstantStateError(
                     f"a state must vary: {name!r} stays at {level:.6g} over all "
                     f"{self.n_samples} samples; leave it out, or pass it as an input"
                 )

@@ -11,6 +11,7 @@ from ep2sindy.constraints import constraint
 from ep2sindy.library import Library, polynomial
 from ep2sindy.studies.operating_points import OSCILLATING, STEADY, PointData, point_label
 from ep2sindy.studies.parametric import Case, Searching, Study
+from ep2sindy.trajectory import ConstantStateError
 from experiments.build import (
     check_library,
     inputs_of,
@@ -20,7 +21,6 @@ from experiments.build import (
 )
 
 STUDIES = "ep2sindy.studies"
-CONSTANT = "a state must vary"  # how a trajectory begins to refuse one
 WITHOUT_OSCILLATION = (STEADY, "decaying", "diverged")  # what a simulation says of itself
 
 
@@ -145,9 +145,9 @@ def opened_point(config: DictConfig) -> PointData:
         if field.attrs.get("status") in WITHOUT_OSCILLATION:
             return PointData(parameters, None, field.attrs["status"])
         return PointData(parameters, to_trajectory(field, inputs=inputs, label=label), OSCILLATING)
+    except ConstantStateError:
+        return PointData(parameters, None, STEADY)
     except (ValueError, OSError, HydraException) as error:
         # What a constructor raised reaches us wrapped; other processes hand on plain errors alone.
         own = error.__cause__ if isinstance(error, HydraException) else None
-        if str(own or error).startswith(CONSTANT):
-            return PointData(parameters, None, STEADY)
         raise ValueError(f"operating point {label}: {own or error}") from error
