@@ -32,6 +32,7 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.refine
 	$(BIN)/python -m benchmarks.intervals
 	$(BIN)/python -m benchmarks.pointwise
+	$(BIN)/python -m benchmarks.regimes
 	$(BIN)/python -m benchmarks.joint
 	$(BIN)/python -m benchmarks.trajectory_scores
 
