@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
@@ -75,7 +78,7 @@ class Dask:
 
     A piece whose worker dies is given to another, as often as the scheduler allows (three times,
     unless it was told otherwise). Workers need this package, and see the same files under the
-    same paths. Needs the extra `cluster`.
+    same paths; a function from elsewhere goes to them with its code. Needs the extra `cluster`.
     Raises OSError when no scheduler answers at the address, or none has a worker, within timeout_s.
     """
 
@@ -114,13 +117,13 @@ class Dask:
         function: Callable[[Any], Any],
         pieces: Iterable[Any],
     ) -> Iterator[tuple[int, Any]]:
-        waiting, n_running = enumerate(pieces), 0
+        waiting, n_running, code = enumerate(pieces), 0, _with_its_code(function)
 
         def submitted() -> list[Any]:
             """What keeps all threads busy, of workers that have joined since, too."""
             n_threads = max(1, sum(client.nthreads().values()))
             return [
-                client.submit(_on_one_thread, function, each, pure=False)
+                client.submit(_sent_on_one_thread, code, each, pure=False)
                 for each in islice(waiting, max(0, AHEAD * n_threads - n_running))
             ]
 
@@ -136,6 +139,23 @@ class Dask:
             result = future.result()
             future.release()
             yield result
+
+
+def _with_its_code(function: Callable[[Any], Any]) -> bytes:
+    """A pickle that holds the code of every package but this one, which workers have."""
+    import cloudpickle  # comes with distributed
+
+    inner: Any = function
+    while isinstance(inner, partial):
+        inner = inner.func
+    package = inner.__module__.partition(".")[0]
+    if package not in (__name__.partition(".")[0], "__main__"):
+        cloudpickle.register_pickle_by_value(sys.modules[package])
+    return cloudpickle.dumps(function)
+
+
+def _sent_on_one_thread(code: bytes, numbered: tuple[int, Any]) -> tuple[int, Any]:
+    return _on_one_thread(pickle.loads(code), numbered)
 
 
 def _distributed() -> Any:

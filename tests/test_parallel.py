@@ -1,6 +1,9 @@
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,10 @@ PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
 
 def total(values: np.ndarray) -> float:
     return float(values.sum())
+
+
+def scaled_total(values: np.ndarray, *, factor: float) -> float:
+    return factor * total(values)
 
 
 def n_threads(_: object) -> int:
@@ -77,6 +84,30 @@ def test_pieces_of_a_dead_worker_are_done_by_another(address: str, tmp_path: obj
     assert dict(Dask(address).run(dies_once, [marker])) == {0: "survived"}
 
 
+CLUSTER = """
+from distributed import LocalCluster
+if __name__ == "__main__":
+    cluster = LocalCluster(n_workers=1, host="127.0.0.1", dashboard_address=None)
+    print(cluster.scheduler_address, flush=True)
+    input()
+"""
+
+
+def test_workers_need_not_have_the_folder_of_a_function(tmp_path: Path) -> None:
+    script = tmp_path / "cluster.py"
+    script.write_text(CLUSTER)
+    with subprocess.Popen(
+        [sys.executable, script], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        text=True,
+    ) as started:  # fmt: skip
+        assert started.stdin is not None
+        assert started.stdout is not None
+        elsewhere = Dask(started.stdout.readline().strip())
+        found = dict(elsewhere.run(partial(scaled_total, factor=2.0), PIECES))
+        started.stdin.write("\n")
+    assert found == {k: 2.0 * piece.sum() for k, piece in enumerate(PIECES)}
+
+
 def test_a_silent_scheduler_is_named() -> None:
     begin = time.monotonic()
     with pytest.raises(OSError, match=r"must answer at 'tcp://127.0.0.1:9' within 0.5 s: .*start "):
@@ -86,7 +117,7 @@ def test_a_silent_scheduler_is_named() -> None:
 
 def test_a_scheduler_without_workers_is_named() -> None:
     with (
-        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=None) as empty,
+        LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=":0") as empty,
         pytest.raises(OSError, match="a dask scheduler with a worker must answer"),
     ):
         list(Dask(empty.scheduler_address, timeout_s=0.5).run(total, PIECES))
