@@ -654,3 +654,15 @@ def test_constrained_settings_that_cannot_work_are_refused(
     with pytest.raises(ValueError) as caught:  # noqa: PT011
         constrained.run(config)
     assert message in str(caught.value)
+
+
+def test_a_sweep_can_go_to_slurm() -> None:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = compose(
+            "config",
+            overrides=["+exp=parametric", "hydra/launcher=slurm"],
+            return_hydra_config=True,
+        )
+    launcher = config.hydra.launcher
+    assert launcher._target_.endswith("SlurmLauncher")
+    assert (launcher.cpus_per_task, launcher.tasks_per_node) == (8, 1)
