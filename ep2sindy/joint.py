@@ -100,20 +100,31 @@ def discover_jointly(
         fronts=fronts,
         scores=dict(zip(fronts, scores, strict=True)),
         chosen={state: front.supports[best[state]] for state, front in fronts.items()},
-        models={
-            point: assemble_model(
-                library,
-                [_last_fit(front.points[point], best[state]) for state, front in fronts.items()],
-                units=runs[0].units,
-                provenance={**provenance, "point": point},
-            )
-            for point, runs in points.items()
-        },
+        models=_models(points, library, fronts, best, provenance),
         ambiguities={
             point: tuple(dict.fromkeys(a for part in problems[point] for a in ambiguities(part)))
             for point in points
         },
     )
+
+
+def _models(
+    points: Mapping[str, Sequence[Trajectory]],
+    library: Library,
+    fronts: Mapping[str, JointFront],
+    best: Mapping[str, int],
+    provenance: Mapping[str, str],
+) -> dict[str, SparseModel]:
+    """The best support of every equation, with each point's own coefficients."""
+    return {
+        point: assemble_model(
+            library,
+            [_last_fit(front.points[point], best[state]) for state, front in fronts.items()],
+            units=runs[0].units,
+            provenance={**provenance, "point": point},
+        )
+        for point, runs in points.items()
+    }
 
 
 def _check_points(points: Mapping[str, Sequence[Trajectory]], library: Library) -> None:
