@@ -215,7 +215,4 @@ def test_a_killed_run_ends_with_the_same_file(grid: Path, tmp_path: Path) -> Non
     (one,) = undisturbed.rglob("pointwise.nc")
     (other,) = broken.rglob("pointwise.nc")
     assert one.read_bytes() == other.read_bytes()
-    # Kept points are reported at once, a point each; then come those that are computed.
-    events = EventAccumulator(str(other.parent / "tensorboard")).Reload().Scalars("points/done")
-    waits = np.diff([event.wall_time for event in events])
-    assert waits[: n_kept - 1].max() < np.median(waits[n_kept:])
+    assert f"going on with {n_kept} of 30 points" in (other.parent / "run.log").read_text()

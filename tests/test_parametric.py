@@ -488,3 +488,17 @@ def test_a_record_of_few_blocks_is_refused(points: list[PointData]) -> None:
         r"2000 groups of rows; use fewer periods per block \(bootstrap\.periods\)",
     ):
         results_of(points[:1], how)
+
+
+@pytest.mark.parametrize(("samples_per_period", "missed"), [(25, 0.012), (50, 0.0028)])
+def test_smoothing_biases_least_squares_and_not_refinements(
+    samples_per_period: int, missed: float
+) -> None:
+    run = forced(**TRUTHS[0], dt=1.0 / samples_per_period, periods=20)
+    smoothed = replace(study(), formulation=Differential(split=RandomSplit(0.0)))
+    (result,) = results_of([PointData({"V": 1.0}, run)], smoothed)
+    for name, value in TRUTHS[0].items():
+        fitted, refined = (result.fits[f"constrained{end}"].estimates for end in ("", "_refined"))
+        assert abs(fitted[name].value / value - 1.0) == pytest.approx(missed, rel=0.15)
+        assert not fitted[name].low < value < fitted[name].high
+        assert refined[name].value == pytest.approx(value, rel=1e-5)

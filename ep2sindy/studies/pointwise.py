@@ -178,7 +178,7 @@ LAYOUT: Mapping[str, tuple[str, ...]] = {
 
 def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> None:
     reasons = {str(result.attrs[NO_FIT]), str(done[NO_FIT])} - {""}
-    result.attrs[NO_FIT] = min(reasons, default="")  # whichever block came first
+    result.attrs[NO_FIT] = min(reasons, default="")  # whatever the blocks are
     for name in (*LAYOUT, "status"):
         values, target = done[name], result[name].isel(block.slices)
         target.values[...] = values.reshape(target.shape)
@@ -191,7 +191,7 @@ def _searched(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
     columns = _columns(block, search.variables)
     status = np.array([_status(values, search) for values in columns], dtype=np.int8)
     found: dict[str, list[np.ndarray]] = {name: [] for name in LAYOUT}
-    reason = ""
+    reasons = []
     nothing = _nothing(search)
     for k, values in enumerate(columns):
         point = nothing
@@ -199,11 +199,12 @@ def _searched(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
             try:
                 point = _at_point(_trajectory(t, values, block, search), search)
             except ValueError as error:
-                status[k], reason = STATUSES.index(NO_FIT), reason or str(error)
+                status[k] = STATUSES.index(NO_FIT)
+                reasons.append(str(error))
         for name, value in point.items():
             found[name].append(value)
     stacked = {name: np.stack(each, axis=-1) for name, each in found.items()}
-    return stacked | {"status": status, NO_FIT: np.array(reason)}
+    return stacked | {"status": status, NO_FIT: np.array(min(reasons, default=""))}
 
 
 def _columns(
