@@ -1,0 +1,187 @@
+"""Do two checkouts find the same? Every experiment at toy size in both, compared to the last digit.
+
+    python -m benchmarks.same_results OTHER_CHECKOUT
+
+Compares summaries, models and tables, but for times. What only this checkout writes is named and
+allowed; anything that differs, or that it lacks, ends the program with status 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+HERE = Path(__file__).resolve().parents[1]
+TIMES = {"cpu_s", "wall_s", "points_per_s", "cpu_s_per_search"}
+ON_FILE = ["data=file", "data.variables.R_ion.name=R_ion", "data.variables.u_iz.name=u_iz"]
+LINE, GRID = "data.path={line}", "data.path={grid}"
+TOYS: dict[str, list[str]] = {
+    "breathing": ["+exp=breathing", *ON_FILE, LINE, "bootstraps.n=8", "search=adaptive_lasso"],
+    "discover": [
+        "+exp=discover", *ON_FILE, LINE, "trajectory.states=[n_i,n_n]", "formulation=weighted_weak",
+        "search=best_subset", "selection=ebic",
+    ],
+    "benchmark": [
+        "+exp=benchmark", "variants=[STLSQ,BALASSO,wALASSO,ours]", "n_realizations=2",
+        "systems=[oscillator,lotka_volterra]", "noises=[0.0,0.05]", "parallel=serial",
+    ],
+    "weak": ["+exp=weak", *ON_FILE, LINE, "n_windows=500", "n_points=[10,50]"],
+    "weak_windows": [
+        "+exp=weak_windows", "n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]",
+        "n_realizations=2", "parallel=serial",
+    ],
+    "frontier": [
+        "+exp=frontier", "variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]",
+        "parallel=serial",
+    ],
+    "constrained": ["+exp=constrained", *ON_FILE, LINE],
+    "ils": [
+        "+exp=ils", *ON_FILE, LINE, "n_windows=8", "windows=[30,60]",
+        "weak.test_functions.n_windows=500", "weak.test_functions.n_points=50",
+    ],
+    "parametric": [
+        "+exp=parametric", "data.cache={cache}", "data.duration_s=2.0e-3", "data.warm_up_s=0.5e-3",
+        "data.n_cells=30", "parallel=serial", "bootstraps.n=2", "bootstrap.n_draws=40",
+        "refining.n_windows=20", "library.variables=[n_i,n_n,R_ion]",
+        "points=[{{V_D_V: 200.0, mdot_mg_s: 5.0}},{{V_D_V: 300.0, mdot_mg_s: 5.0}},"
+        "{{V_D_V: 300.0, mdot_mg_s: 2.0, data: {{operating_point: {{neutral_speed: 190.0}}}}}}]",
+    ],
+    "pointwise": [
+        "+exp=pointwise", *ON_FILE, GRID, "data.r.name=r", "data.variables.u_ir.name=u_ir",
+        "keep={cache}/kept", "parallel=serial", "bootstraps.n=6", "block_points=5", "max_regimes=3",
+    ],
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("other", type=Path, help="the checkout to compare with")
+    parser.add_argument("--only", nargs="*", choices=TOYS, default=list(TOYS))
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        paths = write_data(Path(folder))
+        wrong = [name for name in arguments.only if not is_same(name, arguments.other, paths)]
+    sys.exit(f"they differ in {wrong}" if wrong else 0)
+
+
+def write_data(folder: Path) -> dict[str, Path]:
+    """A line that follows the thesis's Eq. 23, and a grid whose regions follow laws apart."""
+    t = 1.5e-6 * np.arange(1200)
+    profile = np.linspace(0.9, 1.1, 5)
+    line = _field(_predator_prey(t)[:, :, None] * profile, t, {"z": np.linspace(0.012, 0.028, 5)})
+    waves = _predator_prey(t[:300])[:, :, None, None] * np.linspace(0.8, 1.2, 6)[:, None]
+    axes = {"z": np.linspace(0.0, 0.03, 6), "r": np.linspace(0.036, 0.049, 5)}
+    grid = _field(waves * np.linspace(0.95, 1.05, 5), t[:300], axes)
+    line.to_netcdf(folder / "line.nc")
+    grid.to_netcdf(folder / "grid.nc")
+    return {name: folder / f"{name}.nc" for name in ("line", "grid")} | {"folder": folder}
+
+
+def _predator_prey(t: np.ndarray) -> np.ndarray:
+    """(samples, 2): densities by classical Runge-Kutta, a quarter of a sample per step."""
+    a, b, c, h = 1.64e5, 4.66e-14, 4.39e4, (t[1] - t[0]) / 4
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        return np.array([b * x[0] * x[1] - a * x[0], c * x[1] - b * x[0] * x[1]])
+
+    states = [np.array([5e17, 4e18])]
+    for _ in t[1:]:
+        x = states[-1]
+        for _ in range(4):
+            k1 = slope(x)
+            k2 = slope(x + h / 2 * k1)
+            k3 = slope(x + h / 2 * k2)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(x + h * k3))
+        states.append(x)
+    return np.array(states)
+
+
+def _field(densities: np.ndarray, t: np.ndarray, axes: dict[str, np.ndarray]) -> xr.Dataset:
+    shape = (len(t), *(len(axis) for axis in axes.values()))
+    wave = (slice(None), *[None] * len(axes))
+    values = {
+        "n_i": (densities[:, 0], "m^-3"),
+        "n_n": (densities[:, 1], "m^-3"),
+        "R_ion": (np.broadcast_to(4e-14 * (1 + 0.3 * np.sin(9e4 * t))[wave], shape), "m^3/s"),
+        "u_iz": (np.broadcast_to(5e3 * (1 + 0.2 * np.sin(7e4 * t))[wave], shape), "m/s"),
+        "u_ir": (np.broadcast_to(5e2 * (1 + 0.2 * np.sin(5e4 * t))[wave], shape), "m/s"),
+    }
+    units = {name: {"units": "m"} for name in axes} | {"time": {"units": "s"}}
+    field = xr.Dataset(
+        {name: (("time", *axes), v, {"units": unit}) for name, (v, unit) in values.items()},
+        coords={"time": t, **axes},
+    )
+    for name, attributes in units.items():
+        field[name].attrs = attributes
+    return field
+
+
+def is_same(name: str, other: Path, paths: dict[str, Path]) -> bool:
+    found = []
+    for number, checkout in enumerate((other.resolve(), HERE)):
+        output = paths["folder"] / f"{name}_{number}"
+        places = {**paths, "cache": paths["folder"] / f"cache_{number}"}
+        command = [text.format(**places) for text in TOYS[name]]
+        run = subprocess.run(
+            [sys.executable, "-m", "experiments.run", *command, f"output={output}"],
+            cwd=checkout, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if run.returncode:
+            print(f"{name}: failed in {checkout}:\n{run.stderr[-2000:]}")
+            return False
+        found.append(contents(Path(run.stdout.splitlines()[-1])))
+    before, now = found
+    differences = [text for path in before for text in differing(before[path], now.get(path), path)]
+    new = sorted(set(now) - set(before))
+    print(
+        f"{name}: {len(before)} files, "
+        + (f"{len(differences)} differences" if differences else "the same")
+        + (f"; new here: {new}" if new else "")
+    )
+    for text in differences[:10]:
+        print(f"  {text}")
+    return not differences
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Summary, models and tables of a run, by path."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*.json")):
+        if path.name != "provenance.json":
+            found[str(path.relative_to(folder))] = json.loads(path.read_text())
+    for path in sorted(folder.rglob("*.csv")):
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        found[str(path.relative_to(folder))] = table.to_dict("list")
+    return found
+
+
+def differing(before: Any, now: Any, place: str) -> Iterator[str]:
+    """Where what was there is another, or missing; what is new does not count."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key, value in before.items():
+            if key not in TIMES:
+                yield from differing(value, now.get(key), f"{place}: {key}")
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        for k, (one, other) in enumerate(zip(before, now, strict=True)):
+            yield from differing(one, other, f"{place}[{k}]")
+    elif before != now and not (_is_nan(before) and _is_nan(now)):
+        yield f"{place}: {str(before)[:80]} became {str(now)[:80]}"
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+if __name__ == "__main__":
+    main()
