@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from ep2sindy.errors_in_variables import reweighted
-from ep2sindy.parallel import Loky
-from ep2sindy.pareto import fit_support
-from ep2sindy.regression import RandomSplit
-from ep2sindy.studies.benchmark import DRAWS, realization
-from ep2sindy.weak import Weak
+from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.machine.parallel import Loky
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.front import fit_support
+from ep2sindy.synthetic.draws import DRAWS, realization
 
 NOISE = 0.05
 

@@ -9,17 +9,116 @@ right, and the errors of the coefficients, free and tied by the law.
 
 import sys
 import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import pandas as pd
 
-from ep2sindy.errors_in_variables import WeightedWeak
-from ep2sindy.parallel import Loky
-from ep2sindy.regression import RandomSplit
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import EBIC
-from ep2sindy.studies.joint_family import Method, rates, run_family
-from ep2sindy.weak import Weak
-from ep2sindy.windows import Bumps
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.coefficient_law import tied_fit
+from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.machine.parallel import Loky, Workers
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.test_functions import Bumps
+from ep2sindy.regression.weak import Weak
+from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.search.searches import BestSubset, Search
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.rule import Selection
+from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
+
+
+@dataclass(frozen=True)
+class Method:
+    """What joint search and single points have in common."""
+
+    formulation: Formulation
+    search: Search
+    selection: Selection
+    depth: int = 1
+
+    def find(self, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:
+        return discover_jointly(
+            points,
+            LIBRARY,
+            formulation=self.formulation,
+            search=self.search,
+            selection=self.selection,
+            depth=self.depth,
+            rng=np.random.default_rng(0),
+        )
+
+
+def run_family(
+    method: Method,
+    *,
+    noises: Sequence[float],
+    n_realizations: int,
+    workers: Workers,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda n_done: None,
+) -> pd.DataFrame:
+    """Search every realization at all points jointly, and at every point alone.
+
+    One row per noise and number. joint, pooled and one column per point: 1 where the supports of
+    all equations are right; pooled is one regression over all points, with one set of
+    coefficients. error_free, error_tied: RMS relative error of the coefficients at all points,
+    free or tied by the true law, and p_value the least of the equations', where joint is right.
+    """
+    if n_realizations < 1 or not len(noises):
+        raise ValueError(
+            "a study needs a noise level and a realization at least: "
+            f"noises={list(noises)}, n_realizations={n_realizations}"
+        )
+    tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
+    rows = {}
+    for k, row in workers.run(partial(outcome, method, seed=seed), tasks):
+        rows[k] = row
+        progress(len(rows))
+    return pd.DataFrame([rows[k] for k in range(len(tasks))])
+
+
+def outcome(method: Method, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
+    """One realization: one row of `run_family`."""
+    noise, number = task
+    points = realization(noise, number, seed=seed)
+    joint = method.find(points)
+    pooled = method.find({"all": [run for runs in points.values() for run in runs]})
+    row = {"noise": noise, "number": number, "joint": _right(joint), "pooled": _right(pooled)}
+    row |= {point: _right(method.find({point: runs})) for point, runs in points.items()}
+    return row | (_errors(joint) if row["joint"] else dict.fromkeys(ERRORS, np.nan))
+
+
+def _right(found: JointDiscovery) -> float:
+    return float(all(set(found.chosen[state]) == set(terms) for state, terms in TRUTH.items()))
+
+
+ERRORS = ("error_free", "error_tied", "p_value")
+
+
+def _errors(joint: JointDiscovery) -> dict[str, float]:
+    tied = tied_fit(joint, LAW, parameters=PARAMETERS)
+    errors: dict[str, list[float]] = {"error_free": [], "error_tied": []}
+    for point, parameters in PARAMETERS.items():
+        truth = system_at(parameters).model
+        for name, model in (
+            ("error_free", joint.models[point]),
+            ("error_tied", tied.model_at(parameters)),
+        ):
+            used = truth.coef != 0.0
+            errors[name] += (model.coef[used] / truth.coef[used] - 1.0).tolist()
+    found = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
+    return found | {"p_value": min(e.p_value for e in tied.equations.values())}
+
+
+def rates(outcomes: pd.DataFrame) -> pd.DataFrame:
+    """Realizations with the right support, in %, by noise: joint, pooled, every point alone."""
+    shown = ["joint", "pooled", *PARAMETERS]
+    return 100.0 * outcomes.groupby("noise")[shown].mean()
+
 
 NOISES = (0.0, 0.05, 0.1)
 # The same for joint search and single points. A tenth of a record: the automatic width can leave

@@ -9,11 +9,13 @@ reference values are another code's run of the same parameter set.
 import numpy as np
 import xarray as xr
 
-from ep2sindy.fields import Zone, zone_average
-from ep2sindy.library import named_terms
-from ep2sindy.pareto import fit_support
-from ep2sindy.regression import Differential, RandomSplit
-from ep2sindy.thruster import OPERATING_POINTS, Thruster, simulate
+from ep2sindy.data.zones import Zone, zone_average
+from ep2sindy.library.library import named_terms
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.search.front import fit_support
+from ep2sindy.thruster.parameters import OPERATING_POINTS, Thruster
+from ep2sindy.thruster.simulate import simulate
 
 # I_d mean (A), standard deviation (A) and frequency (kHz).
 CURRENTS = {

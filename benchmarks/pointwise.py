@@ -26,16 +26,17 @@ from sklearn.linear_model import lasso_path
 from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import cpu_s
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.io import read_field
-from ep2sindy.library import named_terms
-from ep2sindy.parallel import Serial
-from ep2sindy.regression import Differential, Regression
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import Knee
-from ep2sindy.studies.blocks import blocks_of
-from ep2sindy.studies.pointwise import PointSearch, pointwise
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.open import read_field
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.blocks import blocks_of
+from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.library.library import named_terms
+from ep2sindy.machine.parallel import Serial
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.knees import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s"}

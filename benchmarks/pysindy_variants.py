@@ -22,9 +22,9 @@ import pysindy
 from jaxtyping import Bool, Float
 from sklearn.exceptions import ConvergenceWarning
 
-from ep2sindy.library import Library, polynomial
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.studies.benchmark import Finding
-from ep2sindy.trajectory import Trajectory
 
 Candidates = dict[str, list[tuple[tuple[str, ...], float]]]
 

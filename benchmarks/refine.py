@@ -22,17 +22,18 @@ from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import cpu_s
-from ep2sindy.integral.batch import WindowBatch, cut_windows
-from ep2sindy.integral.descent import GradientDescent, window_paths
-from ep2sindy.integral.multiple_shooting import MultipleShooting
-from ep2sindy.integral.problem import Iteration, Problem
-from ep2sindy.integral.single_shooting import SingleShooting
-from ep2sindy.integral.steps import HermiteSimpson
-from ep2sindy.library import named_terms
-from ep2sindy.model import SparseModel, coef_matrix
-from ep2sindy.ode import ODE
-from ep2sindy.refine import refine, refine_many
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import named_terms
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.refinement.methods.gradient_descent import GradientDescent
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.methods.nelder_mead import window_paths
+from ep2sindy.refinement.methods.single_shooting import SingleShooting
+from ep2sindy.refinement.ode import ODE
+from ep2sindy.refinement.problem import Iteration, Problem
+from ep2sindy.refinement.refine import refine, refine_many
+from ep2sindy.refinement.steps import HermiteSimpson
+from ep2sindy.refinement.windows import WindowBatch, cut_windows
 
 DT_S, N_SAMPLES, N_WINDOWS, WINDOW = 1.5e-6, 12001, 30, 100
 CLOSE = 1e-4  # of the optimal loss

@@ -11,15 +11,17 @@ import argparse
 import numpy as np
 from sklearn.metrics import adjusted_rand_score
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.parallel import Loky
-from ep2sindy.regression import Differential
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import EBIC, Knee, LogKnee, Selection
-from ep2sindy.studies.pointwise import PointSearch, pointwise
-from ep2sindy.studies.regimes import Regimes, regimes
-from ep2sindy.studies.regions import REGIONS, STATES, RegionField, three_regions
-from ep2sindy.validation import Stability
+from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.regimes import Regimes, regimes
+from ep2sindy.machine.parallel import Loky
+from ep2sindy.regression.differential import Differential
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.knees import Knee, LogKnee
+from ep2sindy.selection.resampled import Stability
+from ep2sindy.selection.rule import Selection
+from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {

@@ -15,11 +15,12 @@ from sklearn.linear_model import lasso_path
 from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import cpu_s
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.pareto import ParetoFront, pareto_front
-from ep2sindy.regression import Differential, Regression
-from ep2sindy.search import AdaptiveLasso
-from ep2sindy.systems import lorenz
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.front import ParetoFront, pareto_front
+from ep2sindy.search.searches import AdaptiveLasso
+from ep2sindy.synthetic.systems import lorenz
 
 BOOTSTRAPS = Bootstraps(n=32, n_culled=1)
 # scikit-learn 1.7 renamed the argument.

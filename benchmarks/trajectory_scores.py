@@ -13,15 +13,16 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.errors_in_variables import WeightedWeak
-from ep2sindy.parallel import Loky
-from ep2sindy.pareto import ParetoFront, pareto_front
-from ep2sindy.refined_score import RefinedScore
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import EBIC, Selection, selected
-from ep2sindy.studies.benchmark import realization
-from ep2sindy.validation import IntegralScore
+from ep2sindy.machine.parallel import Loky
+from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.front import ParetoFront, pareto_front
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.integral import IntegralScore
+from ep2sindy.selection.refined import RefinedScore
+from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.synthetic.draws import realization
 
 CASES = (("lotka_volterra", 0.05), ("lotka_volterra", 0.2), ("lorenz", 0.05), ("lorenz", 0.2))
 RULES: dict[str, Selection] = {

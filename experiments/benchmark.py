@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from ep2sindy.report import RunFolder, write_tensorboard
-from ep2sindy.studies.benchmark import COUNTS, MERITS, cells, run_benchmark
-from ep2sindy.study_plots import benchmark_figure
+from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.tensorboard import write_tensorboard
+from ep2sindy.studies.benchmark import cells, run_benchmark
 from experiments.benchmark_view import Outcome, page, print_outcome
 from experiments.build import started_run
 from experiments.checks import check_counts, check_lists, check_numbers

@@ -9,8 +9,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ep2sindy.report import Screen, figure_html, page_html, table_html
-from ep2sindy.studies.benchmark import DRAWS, MERITS, Variant, merit_table
+from ep2sindy.figures.identified import MERITS, merit_table
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.screen import Screen
+from ep2sindy.studies.benchmark import Variant
+from ep2sindy.synthetic.draws import DRAWS
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,10 @@ import xarray as xr
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from ep2sindy.library import Library, named_terms, polynomial
-from ep2sindy.names import split_factors
-from ep2sindy.report import RunFolder, Screen
+from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.library.names import split_factors
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.screen import Screen
 
 # The keys of conf/config.yaml, which every study meets; each study names those it adds.
 BASE_KEYS = {
@@ -103,7 +104,7 @@ def prepared_steps(config: DictConfig) -> list[Callable[[xr.Dataset], xr.Dataset
     for k, entry in enumerate(config.prepare):
         if not isinstance(entry, DictConfig):
             raise ValueError(
-                f"prepare[{k}] must be like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: "
+                f"prepare[{k}] must be like {{_target_: ep2sindy.data.prepare.crop, start_s: 0}}: "
                 f"{entry!r} came"
             )
         step = instantiate(entry, _partial_=True, _convert_="all")

@@ -6,9 +6,10 @@ import numpy as np
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from ep2sindy.constraints import Constraint, constraint
-from ep2sindy.library import Library
-from ep2sindy.report import RunFolder, write_tensorboard
+from ep2sindy.constraints.relations import Constraint, constraint
+from ep2sindy.library.library import Library
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.tensorboard import write_tensorboard
 from ep2sindy.studies.held_out import Judged, constrained_beside_base, parted
 from experiments.build import (
     check_figures,

@@ -11,10 +11,12 @@ from omegaconf import DictConfig
 from rich.table import Table
 from tqdm import tqdm
 
-from ep2sindy.report import RunFolder, figure_html, page_html, table_html, write_tensorboard
+from ep2sindy.figures.identified import frontier_figure
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.tensorboard import write_tensorboard
 from ep2sindy.studies.frontier import identification_frontier
-from ep2sindy.systems import System
-from ep2sindy.weak_plots import frontier_figure
+from ep2sindy.synthetic.systems import System
 from experiments.build import started_run
 from experiments.checks import check_numbers
 from experiments.variants import chosen_variants

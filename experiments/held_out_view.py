@@ -9,12 +9,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ep2sindy.model import SparseModel, equation_text
-from ep2sindy.report import Screen, figure_html, page_html, table_html
-from ep2sindy.setting_plots import settings_figures, settings_trajectory_figure
-from ep2sindy.spectrum import dominant_frequency, frequency_text
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.settings import settings_figures, settings_trajectory_figure
+from ep2sindy.library.equations import equation_text
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.screen import Screen
+from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.held_out import HeldOutRun, Judged
-from ep2sindy.trajectory import Trajectory
 from experiments.model_view import equations_html
 
 

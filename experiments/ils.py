@@ -10,14 +10,15 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
-from ep2sindy.constraints import Constraint, constraint
-from ep2sindy.integral.batch import MIN_SAMPLES
-from ep2sindy.integral.problem import Iteration
-from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
-from ep2sindy.setting_plots import loss_against_window_figure
-from ep2sindy.spectrum import dominant_frequency
+from ep2sindy.constraints.relations import Constraint, constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.refinement.problem import Iteration
+from ep2sindy.refinement.windows import MIN_SAMPLES
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.tensorboard import LiveScalars, write_tensorboard
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.held_out import Judged, parted, refined_beside_base, refined_by_window
-from ep2sindy.trajectory import Trajectory
 from experiments.build import (
     check_figures,
     inputs_of,

@@ -10,19 +10,16 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy import plots
-from ep2sindy.model import equation_text
-from ep2sindy.report import RunFolder, write_tensorboard
-from ep2sindy.smoothing import Smoother
-from ep2sindy.spectrum import dominant_frequency
-from ep2sindy.studies.libraries import (
-    Integrated,
-    LibraryCase,
-    LibraryResult,
-    candidate_text,
-    compare_libraries,
-)
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures import series as plots
+from ep2sindy.figures.fronts import front_figure
+from ep2sindy.library.equations import equation_text
+from ep2sindy.model.integrated import Integrated
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.tensorboard import write_tensorboard
+from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.libraries import LibraryCase, LibraryResult, candidate_text, compare_libraries
 from experiments.build import (
     check_durations,
     check_library,
@@ -146,7 +143,7 @@ def _figures(outcome: Outcome, smoother: Smoother, shown: DictConfig) -> dict[st
     figures = {
         "data": plots.data_figure(run, duration_s=duration_s, f_max_Hz=f_max_Hz),
         **{
-            f"front_{name}": plots.front_figure(
+            f"front_{name}": front_figure(
                 r.discovery.fronts, r.discovery.scores, label=r.case.selection.label
             )
             for name, r in results.items()

@@ -9,11 +9,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ep2sindy.model import equation_text
-from ep2sindy.report import Screen, equation_html, figure_html, page_html, table_html
-from ep2sindy.spectrum import dominant_frequency, frequency_text
-from ep2sindy.studies.libraries import Integrated, LibraryResult, candidate_text, front_table
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.equations import equation_html, equation_text
+from ep2sindy.model.integrated import Integrated
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.screen import Screen
+from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.studies.libraries import LibraryResult, candidate_text, front_table
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.model import SparseModel
-from ep2sindy.report import equation_html
-from ep2sindy.spectrum import frequency_text
-from ep2sindy.studies.libraries import Integrated
+from ep2sindy.library.equations import equation_html
+from ep2sindy.model.integrated import Integrated
+from ep2sindy.model.model import SparseModel
+from ep2sindy.signals.spectrum import frequency_text
 
 
 def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataFrame:

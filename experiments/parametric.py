@@ -10,13 +10,14 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from ep2sindy.library import polynomial
-from ep2sindy.model import SparseModel
-from ep2sindy.parametric_plots import trends_figure
-from ep2sindy.report import LiveScalars, RunFolder, write_tensorboard
-from ep2sindy.studies.joint_points import searched_jointly
-from ep2sindy.studies.parametric import REFINED, PointResult, parametric_study
-from ep2sindy.studies.trends import laws
+from ep2sindy.figures.trends import trends_figure
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.tensorboard import LiveScalars, write_tensorboard
+from ep2sindy.studies.parametric.all_points import searched_jointly
+from ep2sindy.studies.parametric.points import REFINED, PointResult, parametric_study
+from ep2sindy.studies.parametric.trends import laws
 from experiments.build import started_run
 from experiments.checks import check_counts
 from experiments.model_view import coefficients

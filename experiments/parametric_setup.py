@@ -7,11 +7,11 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
-from ep2sindy.constraints import constraint
-from ep2sindy.library import Library, polynomial
-from ep2sindy.studies.operating_points import OSCILLATING, STEADY, PointData, point_label
-from ep2sindy.studies.parametric import Case, Searching, Study
-from ep2sindy.trajectory import ConstantStateError
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.data.trajectory import ConstantStateError
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.studies.parametric.oscillation import OSCILLATING, STEADY, PointData, point_label
+from ep2sindy.studies.parametric.points import Case, Searching, Study
 from experiments.build import (
     check_library,
     inputs_of,
@@ -20,7 +20,7 @@ from experiments.build import (
     terms_of,
 )
 
-STUDIES = "ep2sindy.studies"
+STUDIES = "ep2sindy.studies.parametric"
 WITHOUT_OSCILLATION = (STEADY, "decaying", "diverged")  # what a simulation says of itself
 
 
@@ -38,7 +38,7 @@ def study_of(config: DictConfig) -> Study:
         cases=_cases(config, library, terms),
         formulation=instantiate(config.formulation),
         bootstrap=instantiate(config.bootstrap, _target_=f"{STUDIES}.time_bootstrap.TimeBootstrap"),
-        refining=instantiate(config.refining, _target_=f"{STUDIES}.parametric.Refining"),
+        refining=instantiate(config.refining, _target_=f"{STUDIES}.points.Refining"),
         searching=Searching(
             library=_searched_library(config),
             search=instantiate(config.search),

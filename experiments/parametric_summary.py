@@ -4,7 +4,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from ep2sindy.studies.parametric import REFINED, PointResult
+from ep2sindy.studies.parametric.points import REFINED, PointResult
 from experiments.parametric_tables import Outcome, trends_table
 
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.control_law import ControlLaw
-from ep2sindy.model import equation_text
-from ep2sindy.studies.joint_points import JointResult
-from ep2sindy.studies.parametric import Fitted, PointResult, Study
-from ep2sindy.studies.trends import exponent, trends
+from ep2sindy.discovery.control_law import ControlLaw
+from ep2sindy.library.equations import equation_text
+from ep2sindy.studies.parametric.all_points import JointResult
+from ep2sindy.studies.parametric.points import Fitted, PointResult, Study
+from ep2sindy.studies.parametric.trends import exponent, trends
 
 EACH_POINT, ALL_POINTS = "each point", "all points"
 

@@ -8,11 +8,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ep2sindy.report import Screen, equation_html, figure_html, page_html, table_html
-from ep2sindy.spectrum import frequency_text
-from ep2sindy.studies.operating_points import point_label
-from ep2sindy.studies.parametric import REFINED, PointResult
-from ep2sindy.studies.trends import fit_names
+from ep2sindy.library.equations import equation_html
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.screen import Screen
+from ep2sindy.signals.spectrum import frequency_text
+from ep2sindy.studies.parametric.oscillation import point_label
+from ep2sindy.studies.parametric.points import REFINED, PointResult
+from ep2sindy.studies.parametric.trends import fit_names
 from experiments.parametric_tables import (
     Outcome,
     estimates_table,

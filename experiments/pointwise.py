@@ -14,17 +14,19 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 import ep2sindy
-from ep2sindy.files import fingerprint, replacing
-from ep2sindy.library import Library, named_terms
-from ep2sindy.map_plots import MEDIANS, coefficient_maps, quality_maps, regime_map
-from ep2sindy.model import equation_text
-from ep2sindy.names import split_factors
-from ep2sindy.parallel import Workers
-from ep2sindy.report import LiveScalars, RunFolder, Screen, write_tensorboard
-from ep2sindy.studies.blocks import Kept, blocks_of
-from ep2sindy.studies.pointwise import STATUSES, PointSearch, pointwise
-from ep2sindy.studies.regimes import regimes
-from ep2sindy.thruster import Thruster
+from ep2sindy.discovery.blocks import Kept, blocks_of
+from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.discovery.regimes import regimes
+from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regime_map
+from ep2sindy.library.equations import equation_text
+from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.names import split_factors
+from ep2sindy.machine.files import fingerprint, replacing
+from ep2sindy.machine.parallel import Workers
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.screen import Screen
+from ep2sindy.report.tensorboard import LiveScalars, write_tensorboard
+from ep2sindy.thruster.parameters import Thruster
 from experiments.build import open_prepared_field, started_run
 from experiments.checks import check_counts, check_lists
 from experiments.pointwise_view import Outcome, page, print_outcome, summary, terms_table

@@ -10,11 +10,13 @@ import xarray as xr
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ep2sindy.fields import SPACE
-from ep2sindy.map_plots import MEDIANS
-from ep2sindy.report import Screen, equation_html, figure_html, page_html, table_html
-from ep2sindy.studies.pointwise import STATUSES
-from ep2sindy.studies.regimes import UNSURE, Regimes
+from ep2sindy.data.fields import SPACE
+from ep2sindy.discovery.pointwise import STATUSES
+from ep2sindy.discovery.regimes import UNSURE, Regimes
+from ep2sindy.figures.maps import MEDIANS
+from ep2sindy.library.equations import equation_html
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.screen import Screen
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,14 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from ep2sindy.report import RunFolder, write_tensorboard
-from ep2sindy.setting_plots import settings_derivative_figure, settings_figures
-from ep2sindy.smoothing import Smoother
-from ep2sindy.spectrum import dominant_frequency
+from ep2sindy.figures.settings import settings_derivative_figure, settings_figures
+from ep2sindy.regression.test_functions import Boxes
+from ep2sindy.regression.weak import Weak
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.tensorboard import write_tensorboard
+from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.weak_forms import Fitted, Setting, boxes_grid, fit_settings
-from ep2sindy.weak import Weak
-from ep2sindy.windows import Boxes
 from experiments.build import (
     check_durations,
     inputs_of,

@@ -8,12 +8,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ep2sindy.model import equation_text
-from ep2sindy.report import Screen, equation_html, figure_html, page_html, table_html
-from ep2sindy.spectrum import frequency_text
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.equations import equation_html, equation_text
+from ep2sindy.library.units import prefixed
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.screen import Screen
+from ep2sindy.signals.spectrum import frequency_text
 from ep2sindy.studies.weak_forms import Fitted
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.units import prefixed
 from experiments.model_view import equations_html, frequency_cell, intervals_text
 
 

@@ -12,10 +12,12 @@ from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from tqdm import tqdm
 
-from ep2sindy.report import RunFolder, figure_html, page_html, table_html, write_tensorboard
+from ep2sindy.figures.windows import window_error_figure
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.page import figure_html, page_html, table_html
+from ep2sindy.report.tensorboard import write_tensorboard
 from ep2sindy.studies.weak_windows import coefficient_errors, window_cells
-from ep2sindy.systems import System
-from ep2sindy.weak_plots import window_error_figure
+from ep2sindy.synthetic.systems import System
 from experiments.build import started_run
 from experiments.checks import check_counts, check_numbers
 from experiments.weak import settings_of

@@ -7,7 +7,7 @@ from jaxtyping import install_import_hook
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 # Compiled by numba, which cannot look inside a checking wrapper.
-COMPILED = ("kernels", "kalman_kernels")
+COMPILED = ("kernels", "gram_fits")
 
 
 def checked_modules() -> list[str]:

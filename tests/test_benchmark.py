@@ -6,24 +6,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.library import Library
-from ep2sindy.parallel import Loky
-from ep2sindy.regression import Differential
-from ep2sindy.search import STLSQ, AdaptiveLasso
-from ep2sindy.selection import Knee
-from ep2sindy.studies.benchmark import (
-    Finding,
-    SearchVariant,
-    Variant,
-    cells,
-    judged,
-    merit_table,
-    realization,
-    run_benchmark,
-)
-from ep2sindy.study_plots import benchmark_figure
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.identified import benchmark_figure, merit_table
+from ep2sindy.library.library import Library
+from ep2sindy.machine.parallel import Loky
+from ep2sindy.regression.differential import Differential
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import STLSQ, AdaptiveLasso
+from ep2sindy.selection.knees import Knee
+from ep2sindy.studies.benchmark import Finding, SearchVariant, Variant, cells, judged, run_benchmark
+from ep2sindy.synthetic.draws import realization
 
 TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
 # Draws random bootstraps and a random split: its outcome hangs on its stream.

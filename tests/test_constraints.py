@@ -5,22 +5,24 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ep2sindy.constrained import constrained_fit
-from ep2sindy.constraints import (
+from ep2sindy.constraints.fit import constrained_fit
+from ep2sindy.constraints.relations import (
     Constraint,
     Relation,
     constraint,
     parse_relation,
     relations_from_matrix,
 )
-from ep2sindy.errors_in_variables import reweighted
-from ep2sindy.library import named_terms, polynomial
-from ep2sindy.model import SparseModel
-from ep2sindy.pareto import fit_support
-from ep2sindy.regression import Differential, Formulation, RandomSplit, Regression
-from ep2sindy.systems import lotka_volterra
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.weak import Weak
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.front import fit_support
+from ep2sindy.synthetic.systems import lotka_volterra
 
 LIBRARY = polynomial(["x", "y"], degree=2)
 SUPPORT = {"x": ["x", "x*y"], "y": ["y", "y*x"]}

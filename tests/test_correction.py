@@ -7,18 +7,19 @@ import pytest
 import torch
 from torch import nn
 
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.constraints import constraint
-from ep2sindy.correction import Corrected, refine_with_correction
-from ep2sindy.integral.descent import GradientDescent
-from ep2sindy.library import Library, named_terms, polynomial
-from ep2sindy.model import SparseModel, coef_matrix
-from ep2sindy.pareto import Candidate, pareto_front
-from ep2sindy.regression import Regression
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import LogKnee, selected
-from ep2sindy.systems import lotka_volterra
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.refinement.correction import Corrected, refine_with_correction
+from ep2sindy.refinement.methods.gradient_descent import GradientDescent
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.front import Candidate, pareto_front
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.knees import LogKnee
+from ep2sindy.selection.rule import selected
+from ep2sindy.synthetic.systems import lotka_volterra
 
 PREY = lotka_volterra()
 DENSITY = 1e18

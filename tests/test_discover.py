@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.discover import discover
-from ep2sindy.library import polynomial
-from ep2sindy.names import split_factors
-from ep2sindy.regression import Differential
-from ep2sindy.search import AdaptiveLasso, BestSubset
-from ep2sindy.selection import Knee
-from ep2sindy.systems import lotka_volterra
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import discover
+from ep2sindy.library.library import polynomial
+from ep2sindy.library.names import split_factors
+from ep2sindy.regression.differential import Differential
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import AdaptiveLasso, BestSubset
+from ep2sindy.selection.knees import Knee
+from ep2sindy.synthetic.systems import lotka_volterra
 
 SETTINGS = {
     "formulation": Differential(),

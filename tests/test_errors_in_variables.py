@@ -4,19 +4,22 @@ import numpy as np
 import pytest
 
 from benchmarks.intervals import held
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.discover import discover
-from ep2sindy.errors_in_variables import WeightedWeak, reweighted, whitened_rows
-from ep2sindy.library import named_terms, polynomial
-from ep2sindy.pareto import Candidate, fit_support, pareto_front
-from ep2sindy.regression import RandomSplit, Regression
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import EBIC
-from ep2sindy.studies.benchmark import realization
-from ep2sindy.systems import System, lorenz, lotka_volterra
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.weak import Weak
-from ep2sindy.windows import Bumps
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.test_functions import Bumps
+from ep2sindy.regression.weak import Weak
+from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.front import Candidate, fit_support, pareto_front
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.synthetic.draws import realization
+from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
 
 EVERY_ROW = Weak(split=RandomSplit(0.0))
 

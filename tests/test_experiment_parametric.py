@@ -10,11 +10,11 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ep2sindy.control_law import control_law
-from ep2sindy.io import write_field
-from ep2sindy.library import polynomial
-from ep2sindy.model import SparseModel
-from ep2sindy.parametric_plots import trends_figure
+from ep2sindy.data.open import write_field
+from ep2sindy.discovery.control_law import control_law
+from ep2sindy.figures.trends import trends_figure
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel
 from experiments import parametric
 from experiments.parametric_view import with_error
 from experiments.run import innermost

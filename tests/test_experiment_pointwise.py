@@ -15,9 +15,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ep2sindy.io import write_field
-from ep2sindy.studies.blocks import Block, Kept
-from ep2sindy.studies.regions import TERMS, three_regions
+from ep2sindy.data.open import write_field
+from ep2sindy.discovery.blocks import Block, Kept
+from ep2sindy.synthetic.regions import TERMS, three_regions
 from experiments import pointwise
 from experiments.run import innermost
 
@@ -137,7 +137,7 @@ def test_settings_that_cannot_work_are_refused(
 
 def test_a_rate_table_that_has_changed_has_other_blocks(grid: Path, tmp_path: Path) -> None:
     table = tmp_path / "rates.csv"
-    step = f"{{_target_: ep2sindy.prepare.ionization_rate, table: {table}}}"
+    step = f"{{_target_: ep2sindy.thruster.ionization.ionization_rate, table: {table}}}"
     table.write_text("1,1e-15\n100,1e-13\n")
     before = pointwise.blocks_key(composed(*on_file(grid, tmp_path), f"prepare=[{step}]"))
     table.write_text("1,5e-15\n100,5e-13\n")

@@ -13,12 +13,12 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ep2sindy.constraints import constraint
-from ep2sindy.discover import discover
-from ep2sindy.integral.problem import Iteration
-from ep2sindy.io import write_field
-from ep2sindy.library import polynomial
-from ep2sindy.model import SparseModel
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.data.open import write_field
+from ep2sindy.discovery.discover import discover
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.problem import Iteration
 from experiments import constrained, frontier, ils, libraries, weak, weak_windows
 from experiments.build import check_overrides, open_prepared_field, selection_of
 from experiments.run import innermost
@@ -333,7 +333,7 @@ def test_mistakes_end_in_one_clear_message(
         (["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this field has"),
         (["bootstraps.n_culled=6"], "n_culled must leave a term: 6 of 6 would go"),
         (
-            ["prepare=[{_target_:ep2sindy.prepare.crop,start:1}]"],
+            ["prepare=[{_target_:ep2sindy.data.prepare.crop,start:1}]"],
             "prepare[0], crop: got an unexpected keyword argument 'start'",
         ),
         (["output=Makefile"], "choose another with output=PATH"),

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import ep2sindy.fields as fields
-from ep2sindy.fields import Zone, check_field, mask_outside, point, zone_average
-from ep2sindy.io import read_field, write_field
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data import zones
+from ep2sindy.data.fields import check_field, mask_outside
+from ep2sindy.data.open import read_field, write_field
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.zones import Zone, point, zone_average
 
 T = np.linspace(0.0, 1e-4, 11)
 
@@ -158,12 +159,12 @@ def test_mask_outside_leaves_variables_without_its_dimensions() -> None:
 def test_slabs_do_not_change_the_average(monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"states": ["n_i"], "inputs": ["T_e_eV"], "products": ["n_i*T_e_eV"]}
     whole = zone_average(masked_field(), Zone(), **names)
-    monkeypatch.setattr(fields, "SLAB_VALUES", 12)  # three samples of four cells
+    monkeypatch.setattr(zones, "SLAB_VALUES", 12)  # three samples of four cells
     assert np.array_equal(zone_average(masked_field(), Zone(), **names).values, whole.values)
 
 
 def test_a_gap_in_a_later_slab_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fields, "SLAB_VALUES", 12)
+    monkeypatch.setattr(zones, "SLAB_VALUES", 12)
     field = masked_field()
     field["n_i"].values[9, 1, 1] = np.nan
     with pytest.raises(ValueError, match=r"n_i = nan at time = 9e-05 s, z = 1 m, r = 2 m"):

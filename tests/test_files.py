@@ -7,8 +7,10 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from ep2sindy.files import fingerprint, replacing, write_text
-from ep2sindy.report import RunFolder, equation_html, table_html
+from ep2sindy.library.equations import equation_html
+from ep2sindy.machine.files import fingerprint, replacing, write_text
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.page import table_html
 
 NOW = datetime(2026, 1, 2, 3, 4, 5)
 

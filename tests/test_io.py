@@ -10,9 +10,9 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from scipy.io import savemat
 
-from ep2sindy.fields import Zone, zone_average
-from ep2sindy.io import Variable, conversion, open_field, read_field, same_unit, write_field
-from ep2sindy.prepare import keep_where
+from ep2sindy.data.open import Variable, conversion, open_field, read_field, same_unit, write_field
+from ep2sindy.data.prepare import keep_where
+from ep2sindy.data.zones import Zone, zone_average
 
 ROOT = Path(__file__).resolve().parents[1]
 RNG = np.random.default_rng(3)

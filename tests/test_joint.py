@@ -5,31 +5,26 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.discover import discover
-from ep2sindy.errors_in_variables import WeightedWeak
-from ep2sindy.joint import JointDiscovery, discover_jointly
-from ep2sindy.library import Library, named_terms, polynomial
-from ep2sindy.parallel import Serial
-from ep2sindy.regression import Differential, Formulation, RandomSplit, Regression
-from ep2sindy.search import AdaptiveLasso, BestSubset, Search
-from ep2sindy.selection import BIC, EBIC, AICc, Knee, Selection, log_supports
-from ep2sindy.studies.joint_family import (
-    LAW,
-    LIBRARY,
-    PARAMETERS,
-    TRUTH,
-    Method,
-    rates,
-    realization,
-    run_family,
-    system_at,
-)
-from ep2sindy.systems import lotka_volterra
-from ep2sindy.tied import tied_fit
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.weak import Weak
-from ep2sindy.windows import Bumps
+from benchmarks.joint import Method, rates, run_family
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.coefficient_law import tied_fit
+from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.machine.parallel import Serial
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.test_functions import Bumps
+from ep2sindy.regression.weak import Weak
+from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
+from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
+from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.rule import Selection
+from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
+from ep2sindy.synthetic.systems import lotka_volterra
 
 METHOD = Method(
     WeightedWeak(Weak(test_functions=Bumps(half_width_s=1.5), split=RandomSplit(0.0))),

@@ -1,120 +1,138 @@
-"""The house rule: imports go one way, and heavy guests stay in their rooms."""
+"""The house rule: imports go one way, rooms stay small, and heavy guests stay in their rooms."""
 
 import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
-# From data to report; a module may import only from those before it.
-ORDER = [
-    "files",
-    "parallel",
-    "resampling",
-    "units",
-    "names",
-    "kernels",
-    "trajectory",
-    "fields",
-    "readers",
-    "io",
-    "spectrum",
-    "thruster",
-    "prepare",
-    "smoothing",
-    "kalman_kernels",
-    "kalman",
+# From the ground up: a room may import only from itself and from those before it.
+ROOMS = [
+    "machine",
     "library",
-    "windows",
-    "regression",
-    "weak",
-    "ambiguity",
-    "search",
-    "bootstraps",
-    "pareto",
-    "errors_in_variables",
-    "selection",
+    "data",
+    "signals",
+    "thruster",
     "model",
+    "regression",
     "constraints",
-    "constrained",
-    "ensemble",
-    "validation",
-    "systems",
-    "control_law",
-    "discover",
-    "joint",
-    "tied",
-    "ode",
-    "integral",
-    "refine",
-    "together",
-    "refined_score",
-    "correction",
-    "estimators",
-    "studies",
-    "plots",
-    "setting_plots",
-    "weak_plots",
-    "study_plots",
-    "map_panels",
-    "map_plots",
-    "parametric_plots",
+    "search",
+    "synthetic",
+    "refinement",
+    "selection",
+    "discovery",
+    "figures",
     "report",
+    "studies",
+    "app",
 ]
-# PyTorch is slow to import and of no use to the search; `report` needs its TensorBoard writer.
-ALLOWED = {
-    "torch": {"ode", "integral", "refine", "correction", "report"},
-    "hydra": set(),
-    "omegaconf": set(),
-    "matplotlib": {
-        "parametric_plots",
-        "plots",
-        "study_plots",
-        "report",
-        "setting_plots",
-        "weak_plots",
-        "map_panels",
-        "map_plots",
-    },
+# What takes a second to import, and the modules that may load it, by themselves or through others.
+HEAVY = {
+    "torch": ("refinement", "selection.refined", "studies.held_out", "studies.parametric"),
+    "hydra": ("app",),
+    "omegaconf": ("app",),
+    "matplotlib": ("figures", "report", "studies", "app"),
+    "pandas": ("data", "thruster", "synthetic", "discovery", "figures", "report", "studies", "app"),
+    "xarray": ("data", "thruster", "synthetic", "discovery", "figures", "studies", "app"),
 }
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
 
-def modules() -> list[Path]:
-    return sorted(p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py")
+def named(path: Path) -> str:
+    """`search/front.py` -> `search.front`; a room's `__init__.py` bears the room's name."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def room(path: Path) -> str:
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+PATHS = {named(path): path for path in MODULES}
 
 
-def imported(path: Path) -> set[str]:
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def imports(path: Path, *, at_once: bool) -> Iterator[str]:
+    """Modules that a file imports; at_once: only what importing the file itself loads."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in _loaded(tree) if at_once else ast.walk(tree):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path.name}: write imports in full"
             assert node.module is not None
-            names.add(node.module)
-            names |= {f"{node.module}.{a.name}" for a in node.names if node.module == "ep2sindy"}
-    return names
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_go_one_way(path: Path) -> None:
-    for name in imported(path):
-        parts = name.split(".")
-        if parts[0] != "ep2sindy" or len(parts) == 1 or parts[1] == room(path):
+def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
+    """Statements that run at import: outside of functions and of `if TYPE_CHECKING`."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.Lambda):
             continue
-        assert ORDER.index(parts[1]) < ORDER.index(room(path)), f"{room(path)} imports {name}"
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            continue
+        yield node
+        yield from _loaded(node)
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_heavy_packages_stay_in_their_rooms(path: Path) -> None:
-    for package, rooms in ALLOWED.items():
-        if any(name.split(".")[0] == package for name in imported(path)):
-            assert room(path) in rooms, f"{room(path)} must not import {package}"
+def own(names: Iterator[str]) -> set[str]:
+    """Those of our modules, without the package's name; a name from a module is that module."""
+    inside = {name.removeprefix("ep2sindy.") for name in names if name.startswith("ep2sindy.")}
+    return inside & set(PATHS)
+
+
+def loaded(module: str) -> set[str]:
+    """Every module of ours that importing this one loads, itself included."""
+    found = {module}
+    stack = [module]
+    while stack:
+        for name in own(imports(PATHS[stack.pop()], at_once=True)) - found:
+            found.add(name)
+            stack.append(name)
+    return found
+
+
+@pytest.mark.parametrize("module", PATHS)
+def test_imports_go_one_way(module: str) -> None:
+    room = module.split(".")[0]
+    for name in own(imports(PATHS[module], at_once=False)):
+        there = name.split(".")[0]
+        assert ROOMS.index(there) <= ROOMS.index(room), f"{module} imports {name}"
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    waiting = {m: own(imports(p, at_once=False)) - {m} for m, p in PATHS.items()}
+    while ready := [m for m, needs in waiting.items() if not needs & set(waiting)]:
+        for module in ready:
+            del waiting[module]
+    assert not waiting, f"circles among {sorted(waiting)}"
+
+
+@pytest.mark.parametrize("package", HEAVY)
+def test_heavy_packages_load_only_where_they_are_needed(package: str) -> None:
+    """Through the imports of imports: a light module must not bring in a heavy one."""
+    users = {
+        module
+        for module, path in PATHS.items()
+        if any(name.split(".")[0] == package for name in imports(path, at_once=True))
+    }
+    for module in PATHS:
+        if not any(f"{module}.".startswith(f"{place}.") for place in HEAVY[package]):
+            through = sorted(loaded(module) & users)
+            assert not through, f"{module} loads {package} through {through}"
+
+
+def test_the_package_has_few_entries() -> None:
+    entries = [p.name for p in PACKAGE.iterdir() if p.name != "__pycache__"]
+    assert len(entries) <= 20, sorted(entries)
 
 
 def test_every_room_is_on_the_list() -> None:
-    assert {room(p) for p in modules()} <= set(ORDER)
+    assert {module.split(".")[0] for module in PATHS} <= set(ROOMS)
+
+
+@pytest.mark.parametrize("module", PATHS)
+def test_files_and_functions_stay_short(module: str) -> None:
+    source = PATHS[module].read_text(encoding="utf-8")
+    assert len(source.splitlines()) <= 310, f"{module} holds more than 310 lines"
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef):
+            n_lines = (node.end_lineno or node.lineno) - node.lineno + 1
+            assert n_lines <= 70, f"{module}.{node.name} takes {n_lines} lines"

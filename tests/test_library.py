@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from ep2sindy.library import Library, named_terms, polynomial
-from ep2sindy.names import split_factors
-from ep2sindy.units import unit_product
+from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.library.names import split_factors
+from ep2sindy.library.units import unit_product
 
 
 def test_polynomial_is_ordered_by_degree_then_variable() -> None:

@@ -6,9 +6,9 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from ep2sindy.map_panels import COUNTS, SHARES
-from ep2sindy.map_plots import ABSENT, GAP, coefficient_maps, quality_maps, regime_map
-from ep2sindy.studies.regimes import Regimes, regimes
+from ep2sindy.discovery.regimes import Regimes, regimes
+from ep2sindy.figures.maps import ABSENT, GAP, coefficient_maps, quality_maps, regime_map
+from ep2sindy.figures.panels import COUNTS, SHARES
 from ep2sindy.thruster.parameters import Thruster
 
 TERMS = ["1", "n_n", "n_i*u_iz"]

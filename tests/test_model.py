@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ep2sindy.library import named_terms, polynomial
-from ep2sindy.model import SparseModel, coef_matrix
-from ep2sindy.systems import lotka_volterra
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.synthetic.systems import lotka_volterra
 
 VARIABLES = ["n_i", "n_n", "R_ion"]
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "R_ion": "m^3/s"}

@@ -6,13 +6,13 @@ import torch
 from torch import nn
 from torchdiffeq import odeint
 
-from ep2sindy.constraints import constraint
-from ep2sindy.integral.steps import HermiteSimpson, RungeKutta
-from ep2sindy.integral.tangents import augmented
-from ep2sindy.library import named_terms
-from ep2sindy.model import SparseModel, coef_matrix
-from ep2sindy.ode import ODE, Drive
-from ep2sindy.systems import lotka_volterra
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.library.library import named_terms
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.refinement.ode import ODE, Drive
+from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
+from ep2sindy.refinement.tangents import augmented
+from ep2sindy.synthetic.systems import lotka_volterra
 
 SCALE = np.array([2.0, 3.0])
 

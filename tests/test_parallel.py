@@ -11,7 +11,7 @@ import pytest
 from distributed import LocalCluster
 from threadpoolctl import threadpool_info
 
-from ep2sindy.parallel import Dask, Loky, Serial, Workers
+from ep2sindy.machine.parallel import Dask, Loky, Serial, Workers
 
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
 

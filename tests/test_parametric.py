@@ -6,20 +6,24 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.constrained import constrained_fit
-from ep2sindy.constraints import constraint
-from ep2sindy.library import named_terms, polynomial
-from ep2sindy.model import SparseModel, coef_matrix
-from ep2sindy.parallel import Loky, Serial
-from ep2sindy.regression import Differential, RandomSplit, Regression
-from ep2sindy.resampling import moving_block_counts
-from ep2sindy.search import AdaptiveLasso, BestSubset
-from ep2sindy.selection import Knee
-from ep2sindy.smoothing import NoSmoothing
-from ep2sindy.studies.joint_points import searched_jointly
-from ep2sindy.studies.operating_points import PointData, oscillation
-from ep2sindy.studies.parametric import (
+from ep2sindy.constraints.fit import constrained_fit
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.machine.parallel import Loky, Serial
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.resampling import moving_block_counts
+from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import AdaptiveLasso, BestSubset
+from ep2sindy.selection.knees import Knee
+from ep2sindy.signals.smoothers import NoSmoothing
+from ep2sindy.studies.parametric.all_points import searched_jointly
+from ep2sindy.studies.parametric.oscillation import PointData, oscillation
+from ep2sindy.studies.parametric.points import (
     Case,
     Fitted,
     PointResult,
@@ -28,11 +32,14 @@ from ep2sindy.studies.parametric import (
     Study,
     parametric_study,
 )
-from ep2sindy.studies.quantities import Estimate, Quantity, drawn_estimates, propagated_estimates
-from ep2sindy.studies.time_bootstrap import TimeBootstrap, resampled_coefficients
-from ep2sindy.studies.trends import laws, power_law_r2, trends
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.weak import Weak
+from ep2sindy.studies.parametric.quantities import (
+    Estimate,
+    Quantity,
+    drawn_estimates,
+    propagated_estimates,
+)
+from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap, resampled_coefficients
+from ep2sindy.studies.parametric.trends import laws, power_law_r2, trends
 
 LIBRARY = named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])
 TERMS = {"x": ["x*u", "x*y*R"], "y": ["1", "x*y*R"]}

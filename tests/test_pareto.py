@@ -1,12 +1,21 @@
 import numpy as np
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps, Supports, pooled_supports
-from ep2sindy.library import named_terms
-from ep2sindy.pareto import front_order, pareto_front, r2
-from ep2sindy.regression import Differential, RandomSplit, Regression
-from ep2sindy.search import STLSQ, AdaptiveLasso, BestSubset, Search
-from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
+from ep2sindy.library.library import named_terms
+from ep2sindy.model.scores import r2
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.search.bootstraps import Bootstraps, Supports, pooled_supports
+from ep2sindy.search.front import front_order, pareto_front
+from ep2sindy.search.searches import STLSQ, AdaptiveLasso, BestSubset, Search
+from ep2sindy.synthetic.systems import (
+    System,
+    damped_oscillator,
+    lorenz,
+    lotka_volterra,
+    van_der_pol,
+)
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
 SEARCHES = [AdaptiveLasso(), STLSQ(), BestSubset()]

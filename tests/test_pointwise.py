@@ -9,18 +9,19 @@ import pytest
 import xarray as xr
 from distributed import LocalCluster
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.discover import discover
-from ep2sindy.fields import point
-from ep2sindy.library import named_terms
-from ep2sindy.parallel import Dask, Loky, Serial
-from ep2sindy.regression import Differential, RandomSplit
-from ep2sindy.search import AdaptiveLasso, BestSubset
-from ep2sindy.selection import EBIC
-from ep2sindy.studies.blocks import Kept, blocks_of
-from ep2sindy.studies.pointwise import STATUSES, PointSearch, pointwise
-from ep2sindy.validation import IntegralScore
-from ep2sindy.weak import Weak
+from ep2sindy.data.zones import point
+from ep2sindy.discovery.blocks import Kept, blocks_of
+from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.library.library import named_terms
+from ep2sindy.machine.parallel import Dask, Loky, Serial
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import AdaptiveLasso, BestSubset
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.integral import IntegralScore
 
 T = np.linspace(0.0, 2.0, 201)
 Z, R = np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.035, 0.04, 0.05])

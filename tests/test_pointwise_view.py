@@ -5,8 +5,8 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
-from ep2sindy.report import WIDTH, Screen
-from ep2sindy.studies.regimes import regimes
+from ep2sindy.discovery.regimes import regimes
+from ep2sindy.report.screen import WIDTH, Screen
 from experiments.pointwise_view import Outcome, page, print_outcome, summary
 
 TERMS = ["1", "n_n", "n_i*u_iz"]

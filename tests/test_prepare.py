@@ -4,16 +4,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.prepare import (
-    crop,
-    decimate,
-    derive,
-    ionization_rate,
-    keep_where,
-    low_pass,
-    read_rate_table,
-)
+from ep2sindy.data.prepare import crop, decimate, derive, keep_where, low_pass
 from ep2sindy.thruster import closures
+from ep2sindy.thruster.ionization import ionization_rate, read_rate_table
 
 DT = 1e-6
 N = 2000

@@ -14,8 +14,8 @@ from benchmarks.pysindy_variants import (
     best_of_each_size,
     pysindy_library,
 )
-from ep2sindy.library import named_terms
-from ep2sindy.systems import lotka_volterra, van_der_pol
+from ep2sindy.library.library import named_terms
+from ep2sindy.synthetic.systems import lotka_volterra, van_der_pol
 
 METHODS = [Stlsq(), Ssr(), Ensemble(), WeakForm()]
 

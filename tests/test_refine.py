@@ -8,18 +8,19 @@ import torch
 from scipy.integrate import solve_ivp
 
 from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
-from ep2sindy.constraints import constraint
-from ep2sindy.integral.batch import cut_windows, dominant_window
-from ep2sindy.integral.descent import GradientDescent, NelderMead
-from ep2sindy.integral.multiple_shooting import MultipleShooting
-from ep2sindy.integral.problem import Iteration, Method
-from ep2sindy.integral.single_shooting import SingleShooting
-from ep2sindy.integral.steps import HermiteSimpson, RungeKutta
-from ep2sindy.library import named_terms
-from ep2sindy.model import SparseModel, coef_matrix
-from ep2sindy.refine import Refinement, loss_against_window, refine, refine_many
-from ep2sindy.systems import System, lorenz, lotka_volterra
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import named_terms
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.refinement.methods.gradient_descent import GradientDescent
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.methods.nelder_mead import NelderMead
+from ep2sindy.refinement.methods.single_shooting import SingleShooting
+from ep2sindy.refinement.problem import Iteration, Method
+from ep2sindy.refinement.refine import Refinement, loss_against_window, refine, refine_many
+from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
+from ep2sindy.refinement.windows import cut_windows, dominant_window
+from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
 
 PREY, LORENZ = lotka_volterra(), lorenz()
 LONG = replace(PREY, duration_s=300.0)  # 30 windows of 100 samples, none twice

@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 import torch
 
-from ep2sindy import refined_score
-from ep2sindy.ensemble import MAX_ERROR, Ensemble
-from ep2sindy.integral.batch import WindowBatch, cut_windows
-from ep2sindy.integral.multiple_shooting import MultipleShooting
-from ep2sindy.library import Library, polynomial
-from ep2sindy.model import SparseModel, coef_matrix
-from ep2sindy.pareto import Candidate, ParetoFront
-from ep2sindy.refined_score import RefinedScore, _refined
-from ep2sindy.regression import Regression
-from ep2sindy.selection import FLOOR, Selection, selected
-from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra
-from ep2sindy.together import follow_together, refine_together
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.validation import IntegralScore
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.model.many import MAX_ERROR, Ensemble
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.refinement.many import follow_together, refine_together
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.windows import WindowBatch, cut_windows
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.front import Candidate, ParetoFront
+from ep2sindy.selection import refined as refined_score
+from ep2sindy.selection.integral import IntegralScore
+from ep2sindy.selection.refined import RefinedScore, _refined
+from ep2sindy.selection.rule import FLOOR, Selection, selected
+from ep2sindy.synthetic.systems import System, damped_oscillator, lorenz, lotka_volterra
 
 PREY = lotka_volterra()
 Terms = dict[str, float]
@@ -246,7 +246,7 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
         better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
         return [better, worse], np.zeros(2, dtype=np.bool_)
 
-    monkeypatch.setattr("ep2sindy.refined_score.refine_together", unfinished)
+    monkeypatch.setattr("ep2sindy.selection.refined.refine_together", unfinished)
     run = PREY.trajectory()
     batch = cut_windows(
         [run], states=("x", "y"), inputs=(), n_windows=3, window=50, rng=np.random.default_rng(0)

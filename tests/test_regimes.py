@@ -5,14 +5,14 @@ import pytest
 import xarray as xr
 from sklearn.metrics import adjusted_rand_score
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.parallel import Serial
-from ep2sindy.regression import Differential
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import EBIC
-from ep2sindy.studies.pointwise import PointSearch, pointwise
-from ep2sindy.studies.regimes import Regimes, group_points, regimes
-from ep2sindy.studies.regions import REGIONS, STATES, RegionField, three_regions
+from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.regimes import Regimes, group_points, regimes
+from ep2sindy.machine.parallel import Serial
+from ep2sindy.regression.differential import Differential
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
 
 SIZES = {"fast": (12, 11, 1000), "full": (20, 15, 1500)}
 ONE_EQUATION = dict.fromkeys(REGIONS, REGIONS["exit"])

@@ -3,12 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ep2sindy.ambiguity import ambiguities, usable_terms
-from ep2sindy.library import named_terms, polynomial
-from ep2sindy.regression import BlockSplit, Differential, RandomSplit, Regression
-from ep2sindy.smoothing import NoSmoothing, SavitzkyGolay
-from ep2sindy.systems import lotka_volterra
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.regression.ambiguity import ambiguities, usable_terms
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.splits import BlockSplit, RandomSplit
+from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
+from ep2sindy.synthetic.systems import lotka_volterra
 
 
 def problem_of(theta: np.ndarray, target: np.ndarray, names: list[str]) -> Regression:

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.regression import Differential
-from ep2sindy.resampling import moving_block_counts
-from ep2sindy.systems import lorenz
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.resampling import moving_block_counts
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.synthetic.systems import lorenz
 
 
 def test_a_draw_has_the_size_asked_for() -> None:

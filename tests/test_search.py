@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from sklearn.linear_model import Lasso, lars_path_gram
 
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.kernels import lasso_supports
-from ep2sindy.library import named_terms
-from ep2sindy.regression import Grams, Regression
-from ep2sindy.search import STLSQ, AdaptiveLasso, BestSubset, Search
+from ep2sindy.library.library import named_terms
+from ep2sindy.regression.rows import Grams, Regression
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.kernels import lasso_supports
+from ep2sindy.search.searches import STLSQ, AdaptiveLasso, BestSubset, Search
 
 SEARCHES = [AdaptiveLasso(), STLSQ(), BestSubset(max_terms=8)]
 

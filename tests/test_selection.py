@@ -3,13 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.library import named_terms, polynomial
-from ep2sindy.pareto import Candidate, ParetoFront, pareto_front
-from ep2sindy.regression import Regression
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import BIC, EBIC, AICc, Knee, LogKnee, Selection, log_supports, selected
-from ep2sindy.systems import lorenz
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
+from ep2sindy.selection.knees import Knee, LogKnee
+from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.synthetic.systems import lorenz
 
 RULES = [Knee(), LogKnee(), AICc(), BIC(), EBIC(), EBIC(coarsening=None)]
 CRITERIA = [AICc(), BIC(), EBIC(), EBIC(coarsening=None)]

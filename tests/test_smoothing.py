@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from ep2sindy.smoothing import NoSmoothing, SavitzkyGolay, difference
-from ep2sindy.spectrum import dominant_frequency, frequency_text, power_spectrum
+from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay, difference
+from ep2sindy.signals.spectrum import dominant_frequency, frequency_text, power_spectrum
 
 EQUAL = np.linspace(0.0, 2.0, 41)
 UNEQUAL = EQUAL + 0.02 * np.sin(9.0 * EQUAL)

@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
+from ep2sindy.synthetic.systems import (
+    System,
+    damped_oscillator,
+    lorenz,
+    lotka_volterra,
+    van_der_pol,
+)
 
 
 @pytest.mark.parametrize(

@@ -5,23 +5,18 @@ import json
 import numpy as np
 import pytest
 
-from ep2sindy.thruster import (
+from ep2sindy.thruster import kernels
+from ep2sindy.thruster.closures import SheathWall, TabulatedRates, XenonFits, ionization_rate
+from ep2sindy.thruster.discretization import build_model, closure_table, initial_state
+from ep2sindy.thruster.landmark import landmark_thruster, read_rate_table
+from ep2sindy.thruster.parameters import (
     OPERATING_POINTS,
     AnomalousTransport,
     MagneticField,
     OperatingPoint,
-    SheathWall,
-    TabulatedRates,
     Thruster,
-    XenonFits,
-    ionization_rate,
-    kernels,
-    landmark_thruster,
-    read_rate_table,
-    simulate,
 )
-from ep2sindy.thruster.discretization import build_model, closure_table, initial_state
-from ep2sindy.thruster.simulate import judge_status
+from ep2sindy.thruster.simulate import judge_status, simulate
 
 NOMINAL = OperatingPoint(300.0, 5.0)
 
@@ -91,7 +86,7 @@ def advected_error(n_cells):
 
 def test_transport_converges_at_second_order():
     cells = np.array([100, 200, 400, 800])
-    errors = np.array([advected_error(n) for n in cells])
+    errors = np.array([advected_error(int(n)) for n in cells])
     slopes = -np.polyfit(np.log(cells), np.log(errors), 1)[0]
     # van Leer's limiter is second order but at the one extremum, which costs part of the slope
     assert np.all(slopes > 1.7)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy import files
-from ep2sindy.thruster import OperatingPoint, Thruster, cache, simulate_cached
+from ep2sindy.machine import files
+from ep2sindy.thruster import cache
+from ep2sindy.thruster.cache import simulate_cached
+from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 
 POINT = OperatingPoint(300.0, 5.0)
 BRIEF = {"duration_s": 3e-5, "warm_up_s": 0.0, "n_cells": 40, "progress": False}

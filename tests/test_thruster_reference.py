@@ -8,14 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.operating_points import COEFFICIENTS, CURRENTS, coefficient_ratios
-from ep2sindy.thruster import (
-    LANDMARK_POINT,
-    OPERATING_POINTS,
-    Thruster,
-    landmark_thruster,
-    read_rate_table,
-    simulate,
-)
+from ep2sindy.thruster.landmark import LANDMARK_POINT, landmark_thruster, read_rate_table
+from ep2sindy.thruster.parameters import OPERATING_POINTS, Thruster
+from ep2sindy.thruster.simulate import simulate
 
 pytestmark = pytest.mark.slow
 # The benchmark's own table is not ours to ship: name it with EP2SINDY_DATA=folder.

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
 
 
 def wave(n: int = 50, **changes: object) -> Trajectory:

@@ -4,18 +4,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.discover import discover
-from ep2sindy.ensemble import MAX_ERROR, DrivenWindows, Ensemble
-from ep2sindy.library import Library, named_terms, polynomial
-from ep2sindy.pareto import Candidate, ParetoFront, fit_support, pareto_front
-from ep2sindy.regression import Regression
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import FLOOR, Selection, selected
-from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.validation import CrossValidation, IntegralScore, Stability, blocked_folds
-from ep2sindy.weak import Weak
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import discover
+from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.model.many import MAX_ERROR, DrivenWindows, Ensemble
+from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.front import Candidate, ParetoFront, fit_support, pareto_front
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.integral import IntegralScore
+from ep2sindy.selection.resampled import CrossValidation, Stability, blocked_folds
+from ep2sindy.selection.rule import FLOOR, Selection, selected
+from ep2sindy.synthetic.systems import (
+    System,
+    damped_oscillator,
+    lorenz,
+    lotka_volterra,
+    van_der_pol,
+)
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
 NO_BOOTSTRAPS = Bootstraps(n=0)
@@ -312,7 +319,7 @@ def test_runs_in_blocks_are_runs_all_at_once(monkeypatch: pytest.MonkeyPatch) ->
     system = lotka_volterra()
     fronts = fronts_of([system.trajectory()], system.model.library, choices_with_truth(system))
     at_once = IntegralScore().scores(fronts)
-    monkeypatch.setattr("ep2sindy.ensemble.RUN_BLOCK", 3 * 20)  # three of 16 models
+    monkeypatch.setattr("ep2sindy.model.many.RUN_BLOCK", 3 * 20)  # three of 16 models
     for whole, blocks in zip(at_once, IntegralScore().scores(fronts), strict=True):
         assert blocks == pytest.approx(whole, rel=1e-12)
 

@@ -3,18 +3,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.discover import Discovery, discover
-from ep2sindy.library import Library, polynomial
-from ep2sindy.names import split_factors
-from ep2sindy.regression import BlockSplit, RandomSplit, Regression
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import EBIC
-from ep2sindy.smoothing import NoSmoothing
-from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.weak import Weak
-from ep2sindy.windows import Boxes, Bumps
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.names import split_factors
+from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.splits import BlockSplit, RandomSplit
+from ep2sindy.regression.test_functions import Boxes, Bumps
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.signals.smoothers import NoSmoothing
+from ep2sindy.synthetic.systems import (
+    System,
+    damped_oscillator,
+    lorenz,
+    lotka_volterra,
+    van_der_pol,
+)
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
 EVERY_ROW = Weak(split=RandomSplit(test_fraction=0.0))

@@ -4,10 +4,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ep2sindy.bootstraps import Bootstraps
-from ep2sindy.regression import Differential, RandomSplit
-from ep2sindy.search import BestSubset
-from ep2sindy.selection import Knee
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.identified import frontier_figure
+from ep2sindy.figures.windows import window_error_figure
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.test_functions import Boxes, Bumps
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.knees import Knee
 from ep2sindy.studies.benchmark import SearchVariant
 from ep2sindy.studies.frontier import identification_frontier
 from ep2sindy.studies.weak_forms import Setting, boxes_grid, fit_settings, fitted_terms
@@ -17,11 +23,7 @@ from ep2sindy.studies.weak_windows import (
     true_library,
     window_cells,
 )
-from ep2sindy.systems import System, lotka_volterra
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.weak import Weak
-from ep2sindy.weak_plots import frontier_figure, window_error_figure
-from ep2sindy.windows import Boxes, Bumps
+from ep2sindy.synthetic.systems import System, lotka_volterra
 
 EVERY_ROW = RandomSplit(test_fraction=0.0)
 BOXES = Weak(

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ep2sindy.windows import (
+from ep2sindy.regression.test_functions import (
     EDGE,
     Boxes,
     Bumps,

@@ -1,1 +1,1 @@
-"""Studies: pure functions from data to tables, one module per kind of question."""
+"""Studies: one file per experiment, from its settings to an outcome that can be read."""

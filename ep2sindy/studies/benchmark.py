@@ -14,15 +14,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import pandas as pd
 
-from ep2sindy.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.library import Library
-from ep2sindy.parallel import ONE_BY_ONE, Workers
-from ep2sindy.pareto import pareto_front
-from ep2sindy.regression import Formulation
-from ep2sindy.search import Search
-from ep2sindy.selection import Selection, selected
-from ep2sindy.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
+from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.front import pareto_front
+from ep2sindy.search.searches import Search
+from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.synthetic.draws import check_systems, realization
 
 
 @dataclass(frozen=True)
@@ -74,61 +74,6 @@ class SearchVariant:
         )
 
 
-@dataclass(frozen=True)
-class Draw:
-    """A system with a parameter or a starting point drawn at random."""
-
-    system: System
-    initial: np.ndarray
-
-
-def _oscillator(rng: np.random.Generator) -> Draw:
-    return Draw(damped_oscillator(), rng.uniform(-2.0, 2.0, 2))
-
-
-def _lotka_volterra(rng: np.random.Generator) -> Draw:
-    return Draw(lotka_volterra(), rng.uniform(0.1, 1.5, 2))
-
-
-def _van_der_pol(rng: np.random.Generator) -> Draw:
-    return Draw(van_der_pol(mu=rng.uniform(0.1, 10.0)), np.ones(2))
-
-
-def _lorenz(rng: np.random.Generator) -> Draw:
-    return Draw(lorenz(), rng.uniform([-15.0, -15.0, 10.0], [15.0, 15.0, 40.0]))
-
-
-# The thesis draws the Van der Pol oscillator's mu and starts it at (1, 1); it does not say where
-# it starts the others: these ranges are ours.
-DRAWS: Mapping[str, Callable[[np.random.Generator], Draw]] = {
-    "oscillator": _oscillator,
-    "lotka_volterra": _lotka_volterra,
-    "van_der_pol": _van_der_pol,
-    "lorenz": _lorenz,
-}
-
-
-def realization(
-    name: str, noise: float, number: int, *, n_trajectories: int = 1, seed: int = 0
-) -> tuple[System, list[Trajectory]]:
-    """One draw of a system and noisy trajectories of it; every noise level sees the same draw.
-
-    noise: standard deviation of the white noise, in RMS of each state. n_trajectories: beyond
-    the first they start where other draws would; the Van der Pol oscillator in [-2, 2]^2.
-    """
-    _check_names([name])
-    rng = np.random.default_rng([seed, list(DRAWS).index(name), number])
-    draw = DRAWS[name](rng)
-    starts = [draw.initial]
-    for _ in range(n_trajectories - 1):
-        other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else DRAWS[name](rng).initial
-        starts.append(other)
-    return draw.system, [
-        draw.system.trajectory(initial=start, noise=noise, rng=stream)
-        for start, stream in zip(starts, rng.spawn(n_trajectories), strict=True)
-    ]
-
-
 def run_benchmark(
     variants: Mapping[str, Variant],
     *,
@@ -146,7 +91,7 @@ def run_benchmark(
     right), correct_terms (true terms among those selected), cpu_s. A variant that selects nothing
     has NaN there. Raises ValueError for an unknown system, or nothing to run.
     """
-    _check_names(systems)
+    check_systems(systems)
     if n_realizations < 1 or not (variants and systems and len(noises)):
         raise ValueError(
             "a benchmark needs a realization, a system, a noise level and a variant at least: "
@@ -217,36 +162,3 @@ def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
         n=("number", "count"),
         cpu_s_per_search=("cpu_s", "median"),
     ).reset_index()
-
-
-COUNTS = ("on_front", "selected")
-MERITS = (*COUNTS, "mean_correct_terms")
-
-
-def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.DataFrame:
-    """One figure of merit of every variant, with its published row below it where there is one.
-
-    published: as `cells`, without the time. Index (variant, is it published), columns (system,
-    noise), in the order of `cells`; counts become percentages of n.
-    """
-    place, shown = ["system", "noise"], ["variant", "system", "noise", merit, "n"]
-    known = published.merge(cells[[*place, "variant"]])
-    both = pd.concat(
-        [cells[shown].assign(published=False), known[shown].assign(published=True)]
-        if len(known)
-        else [cells[shown].assign(published=False)]
-    )
-    if merit in COUNTS:
-        both[merit] *= 100.0 / both["n"]
-    table = both.set_index(["variant", "published", *place])[merit].unstack(place)
-    rows = [(name, old) for name in cells["variant"].unique() for old in (False, True)]
-    return table.reindex(
-        index=pd.MultiIndex.from_tuples([row for row in rows if row in table.index]),
-        columns=pd.MultiIndex.from_frame(cells[place].drop_duplicates()),
-    )
-
-
-def _check_names(systems: Sequence[str]) -> None:
-    unknown = [name for name in systems if name not in DRAWS]
-    if unknown:
-        raise ValueError(f"unknown systems {unknown}; there are {list(DRAWS)}")

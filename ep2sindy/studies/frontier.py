@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from ep2sindy.parallel import ONE_BY_ONE, Workers
+from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
 from ep2sindy.studies.benchmark import Variant, judged
-from ep2sindy.systems import System
+from ep2sindy.synthetic.systems import System
 
 
 def identification_frontier(

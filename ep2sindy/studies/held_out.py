@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from ep2sindy.constrained import constrained_fit
-from ep2sindy.constraints import Constraint
-from ep2sindy.integral.batch import dominant_window
-from ep2sindy.integral.problem import Iteration
-from ep2sindy.library import Library
-from ep2sindy.model import SparseModel
-from ep2sindy.refine import Refinement, loss_against_window, refine
-from ep2sindy.regression import Formulation
-from ep2sindy.spectrum import dominant_frequency
-from ep2sindy.studies.libraries import Integrated, integrate
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.constraints.fit import constrained_fit
+from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
+from ep2sindy.model.integrated import Integrated, integrate
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.problem import Iteration
+from ep2sindy.refinement.refine import Refinement, loss_against_window, refine
+from ep2sindy.refinement.windows import dominant_window
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.signals.spectrum import dominant_frequency
 
 DIVERGED = 10.0  # residual, in std, of samples that a run does not reach
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ep2sindy.errors_in_variables import reweighted
-from ep2sindy.library import Library
-from ep2sindy.model import assemble_model
-from ep2sindy.pareto import Candidate, fit_support, r2
-from ep2sindy.regression import Formulation, Regression
-from ep2sindy.studies.libraries import Integrated, integrate, samples_in
-from ep2sindy.trajectory import Trajectory
-from ep2sindy.weak import Weak
-from ep2sindy.windows import Boxes, Bumps
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.last_fit import assemble_model, reweighted
+from ep2sindy.library.library import Library
+from ep2sindy.model.integrated import Integrated, integrate, samples_in
+from ep2sindy.model.scores import r2
+from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.regression.test_functions import Boxes, Bumps
+from ep2sindy.regression.weak import Weak
+from ep2sindy.search.front import Candidate, fit_support
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from ep2sindy.library import Library, named_terms
-from ep2sindy.parallel import ONE_BY_ONE, Workers
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library, named_terms
+from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
 from ep2sindy.studies.weak_forms import Setting, check_windows, fitted_terms
-from ep2sindy.systems import System
-from ep2sindy.trajectory import Trajectory
+from ep2sindy.synthetic.systems import System
 
 
 def true_library(system: System) -> Library:

@@ -7,7 +7,7 @@ from pathlib import Path
 import xarray as xr
 from tqdm import tqdm
 
-from ep2sindy.files import fingerprint, replacing
+from ep2sindy.machine.files import fingerprint, replacing
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.simulate import simulate, to_json
 

@@ -19,7 +19,7 @@ E_IONIZATION_EV = 12.13  # eV, first ionisation of xenon (Goebel & Katz, appendi
 E_EXCITATION_EV = 8.32  # eV, lowest excited level (Goebel & Katz, appendix E)
 SHEATH_DENSITY_RATIO = 0.4965  # edge over mean density, 0.86 / sqrt(3) (Marks et al. 2023)
 
-FloatArray = Float[np.ndarray, "..."]
+FloatArray = Float[np.ndarray, "..."] | np.float64  # NumPy makes scalars of arrays without axes
 
 
 def thermal_speed(T_e_eV: FloatArray) -> FloatArray:

@@ -8,12 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.closures import (
-    ExponentialWall,
-    SheathWall,
-    TabulatedRates,
-    XenonFits,
-)
+from ep2sindy.thruster.closures import ExponentialWall, SheathWall, TabulatedRates, XenonFits
 
 
 def check_positive(owner: object, *names: str) -> None:

@@ -11,7 +11,7 @@ import xarray as xr
 from jaxtyping import Float
 from tqdm import tqdm
 
-from ep2sindy.spectrum import dominant_frequency
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.thruster import kernels
 from ep2sindy.thruster.closures import M_XENON
 from ep2sindy.thruster.discretization import build_model, cell_centres, initial_state

@@ -1,0 +1,1 @@
+"""Constraints: relations between coefficients, and fits that keep them."""

@@ -1,0 +1,224 @@
+"""Linear relations between coefficients, solved once and for all: coef = C free + d."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ep2sindy.data.trajectory import read_only
+from ep2sindy.library.library import Library
+
+ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
+
+
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w)"
+
+
+_VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*)"
+
+
+_FACTOR = rf"{_VARIABLE}(?:\^\d+)?"
+
+
+_TERM = rf"(?:1(?![\w.])|{_FACTOR}(?:\s*\*\s*{_FACTOR})*)"
+
+
+_ADDEND = re.compile(
+    rf"\s*(?P<sign>[+-]?)\s*(?:(?:(?P<factor>[+-]?{_NUMBER})\s*\*\s*)?"
+    rf"(?P<state>{_VARIABLE})\s*:\s*(?P<term>{_TERM})|(?P<number>[+-]?{_NUMBER}))\s*"
+)
+
+
+_EXAMPLE = "write it like 'n_i: n_i*n_n == -1 * n_n: n_i*n_n'"
+
+
+@dataclass(frozen=True)
+class Relation:
+    """One linear relation: the sum of factor * coef(state, term) over `factors` is `value`.
+
+    factors: (factor, state, term) as named in `text`. SI, as the coefficients.
+    """
+
+    factors: tuple[tuple[float, str, str], ...]
+    value: float
+    text: str
+
+    def __post_init__(self) -> None:
+        if not self.factors:
+            raise ValueError(f"a relation must name a coefficient: {self.text!r} came; {_EXAMPLE}")
+        if not np.isfinite([self.value, *(factor for factor, _, _ in self.factors)]).all():
+            raise ValueError(f"the numbers of a relation must be finite: {self.text!r} came")
+
+
+def parse_relation(text: str) -> Relation:
+    """Read `2 * x: x*y + y: x*y == 0`, or `n_n: 1 == 1.83e23` for a known value.
+
+    Each side adds and subtracts numbers and coefficients, `[number *] state: term`.
+    Raises ValueError with the text and the position of what cannot be read.
+    """
+    if text.count("==") != 1:
+        raise ValueError(f"a relation has two sides joined by one '==': {text!r} came; {_EXAMPLE}")
+    middle = text.index("==")
+    factors: list[tuple[float, str, str]] = []
+    value = 0.0
+    for start, stop, side in ((0, middle, 1.0), (middle + 2, len(text), -1.0)):
+        for addend in _addends(text, start, stop):
+            sign = -side if addend["sign"] == "-" else side
+            if addend["number"]:
+                value -= sign * float(addend["number"])
+            else:
+                factor = sign * float(addend["factor"] or 1.0)
+                factors.append((factor, addend["state"], addend["term"]))
+    return Relation(tuple(factors), value, text.strip())
+
+
+def _addends(text: str, start: int, stop: int) -> Iterator[re.Match[str]]:
+    """What one side of a relation adds up."""
+    position = start
+    while position == start or position < stop:
+        if position > start and text[position] not in "+-":
+            raise _unreadable(text, position, "+, -, == or the end")
+        addend = _ADDEND.match(text, position, stop)
+        if addend is None:
+            raise _unreadable(text, position, "'[number *] state: term' or a number")
+        yield addend
+        position = addend.end()
+
+
+def _unreadable(text: str, position: int, expected: str) -> ValueError:
+    rest = text[position:].lstrip()
+    return ValueError(
+        f"{expected} must stand at character {len(text) - len(rest) + 1} of the relation "
+        f"{text!r}: {rest[:12] or 'the end'!r} came; {_EXAMPLE}"
+    )
+
+
+def relations_from_matrix(
+    C: Float[np.ndarray, "states features"], *, states: Sequence[str], terms: Sequence[str]
+) -> tuple[dict[str, tuple[str, ...]], tuple[Relation, ...]]:
+    """Read the thesis's matrix: coef(state i, feature k) = C[i, k] b_k, absent where C is zero.
+
+    Returns the support and the relations for `constraint`. Columns may repeat a term, so that
+    states can have coefficients b_k of their own.
+    Raises ValueError for another shape, or a term that comes twice in one equation.
+    Source: thesis II-E, Eqs. 13-16.
+    """
+    if C.shape != (len(states), len(terms)):
+        raise ValueError(
+            "C must have one row per state and one column per feature: shape "
+            f"{C.shape} came for {list(states)} and {list(terms)}"
+        )
+    support = {
+        state: tuple(term for term, c in zip(terms, row, strict=True) if c != 0.0)
+        for state, row in zip(states, C, strict=True)
+    }
+    for state, present in support.items():
+        if len(set(present)) < len(present):
+            raise ValueError(f"C may give {state!r} each term once: it has {list(present)}")
+    texts = []
+    for term, column in zip(terms, C.T, strict=True):
+        shares = [(s, float(c)) for s, c in zip(states, column, strict=True) if c != 0.0]
+        for state, c in shares[1:]:
+            first, c_first = shares[0]
+            texts.append(f"{c!r} * {first}: {term} == {c_first!r} * {state}: {term}")
+    return support, tuple(map(parse_relation, texts))
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """All coefficients that obey the relations: coef = C z + d for any z, in SI.
+
+    coefficients: (state, term) of each, equation by equation, in the order of the library.
+    free: (free,), indices of those that z holds: C[free] is the identity, d[free] is zero.
+    states: one per equation, also where it has no term.
+    """
+
+    states: tuple[str, ...]
+    coefficients: tuple[tuple[str, str], ...]
+    C: Float[np.ndarray, "coefs free"]
+    d: Float[np.ndarray, " coefs"]
+    free: Int[np.ndarray, " free"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "C", read_only(self.C))
+        object.__setattr__(self, "d", read_only(self.d))
+        assert len(self.coefficients) == len(self.d)
+        assert np.array_equal(self.C[self.free], np.eye(len(self.free)))
+        assert not self.d[self.free].any()
+
+    def coef(self, z: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefs"]:
+        """Values of all coefficients, from those of the free ones."""
+        return self.C @ z + self.d
+
+
+def constraint(
+    library: Library,
+    support: Mapping[str, Sequence[str]],
+    relations: Sequence[Relation | str] = (),
+) -> Constraint:
+    """Eliminate one coefficient of the support per relation.
+
+    The one of the largest factor goes; of equals the one that the relations name last.
+    Raises ValueError, with the relation, for one that contradicts or repeats the earlier ones
+    or names an unknown state or term, or one outside the support.
+    """
+    coefficients = tuple(
+        (state, library.names[j])
+        for state, terms in support.items()
+        for j in sorted({library.index(term) for term in terms})
+    )
+    C, d = np.eye(len(coefficients)), np.zeros(len(coefficients))
+    free = np.ones(len(coefficients), dtype=np.bool_)
+    named: dict[int, None] = {}
+    earlier: list[str] = []
+    for relation in (parse_relation(r) if isinstance(r, str) else r for r in relations):
+        row, size = np.zeros((2, len(coefficients)))
+        for factor, state, term in relation.factors:
+            k = place_of(library, coefficients, state, term, f"relation {relation.text!r}")
+            named[k] = None
+            row[k] += factor
+            size[k] += abs(factor)
+        factors = _rounded(row @ C, size @ np.abs(C))
+        value = _rounded(relation.value - row @ d, abs(relation.value) + size @ np.abs(d))
+        if not factors.any():
+            why = "contradicts" if value else "is redundant: it is implied by"
+            others = f"the earlier ones, {earlier}" if earlier else "arithmetic alone"
+            raise ValueError(f"relation {relation.text!r} {why} {others}; drop one of them")
+        largest = (1.0 - ROUNDING) * np.abs(factors).max()
+        last = [k for k in named if abs(factors[k]) >= largest][-1]
+        change = np.outer(C[:, last], -factors / factors[last])
+        shift = C[:, last] * (value / factors[last])
+        C = _rounded(C + change, np.abs(C) + np.abs(change))
+        d = _rounded(d + shift, np.abs(d) + np.abs(shift))
+        C[:, last], free[last] = 0.0, False
+        earlier.append(relation.text)
+    return Constraint(tuple(support), coefficients, C[:, free], d, np.flatnonzero(free))
+
+
+def place_of(
+    library: Library, coefficients: Sequence[tuple[str, str]], state: str, term: str, who: str
+) -> int:
+    """Index of a coefficient that `who` names."""
+    try:
+        name = library.names[library.index(term)]
+    except ValueError as error:
+        raise ValueError(f"{who}: {error}") from error
+    if (state, name) in coefficients:
+        return coefficients.index((state, name))
+    support = [t for s, t in coefficients if s == state]
+    if not support:
+        states = list(dict.fromkeys(s for s, _ in coefficients))
+        raise ValueError(f"{who}: unknown state {state!r}; the support has terms for {states}")
+    raise ValueError(
+        f"{who}: {name!r} is not in the support of {state!r}, {support}; add it there, or leave "
+        "it out here"
+    )
+
+
+def _rounded(sums: np.ndarray | float, sizes: np.ndarray | float) -> np.ndarray:
+    """Sums of numbers with these sizes in all; zero where they cancel but for rounding."""
+    return np.where(np.abs(sums) <= ROUNDING * sizes, 0.0, sums)

@@ -1,0 +1,136 @@
+"""Fields on a (time, z, r) grid as xarray datasets; zone averages and grid points of them.
+
+A field has the dimension `time` and may have `z` and `r`, each with a coordinate in s or m.
+Its variables may use fewer dimensions than the field: T_e_eV(time, z), I_d(time), B(z).
+Values are SI unless the name carries a suffix (`T_e_eV`); the attribute `units` names the unit.
+A cell outside the plasma is NaN at all times; a value that is missing only now and then is
+refused, since an average over a changing set of cells is no observable.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.trajectory import check_time
+
+DIMS = ("time", "z", "r")
+
+
+SPACE = ("z", "r")
+
+
+COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
+
+
+def check_field(field: xr.Dataset) -> None:
+    """Raise ValueError unless `field` is one: dimensions, coordinates, names, types, units.
+
+    Values are not looked at, so a lazy field stays on disk.
+    """
+    unknown = set(map(str, field.dims)) - set(DIMS)
+    if unknown or "time" not in field.dims:
+        raise ValueError(
+            f"a field has the dimension time and may have z and r: {list(field.dims)} came; "
+            "rename or reduce the others"
+        )
+    for axis in field.dims:
+        if axis not in field.coords:
+            raise ValueError(f"the dimension {axis!r} needs a coordinate of that name")
+    check_time(np.asarray(field["time"].values, dtype=np.float64))
+    for axis in SPACE:
+        if axis in field.dims:
+            _check_axis(axis, grid_points(field, axis))
+    for name, variable in field.data_vars.items():
+        if not str(name).isidentifier():
+            raise ValueError(f"a variable's name must be letters, digits and _: {name!r} came")
+        if variable.dtype.kind != "f":
+            raise ValueError(f"{name} must hold real numbers: its type is {variable.dtype}")
+        if "units" not in variable.attrs:
+            raise ValueError(f"{name} must name its unit in the attribute 'units' ('1' for none)")
+
+
+def _check_axis(axis: str, points: Float[np.ndarray, " points"]) -> None:
+    stalls = np.flatnonzero(~(np.diff(points) > 0))
+    if not np.isfinite(points).all() or stalls.size:
+        k = int(stalls[0]) if stalls.size else 0
+        raise ValueError(
+            f"{axis} must be finite and increase: {axis}[{k}:{k + 2}] = {points[k : k + 2]} m; "
+            "sort the grid first"
+        )
+
+
+def grid_points(field: xr.Dataset, axis: str) -> Float[np.ndarray, " points"]:
+    """Coordinate of one axis as float64, in s or m."""
+    return np.asarray(field[axis].values, dtype=np.float64)
+
+
+def grid_values(array: xr.DataArray) -> Float[np.ndarray, "time z r"]:
+    """Load a variable as (time, z, r) in float64; a dimension it lacks has length 1."""
+    missing = [axis for axis in DIMS if axis not in array.dims]
+    return array.expand_dims(missing).transpose(*DIMS).values.astype(np.float64)
+
+
+def masked_cells(array: xr.DataArray) -> Bool[np.ndarray, "1 z r"]:
+    """Cells that hold no plasma: NaN in the first sample (`check_samples` sees to the others)."""
+    return np.isnan(grid_values(array.isel(time=[0], missing_dims="ignore")))
+
+
+def check_samples(
+    array: xr.DataArray,
+    values: Float[np.ndarray, "time z r"],
+    masked: Bool[np.ndarray, "1 z r"],
+) -> None:
+    """Raise ValueError unless each cell is finite at all times, or masked at all times.
+
+    values: `array` as `grid_values` returns it. Names the variable, the time and the place.
+    """
+    bad = np.argwhere(np.isfinite(values) == masked)
+    if bad.size:
+        value = values[tuple(bad[0])]
+        place = ", ".join(
+            f"{axis} = {array[axis].values[k]:.6g} {COORDINATE_UNITS[axis]}"
+            for axis, k in zip(DIMS, bad[0], strict=True)
+            if axis in array.dims
+        )
+        raise ValueError(
+            f"samples must be finite, or NaN at all times where there is no plasma: "
+            f"{array.name} = {value:.6g}{' after NaN' if np.isfinite(value) else ''} at {place} "
+            f"({len(bad)} such values); "
+            "crop, mask or interpolate them first"
+        )
+
+
+def mask_outside(field: xr.Dataset, inside: xr.DataArray) -> xr.Dataset:
+    """Set NaN where `inside` is false, in every variable that has all of its dimensions."""
+    masked = {
+        name: variable.where(inside)
+        for name, variable in field.data_vars.items()
+        if set(inside.dims) <= set(variable.dims)
+    }
+    if not masked:
+        raise ValueError(f"no variable of the field has all dimensions of the mask, {inside.dims}")
+    return field.assign(masked)
+
+
+def cell_edges(points: Float[np.ndarray, " points"]) -> Float[np.ndarray, " edges"]:
+    """Edges of the cells around grid points: midpoints, and the end cells symmetric."""
+    middle = (points[1:] + points[:-1]) / 2
+    return np.concatenate([[2 * points[0] - middle[0]], middle, [2 * points[-1] - middle[-1]]])
+
+
+def cell_sizes(field: xr.Dataset, axis: str, *, axisymmetric: bool) -> Float[np.ndarray, " points"]:
+    """Size of each cell along z or r; in r, if axisymmetric, its annulus area over 2 pi."""
+    points = grid_points(field, axis)
+    if axis == "r" and axisymmetric and points[0] < 0:
+        raise ValueError(
+            f"r must not be negative in an axisymmetric field: it begins at {points[0]:.6g} m; "
+            "pass axisymmetric=False for a planar one"
+        )
+    if len(points) == 1:
+        return np.ones(1)
+    edges = cell_edges(points)
+    if axis == "r" and axisymmetric:
+        return np.diff(np.maximum(edges, 0.0) ** 2) / 2
+    return np.diff(edges)

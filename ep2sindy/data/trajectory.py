@@ -1,0 +1,200 @@
+"""A trajectory: sampled states and inputs of one system over one stretch of time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+
+
+def read_only(values: np.ndarray) -> np.ndarray:
+    """Copy to float64 and lock, so that a value cannot change behind its owner."""
+    copy = np.array(values, dtype=np.float64, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+class ConstantStateError(ValueError):
+    """A state that never changes shows no dynamics."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Time series of the modelled states and of the inputs that drive them.
+
+    t: (samples,) in s, increasing; steps may be unequal.
+    states: (samples, n_states). inputs: (samples, n_inputs), by default none.
+    units: name -> unit for any of the variables; a missing one reads "1".
+    Raises ValueError for time that does not increase, unequal lengths, values that are
+    not finite, repeated names, fewer than two samples, or a state that never changes.
+    """
+
+    # Lengths read `_`, since __post_init__ compares them and says what to do.
+    t: Float[np.ndarray, " _"]
+    states: Float[np.ndarray, "_ n_states"]
+    state_names: Sequence[str]
+    inputs: Float[np.ndarray, "_ n_inputs"] = field(default_factory=lambda: np.empty((0, 0)))
+    input_names: Sequence[str] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        inputs = self.inputs if self.input_names or self.inputs.size else np.empty((len(self.t), 0))
+        for name, value in {
+            "t": read_only(self.t),
+            "states": read_only(self.states),
+            "inputs": read_only(inputs),
+            "state_names": tuple(self.state_names),
+            "input_names": tuple(self.input_names),
+            "units": MappingProxyType({n: self.units.get(n, "1") for n in self.names}),
+        }.items():
+            object.__setattr__(self, name, value)
+        self._check_shapes()
+        check_time(self.t)
+        check_finite(self.t, self.values, self.names)
+        self._check_variation()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """States first, then inputs: the order of the library's variables."""
+        return (*self.state_names, *self.input_names)
+
+    @property
+    def values(self) -> Float[np.ndarray, "samples variables"]:
+        """States and inputs side by side, in the order of `names`."""
+        return self.columns(self.names)
+
+    @property
+    def n_samples(self) -> int:
+        return len(self.t)
+
+    @property
+    def dt_s(self) -> float:
+        """Mean time step in s."""
+        return float((self.t[-1] - self.t[0]) / (len(self.t) - 1))
+
+    def columns(self, names: Sequence[str]) -> Float[np.ndarray, "samples columns"]:
+        """Samples of some states or inputs, in the order asked for.
+
+        Raises ValueError for an unknown name, with those that exist.
+        """
+        for name in names:
+            if name not in self.names:
+                raise ValueError(
+                    f"unknown variable {name!r}; this trajectory has {list(self.names)}"
+                )
+        n_states = len(self.state_names)
+        columns = np.empty((self.n_samples, len(names)))
+        for j, k in enumerate(map(self.names.index, names)):
+            columns[:, j] = self.states[:, k] if k < n_states else self.inputs[:, k - n_states]
+        return columns
+
+    def window(self, start: int, stop: int) -> Trajectory:
+        """Samples start to stop (exclusive) as a trajectory of their own."""
+        if not 0 <= start < stop <= self.n_samples:
+            raise ValueError(
+                f"a window must lie inside the trajectory: [{start}, {stop}) was asked of "
+                f"{self.n_samples} samples"
+            )
+        return Trajectory(
+            t=self.t[start:stop],
+            states=self.states[start:stop],
+            state_names=self.state_names,
+            inputs=self.inputs[start:stop],
+            input_names=self.input_names,
+            units=self.units,
+            label=self.label,
+        )
+
+    def _check_shapes(self) -> None:
+        for role, values, names in (
+            ("states", self.states, self.state_names),
+            ("inputs", self.inputs, self.input_names),
+        ):
+            if values.ndim != 2 or len(values) != len(self.t):
+                raise ValueError(
+                    f"{role} must have shape (samples, variables) with as many samples as t: "
+                    f"{values.shape} came with {len(self.t)} times"
+                )
+            if values.shape[1] != len(names):
+                raise ValueError(
+                    f"{role} must have one name per column: {values.shape[1]} columns came with "
+                    f"the names {list(names)}"
+                )
+        repeated = [name for name, n in Counter(self.names).items() if n > 1]
+        if repeated:
+            raise ValueError(f"variable names must be unique: {repeated} came more than once")
+        if not self.state_names:
+            raise ValueError("a trajectory needs at least one state; name one in state_names")
+
+    def _check_variation(self) -> None:
+        columns = np.ascontiguousarray(self.states.T)  # along rows of few columns this is slow
+        for name, width, level in zip(
+            self.state_names, np.ptp(columns, axis=1), np.abs(columns).max(axis=1), strict=True
+        ):
+            # Below rounding the derivative is noise of the number format, not of the system.
+            if width <= 1e-12 * level:
+                raise ConstantStateError(
+                    f"a state must vary: {name!r} stays at {level:.6g} over all "
+                    f"{self.n_samples} samples; leave it out, or pass it as an input"
+                )
+
+
+def check_time(t: Float[np.ndarray, " samples"]) -> None:
+    """Raise ValueError unless t has two samples or more, is finite and increases."""
+    if t.ndim != 1 or len(t) < 2:
+        raise ValueError(f"a trajectory needs at least two samples: t has shape {t.shape}")
+    bad = np.flatnonzero(~np.isfinite(t))
+    if bad.size:
+        raise ValueError(
+            f"t must be finite: t[{bad[0]}] = {t[bad[0]]} ({bad.size} such samples); "
+            "cut or fill them first"
+        )
+    stalls = np.flatnonzero(np.diff(t) <= 0)
+    if stalls.size:
+        k = int(stalls[0])
+        raise ValueError(
+            f"t must increase: t[{k + 1}] = {t[k + 1]:.9g} s follows {t[k]:.9g} s; "
+            "drop repeated samples or sort by time first"
+        )
+
+
+def check_finite(
+    t: Float[np.ndarray, " samples"],
+    values: Float[np.ndarray, "samples variables"],
+    names: Sequence[str],
+) -> None:
+    """Raise ValueError naming the first sample that is NaN or infinite."""
+    rows, columns = np.nonzero(~np.isfinite(values))
+    if rows.size:
+        k, j = rows[0], columns[0]
+        raise ValueError(
+            f"samples must be finite: {names[j]}[{k}] = {values[k, j]} at t = {t[k]:.6g} s "
+            f"({rows.size} such values); crop, mask or interpolate them first"
+        )
+
+
+def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
+    """One regression has one meaning per column: the same states, and units, everywhere."""
+    if not trajectories:
+        raise ValueError("a regression needs at least one trajectory: none came")
+    first = trajectories[0]
+    names = [*first.state_names, *(v for v in variables if v not in first.state_names)]
+    for k, run in enumerate(trajectories):
+        missing = [name for name in names if name not in run.names]
+        if missing or run.state_names != first.state_names:
+            raise ValueError(
+                f"every trajectory needs the states {list(first.state_names)} and the variables "
+                f"{list(variables)}: trajectory {k} has states {list(run.state_names)} and inputs "
+                f"{list(run.input_names)}"
+            )
+        for name in names:
+            if run.units[name] != first.units[name]:
+                raise ValueError(
+                    f"units must agree: {name!r} is in {first.units[name]} in trajectory 0 and "
+                    f"in {run.units[name]} in trajectory {k}; convert one of them first"
+                )

@@ -1,0 +1,209 @@
+"""From fields to trajectories: averages over a zone, and single grid points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.fields import (
+    SPACE,
+    cell_edges,
+    cell_sizes,
+    check_field,
+    check_samples,
+    grid_points,
+    grid_values,
+    masked_cells,
+)
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.names import split_factors
+from ep2sindy.library.units import unit_product
+
+SLAB_VALUES = 2**22  # 32 MB of float64: what one variable may take while a zone is averaged
+
+
+@dataclass(frozen=True)
+class Zone:
+    """Part of the grid: (from, to) in z and r, in m, ends included; None is the whole axis."""
+
+    z: Sequence[float] | None = None
+    r: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        for axis in SPACE:
+            bounds = getattr(self, axis)
+            if bounds is None:
+                continue
+            if len(bounds) != 2 or not bounds[0] < bounds[1]:
+                raise ValueError(
+                    f"a zone's {axis} must be two increasing numbers in m: {list(bounds)} came"
+                )
+            object.__setattr__(self, axis, (float(bounds[0]), float(bounds[1])))
+
+
+def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
+    """Grid points inside the zone, per axis of the field.
+
+    Raises ValueError if the zone bounds an axis the field lacks, holds no grid point, or
+    reaches beyond the grid by more than one cell (a sign of cm taken for m).
+    """
+    slices = {}
+    for axis in SPACE:
+        bounds = getattr(zone, axis)
+        if bounds is None:
+            continue
+        if axis not in field.dims:
+            raise ValueError(
+                f"a zone may bound only the axes of its field: {axis} came, the field has "
+                f"{list(field.dims)}; leave {axis} out of the zone"
+            )
+        points = grid_points(field, axis)
+        rounding = 1e-6 * np.ptp(points)  # a grid stored as float32 must not lose its end points
+        start = int(np.searchsorted(points, bounds[0] - rounding, side="left"))
+        stop = int(np.searchsorted(points, bounds[1] + rounding, side="right"))
+        steps = np.diff(points) if len(points) > 1 else np.array([np.inf])
+        beyond = max(points[0] - bounds[0] - steps[0], bounds[1] - points[-1] - steps[-1])
+        if start >= stop or beyond > rounding:
+            raise ValueError(
+                f"a zone must hold grid points and stay on the grid: {axis} from {bounds[0]:g} to "
+                f"{bounds[1]:g} m came, the grid has {len(points)} points from {points[0]:g} to "
+                f"{points[-1]:g} m"
+            )
+        slices[axis] = slice(start, stop)
+    return slices
+
+
+def zone_average(
+    field: xr.Dataset,
+    zone: Zone | None,
+    *,
+    states: Sequence[str],
+    inputs: Sequence[str] = (),
+    products: Sequence[str] = (),
+    axisymmetric: bool = True,
+    label: str = "",
+) -> Trajectory:
+    """Average variables over the grid points inside a zone (None: the whole field), at each time.
+
+    Weights are the sizes of the cells: length in z and, where the field has r, annulus area
+    (length if not axisymmetric). One set of cells serves all variables of the call: those
+    where none of them is masked. `products` such as "n_i*n_n*R_ion" add inputs named
+    `<n_i*n_n*R_ion>` with the average of the product, which is not the product of averages.
+    Sums run in float64 and slab by slab in time, whatever the storage.
+    Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
+    value that is not finite in a cell that is not masked.
+    """
+    check_field(field)
+    columns = {name: [(name, 1)] for name in (*states, *inputs)}
+    columns |= {f"<{p.replace(' ', '')}>": split_factors(p) for p in products}
+    used = list(dict.fromkeys(name for factors in columns.values() for name, _ in factors))
+    _check_names(field, used, [*states, *inputs, *products])
+    slices = zone_slices(field, zone or Zone())
+    part = field[used].assign_coords({axis: field[axis] for axis in field.dims}).isel(slices)
+    masks = {name: masked_cells(part[name]) for name in used}
+    weights = _zone_weights(field, slices, masks, axisymmetric=axisymmetric)
+    n_slab = max(1, SLAB_VALUES // weights.size)
+    slabs = (part.isel(time=slice(k, k + n_slab)) for k in range(0, part.sizes["time"], n_slab))
+    means = np.concatenate([_slab_means(s, masks, weights, list(columns.values())) for s in slabs])
+    return Trajectory(
+        t=grid_points(field, "time"),
+        states=means[:, : len(states)],
+        state_names=states,
+        inputs=means[:, len(states) :],
+        input_names=list(columns)[len(states) :],
+        units={
+            column: unit_product((field[name].attrs["units"], power) for name, power in factors)
+            for column, factors in columns.items()
+        },
+        label=label,
+    )
+
+
+def point(
+    field: xr.Dataset,
+    *,
+    z: float | None = None,
+    r: float | None = None,
+    states: Sequence[str],
+    inputs: Sequence[str] = (),
+    label: str = "",
+) -> Trajectory:
+    """Samples at the grid point nearest to (z, r), in m; each axis of the field must be given.
+
+    Raises ValueError for a place outside the grid's cells or without plasma.
+    """
+    check_field(field)
+    places = {axis: value for axis, value in (("z", z), ("r", r)) if value is not None}
+    axes = [axis for axis in SPACE if axis in field.dims]
+    if sorted(places) != sorted(axes):
+        raise ValueError(f"a point needs one place per axis {axes} of its field: {places} came")
+    nearest = {}
+    for axis, place in places.items():
+        points = grid_points(field, axis)
+        ends = cell_edges(points)[[0, -1]] if len(points) > 1 else points[[0, 0]]
+        if not ends[0] <= place <= ends[1]:
+            raise ValueError(
+                f"a point must lie on the grid: {axis} = {place:g} m came, the grid's cells reach "
+                f"from {ends[0]:g} to {ends[1]:g} m"
+            )
+        nearest[axis] = [int(np.argmin(np.abs(points - place)))]
+    return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
+
+
+def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str]) -> None:
+    unknown = [name for name in used if name not in field.data_vars]
+    if unknown:
+        raise ValueError(f"unknown variables {unknown}; this field has {list(field.data_vars)}")
+    if len(set(columns)) < len(columns):
+        raise ValueError(f"states, inputs and products must differ: {list(columns)} came")
+
+
+def _zone_weights(
+    field: xr.Dataset,
+    slices: Mapping[str, slice],
+    masks: Mapping[str, Bool[np.ndarray, ...]],
+    *,
+    axisymmetric: bool,
+) -> Float[np.ndarray, "z r"]:
+    """Cell sizes inside the zone with sum one; zero where any variable is masked."""
+    sizes = [
+        cell_sizes(field, axis, axisymmetric=axisymmetric)[slices.get(axis, slice(None))]
+        if axis in field.dims
+        else np.ones(1)
+        for axis in SPACE
+    ]
+    weights = np.multiply.outer(*sizes)
+    for mask in masks.values():
+        weights = np.where(mask[0], 0.0, weights)
+    if not weights.any():
+        raise ValueError(
+            f"a zone must hold plasma: {list(masks)} share no unmasked cell "
+            f"among its {weights.size} grid points; move the zone, mend the mask, or crop a first "
+            "sample that is empty"
+        )
+    return weights / weights.sum()
+
+
+def _slab_means(
+    slab: xr.Dataset,
+    masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
+    weights: Float[np.ndarray, "z r"],
+    columns: Sequence[Sequence[tuple[str, int]]],
+) -> Float[np.ndarray, "samples columns"]:
+    """Weighted means of products of variables over the cells, for some samples of the zone."""
+    values = {}
+    for name, masked in masks.items():
+        raw = grid_values(slab[name])
+        check_samples(slab[name], raw, masked)
+        values[name] = np.where(masked, 0.0, raw)
+    means = np.empty((slab.sizes["time"], len(columns)))
+    for j, factors in enumerate(columns):
+        product = math.prod(values[name] ** power for name, power in factors)
+        cells = np.broadcast_to(product, (len(means), *weights.shape))
+        means[:, j] = np.einsum("tzr,zr->t", cells, weights)
+    return means

@@ -1,0 +1,291 @@
+"""A search at every grid point of a field: which terms act where, with which coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.blocks import Block, Kept, blocks_of
+from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.library.library import Library
+from ep2sindy.library.units import unit_product
+from ep2sindy.machine.parallel import Workers
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.search.bootstraps import Bootstraps, pooled, resamples
+from ep2sindy.search.front import pareto_front
+from ep2sindy.search.searches import Search
+from ep2sindy.selection.rule import Selection, selected
+
+NO_FIT = "no_fit"
+
+
+STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
+
+
+@dataclass(frozen=True, eq=False)
+class PointSearch:
+    """What is done at every point: `discover`, and the spread of its result over the bootstraps.
+
+    least_variation: standard deviation of every state, as a share of its root mean square,
+    below which a point shows no dynamics. seed: every point meets the same split and the same
+    draws, so that results differ by place alone.
+    """
+
+    states: Sequence[str]
+    library: Library
+    formulation: Formulation
+    search: Search
+    bootstraps: Bootstraps
+    selection: Selection
+    depth: int = 1
+    least_variation: float = 1e-3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "states", tuple(self.states))
+        if not 0.0 <= self.least_variation < 1.0:
+            raise ValueError(
+                f"least_variation must lie in [0, 1): {self.least_variation} came; it is a share"
+            )
+        if self.bootstraps.n < 1:
+            raise ValueError(
+                f"a pointwise study needs bootstraps for its spread: n={self.bootstraps.n} came"
+            )
+
+    @cached_property
+    def variables(self) -> tuple[str, ...]:
+        """States, then what else the library needs."""
+        others = (v for v in self.library.variables if v not in self.states)
+        return (*self.states, *others)
+
+
+def pointwise(
+    field: xr.Dataset,
+    search: PointSearch,
+    *,
+    workers: Workers,
+    kept: Kept | None = None,
+    block_points: int = 128,
+    progress: Callable[[int], None] = lambda n_points: None,
+) -> xr.Dataset:
+    """Search at every point of a (time, z, r), (time, z) or (time, r) field, block by block.
+
+    Returns, over `equation`, `term`, `draw` and the axes of the field:
+    coef, in SI, zero where a term is not in the selected support; inclusion, share of bootstraps
+    whose support of that size held the term; weight, coef times the root mean square of its term,
+    with its sign, as a share of all terms of the equation (not the variance: the constant has
+    none); coef_draws and weight_draws, the same in every bootstrap; r2_train, r2_test, n_terms
+    per equation; status per point. Where the status is not 0, the others are NaN. The attribute
+    no_fit holds a reason why a fit failed, if one did.
+    Only the block at work is in memory where the field is open lazily.
+    kept: where finished blocks are found again by a run that takes up a broken one.
+    progress: told of the points of every finished block.
+    Raises ValueError for a field without space, a variable it lacks, or where no point could be
+    fitted, with the first reason.
+    """
+    _check(field, search)
+    part = field[list(search.variables)]
+    blocks = blocks_of(part, block_points)
+    result = _empty(part, search)
+    waiting: list[Block] = []
+    for block in blocks:
+        done = kept.read(block) if kept else None
+        if done is None:
+            waiting.append(block)
+        else:
+            _place(result, block, done)
+            progress(block.n_points)
+    pieces = (part.isel(block.slices) for block in waiting)
+    for number, done in workers.run(partial(_searched, search), pieces):
+        if kept:
+            kept.write(waiting[number], done)
+        _place(result, waiting[number], done)
+        progress(waiting[number].n_points)
+    if not (result["status"] == 0).any():
+        raise ValueError(f"no point could be fitted: {_why_none(result)}")
+    return result
+
+
+def _why_none(result: xr.Dataset) -> str:
+    if result.attrs[NO_FIT]:
+        return str(result.attrs[NO_FIT])
+    counts = {name: int((result["status"] == k).sum()) for k, name in enumerate(STATUSES)}
+    found = ", ".join(f"{n} with {name.replace('_', ' ')}" for name, n in counts.items() if n)
+    return f"of {result['status'].size} points {found}; see to the mask and to least_variation"
+
+
+def _check(field: xr.Dataset, search: PointSearch) -> None:
+    check_field(field)
+    if not [axis for axis in SPACE if axis in field.dims]:
+        raise ValueError(
+            "a pointwise study needs a grid: this field has time alone; search it with discover"
+        )
+    missing = [name for name in search.variables if name not in field.data_vars]
+    if missing:
+        raise ValueError(f"unknown variables {missing}; this field has {list(field.data_vars)}")
+    timeless = [name for name in search.variables if "time" not in field[name].dims]
+    if set(timeless) & set(search.states):
+        raise ValueError(f"states must depend on time: {timeless} do not")
+
+
+def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
+    """The result before any point is done: units and coordinates, and NaN."""
+    axes = [axis for axis in SPACE if axis in field.dims]
+    shape = tuple(field.sizes[axis] for axis in axes)
+    units = {name: str(field[name].attrs["units"]) for name in search.variables}
+    term_units = search.library.units(units)
+    coef_units = [
+        [unit_product([(units[state], 1), ("s", -1), (unit, -1)]) for unit in term_units]
+        for state in search.states
+    ]
+    sizes = {
+        "draw": search.bootstraps.n, "equation": len(search.states), "term": len(search.library),
+    }  # fmt: skip
+    values = {
+        name: ((*dims, *axes), np.full((*(sizes[d] for d in dims), *shape), np.nan))
+        for name, dims in LAYOUT.items()
+    }
+    flags = {"flag_values": list(range(len(STATUSES))), "flag_meanings": " ".join(STATUSES)}
+    return xr.Dataset(
+        values | {"status": (axes, np.full(shape, -1, dtype=np.int8), flags)},
+        coords={
+            "equation": list(search.states),
+            "term": list(search.library.names),
+            "coef_units": (("equation", "term"), coef_units),
+            **{axis: (axis, grid_points(field, axis), {"units": "m"}) for axis in axes},
+        },
+        attrs={NO_FIT: ""},
+    )
+
+
+# Dimensions of every result, before those of space.
+LAYOUT: Mapping[str, tuple[str, ...]] = {
+    "coef": ("equation", "term"),
+    "inclusion": ("equation", "term"),
+    "weight": ("equation", "term"),
+    "coef_draws": ("draw", "equation", "term"),
+    "weight_draws": ("draw", "equation", "term"),
+    "r2_train": ("equation",),
+    "r2_test": ("equation",),
+    "n_terms": ("equation",),
+}
+
+
+def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> None:
+    reasons = {str(result.attrs[NO_FIT]), str(done[NO_FIT])} - {""}
+    result.attrs[NO_FIT] = min(reasons, default="")  # whatever the blocks are
+    for name in (*LAYOUT, "status"):
+        values, target = done[name], result[name].isel(block.slices)
+        target.values[...] = values.reshape(target.shape)
+
+
+def _searched(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
+    """Every point of a block, points along the last axis; why a fit failed, if one did."""
+    block = block.load(scheduler="synchronous")  # in chunks, if at all, on this thread
+    t = grid_points(block, "time")
+    columns = _columns(block, search.variables)
+    status = np.array([_status(values, search) for values in columns], dtype=np.int8)
+    found: dict[str, list[np.ndarray]] = {name: [] for name in LAYOUT}
+    reasons = []
+    nothing = _nothing(search)
+    for k, values in enumerate(columns):
+        point = nothing
+        if status[k] == 0:
+            try:
+                point = _at_point(_trajectory(t, values, block, search), search)
+            except ValueError as error:
+                status[k] = STATUSES.index(NO_FIT)
+                reasons.append(str(error))
+        for name, value in point.items():
+            found[name].append(value)
+    stacked = {name: np.stack(each, axis=-1) for name, each in found.items()}
+    return stacked | {"status": status, NO_FIT: np.array(min(reasons, default=""))}
+
+
+def _columns(
+    block: xr.Dataset, names: Sequence[str]
+) -> Float[np.ndarray, "points variables samples"]:
+    """All variables at all points, each one's samples in one stretch of memory."""
+    shape = (block.sizes["time"], *(block.sizes.get(axis, 1) for axis in SPACE))
+    columns = np.empty((shape[1] * shape[2], len(names), shape[0]))
+    for j, name in enumerate(names):
+        values = np.broadcast_to(grid_values(block[name]), shape)
+        columns[:, j] = values.reshape(shape[0], -1).T
+    return columns
+
+
+def _status(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
+    """What can be said before a fit; 0 where one is worth trying."""
+    lost = ~np.isfinite(values)
+    if lost.all(axis=1).any():
+        return STATUSES.index("no_plasma")
+    if lost.any():
+        return STATUSES.index("missing_samples")
+    states = values[: len(search.states)]
+    largest = np.abs(states).max(axis=1, keepdims=True)
+    scaled = states / np.where(largest > 0.0, largest, 1.0)
+    still = scaled.std(axis=1) <= search.least_variation * np.sqrt(np.square(scaled).mean(axis=1))
+    return STATUSES.index("too_little_variation") if still.any() else 0
+
+
+def _trajectory(
+    t: np.ndarray, values: np.ndarray, block: xr.Dataset, search: PointSearch
+) -> Trajectory:
+    n = len(search.states)
+    return Trajectory(
+        t=t,
+        states=values[:n].T,
+        state_names=search.states,
+        inputs=values[n:].T,
+        input_names=search.variables[n:],
+        units={name: str(block[name].attrs["units"]) for name in search.variables},
+    )
+
+
+def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
+    sizes = (search.bootstraps.n, len(search.states), len(search.library))
+    first = {"draw": 0, "equation": 1, "term": 2}
+    return {name: np.full([sizes[first[d]] for d in dims], np.nan) for name, dims in LAYOUT.items()}
+
+
+def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
+    """Search, select and fit one trajectory; its spread over the bootstraps."""
+    rng = np.random.default_rng(search.seed)
+    problems = search.formulation.assemble([run], search.library, rng=rng)
+    drawn = [resamples(problem, search.bootstraps, rng=rng) for problem in problems]
+    point = _nothing(search)
+    places, fronts, supports, found = [], [], [], []
+    for problem, draws in zip(problems, drawn, strict=True):
+        for k in range(len(problem.equations)):
+            places.append((problem, draws, k))
+            found.append(draws.searched(search.search, k))
+            supports.append(pooled(draws, k, found[-1]))
+            fronts.append(pareto_front(problem, supports[-1], depth=search.depth))
+    for row, (front, score) in enumerate(zip(fronts, search.selection.scores(fronts), strict=True)):
+        problem, draws, k = places[row]
+        chosen = selected(front, score)
+        final = chosen if problem.noisy is None else reweighted(problem, chosen)
+        mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
+        point["coef"][row] = 0.0
+        point["coef"][row, mask] = final.coef
+        point["inclusion"][row] = supports[row].inclusion[chosen.n_terms]
+        point["weight"][row] = _shares(point["coef"][row] * problem.theta_scale)
+        fits = draws.fits(k, found[row], mask)
+        point["coef_draws"][:, row] = fits * problem.target_scale[k] / problem.theta_scale
+        point["weight_draws"][:, row] = _shares(fits)
+        point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
+        point["n_terms"][row] = chosen.n_terms
+    return point
+
+
+def _shares(contributions: Float[np.ndarray, "*draws terms"]) -> Float[np.ndarray, "*draws terms"]:
+    """Each term's part in the sum of absolute values, with its sign; zeros where all are."""
+    total = np.abs(contributions).sum(axis=-1, keepdims=True)
+    return contributions / np.where(total > 0.0, total, 1.0)

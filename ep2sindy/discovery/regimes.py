@@ -1,0 +1,235 @@
+"""Regimes of a field: points where the same terms act, how many there are, and how sure that is.
+
+The pointwise study gives every point its equations. A term's weight there is its signed share of
+the equation; what tells regimes apart is which terms act, as source or sink, so a weight w counts
+as w |w| / (w^2 + least^2): near 0 well below the share `least`, near +-1 well above it. Points are
+grouped by a Gaussian mixture of these, with no component narrower than `resolution` or than the
+bootstraps' own spread, and as many components as Schwarz's criterion supports. Neighbours are
+alike and no regime is exact, so that with enough points any difference would become significant:
+the likelihood is raised to the power 1 / (1 + n_points / COARSENING). Where equations pass into
+one another, the points between may still come out as a regime of their own.
+Sources: Callaham, Koch, Brunton, Kutz & Brunton 2021, doi:10.1038/s41467-021-21331-z (regimes as
+clusters of the balance between terms); Schwarz 1978, doi:10.1214/aos/1176344136; Miller & Dunson
+2019, doi:10.1080/01621459.2018.1469995 (coarsening).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Float, Int
+from sklearn.mixture import GaussianMixture
+
+from ep2sindy.data.fields import SPACE
+
+N_STARTS = 20  # of the mixture's iteration, which may end in a poor optimum
+
+
+COARSENING = 100.0  # points after which evidence stops growing
+
+
+UNSURE = 0.5  # a confidence below
+
+
+@dataclass(frozen=True, eq=False)
+class Regimes:
+    """Which points share an equation.
+
+    labels: over z and r as far as the field has them; 0 is the largest regime, -1 a point without
+    equations. confidence: same shape, how probable the point's regime is on average over the
+    bootstraps; NaN where labels are -1.
+    table: one row per regime, equation and term: acts, whether the median of |weight| reaches
+    `least`; in_support, share of the regime's points whose support holds the term; weight, the
+    median; coef, coef_low and coef_high, median, 16 % and 84 % of the points that hold the term,
+    in the unit of the column coef_units; n_points, confidence (mean) and unsure (share of the
+    points whose confidence is below UNSURE) of the regime.
+    at_limit: whether there are as many as max_regimes allowed; the points may bear more.
+    """
+
+    labels: xr.DataArray
+    confidence: xr.DataArray
+    table: pd.DataFrame
+    at_limit: bool
+
+    @property
+    def n_regimes(self) -> int:
+        return int(self.labels.max()) + 1
+
+    def equations(self, regime: int) -> dict[str, dict[str, float]]:
+        """Terms that act in a regime, with their medians over the points that have them.
+
+        No point need have the equation as it stands: see in_support and the spread in the table.
+        """
+        if not 0 <= regime < self.n_regimes:
+            raise ValueError(f"regimes run from 0 to {self.n_regimes - 1}: {regime} came")
+        rows = self.table[self.table["regime"] == regime]
+        return {
+            str(equation): dict(zip(acting["term"], acting["coef"], strict=True))
+            for equation, terms in rows.groupby("equation", sort=False)
+            for acting in [terms[terms["acts"]]]
+        }
+
+
+def regimes(
+    result: xr.Dataset,
+    *,
+    rng: np.random.Generator,
+    max_regimes: int = 8,
+    least: float = 0.1,
+    resolution: float = 0.2,
+) -> Regimes:
+    """Group the points of a pointwise study by the terms that act in their equations.
+
+    result: as `studies.pointwise` gives it; used are weight, weight_draws and coef, with the
+    dimensions equation, term, draw, and z and r as far as the field has them.
+    max_regimes: where as many come out, the points may bear more.
+    Raises ValueError where no point has equations, or no bootstraps stand behind them.
+    """
+    if not result.sizes["draw"]:
+        raise ValueError("a regime's confidence needs bootstraps: the study made none; ask for 32")
+    space = [axis for axis in SPACE if axis in result["weight"].dims]
+    weights = _rows(result["weight"], space)
+    draws = _rows(result["weight_draws"], space)
+    coef = _rows(result["coef"], space)
+    valid = np.isfinite(weights).all(axis=(1, 2))
+    if not valid.any():
+        raise ValueError(
+            f"regimes need a point with equations: none of the {len(valid)} points of the study "
+            "has any; its variable `status` says why"
+        )
+    labels = np.full(len(valid), -1)
+    confidence = np.full(len(valid), np.nan)
+    labels[valid], confidence[valid] = group_points(
+        weights[valid].reshape(valid.sum(), -1),
+        np.moveaxis(draws[valid], 1, 0).reshape(draws.shape[1], valid.sum(), -1),
+        rng=rng,
+        max_regimes=max_regimes,
+        least=least,
+        resolution=resolution,
+    )
+    grid = result["weight"].isel(equation=0, term=0, drop=True).transpose(*space)
+    return Regimes(
+        labels=xr.DataArray(labels.reshape(grid.shape), grid.coords, space, "regime"),
+        confidence=xr.DataArray(confidence.reshape(grid.shape), grid.coords, space, "confidence"),
+        table=_table(result, labels, confidence, weights, coef, least),
+        at_limit=int(labels.max()) + 1 == max_regimes,
+    )
+
+
+def _rows(array: xr.DataArray, space: Sequence[str]) -> np.ndarray:
+    """Values with the points along the first axis, then any draws, equations and terms."""
+    rest = [axis for axis in ("draw", "equation", "term") if axis in array.dims]
+    values = array.transpose(*space, *rest).values
+    return values.reshape(-1, *values.shape[len(space) :])
+
+
+def group_points(
+    weights: Float[np.ndarray, "points features"],
+    draws: Float[np.ndarray, "draws points features"],
+    *,
+    rng: np.random.Generator,
+    max_regimes: int = 8,
+    least: float = 0.1,
+    resolution: float = 0.2,
+) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Regime of every point and how sure it is; the order of the points does not matter.
+
+    weights: signed shares of all terms in all equations. draws: the same from each bootstrap, NaN
+    where it could not be fitted. A confidence is the probability of the point's regime under the
+    mixture, averaged over the bootstraps: low where they disagree or fail, and where a point lies
+    between two regimes.
+    Raises ValueError unless max_regimes is one or more, least and resolution above 0.
+    """
+    if max_regimes < 1 or not least > 0.0 or not resolution > 0.0:
+        raise ValueError(
+            "grouping needs max_regimes of 1 or more, least and resolution above 0: "
+            f"max_regimes={max_regimes}, least={least}, resolution={resolution} came"
+        )
+    known = np.isfinite(draws).all(axis=2)
+    acting = _action(weights, least)
+    drawn = _action(np.where(known[:, :, None], draws, weights), least)
+    floor = resolution**2 + float(drawn.var(axis=0).mean())
+    mixture = _mixture(acting, floor, max_regimes, seed=int(rng.integers(2**31)))
+    if mixture is None:
+        return np.zeros(len(weights), dtype=np.int64), known.mean(axis=0)
+    found = mixture.predict(acting)
+    # A component may be the likeliest at no point; the largest regime comes first.
+    names, which, sizes = np.unique(found, return_inverse=True, return_counts=True)
+    order = np.lexsort([*mixture.means_[names].T, -sizes])
+    labels = np.argsort(order)[which]
+    chosen = np.arange(len(found)), found
+    agreeing = np.array([mixture.predict_proba(draw)[chosen] for draw in drawn])
+    return labels, (known * agreeing).mean(axis=0)
+
+
+def _action(weights: np.ndarray, least: float) -> np.ndarray:
+    """How far a term acts: 0 for not at all, +-1/2 at the share `least`, +-1 in the end."""
+    return weights * np.abs(weights) / (weights**2 + least**2)
+
+
+def _mixture(
+    features: np.ndarray, floor: float, max_regimes: int, *, seed: int
+) -> GaussianMixture | None:
+    """The mixture of least coarsened BIC; None for one regime, which needs none.
+
+    floor: added to the variance of every component.
+    """
+    # Sorted, so that the random starts do not depend on the order of the points.
+    points = features[np.lexsort(features.T)]
+    n_most = min(max_regimes, len(np.unique(points, axis=0)))
+    if n_most == 1:
+        return None
+    sizes = np.arange(1, n_most + 1)
+    candidates = [
+        GaussianMixture(
+            n, covariance_type="spherical", reg_covar=floor, n_init=N_STARTS, random_state=seed
+        ).fit(points)
+        for n in sizes.tolist()
+    ]
+    n_effective = len(points) / (1.0 + len(points) / COARSENING)
+    # A mean, a variance and a share each; the shares sum to one.
+    n_parameters = sizes * (points.shape[1] + 2) - 1
+    misfit = np.array([-2.0 * mixture.score(points) for mixture in candidates])
+    best = int(np.argmin(n_effective * misfit + n_parameters * np.log(n_effective)))
+    return candidates[best] if best else None
+
+
+def _table(
+    result: xr.Dataset,
+    labels: Int[np.ndarray, " points"],
+    confidence: Float[np.ndarray, " points"],
+    weights: Float[np.ndarray, "points equations terms"],
+    coef: Float[np.ndarray, "points equations terms"],
+    least: float,
+) -> pd.DataFrame:
+    """One row per regime, equation and term: see `Regimes`."""
+    rows: list[dict[str, object]] = []
+    for regime in range(labels.max() + 1):
+        inside = labels == regime
+        for e, equation in enumerate(result["equation"].values):
+            for k, term in enumerate(result["term"].values):
+                values = coef[inside, e, k]
+                held = values[values != 0.0]
+                low, middle, high = np.percentile(held, [16, 50, 84]) if held.size else [np.nan] * 3
+                rows.append(
+                    {
+                        "regime": regime,
+                        "equation": str(equation),
+                        "term": str(term),
+                        "acts": bool(np.median(np.abs(weights[inside, e, k])) >= least),
+                        "in_support": held.size / inside.sum(),
+                        "weight": float(np.median(weights[inside, e, k])),
+                        "coef": middle,
+                        "coef_low": low,
+                        "coef_high": high,
+                        "coef_units": str(result["coef_units"].values[e, k]),
+                        "n_points": int(inside.sum()),
+                        "confidence": float(confidence[inside].mean()),
+                        "unsure": float((confidence[inside] < UNSURE).mean()),
+                    }
+                )
+    return pd.DataFrame(rows)

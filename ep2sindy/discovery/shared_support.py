@@ -1,0 +1,203 @@
+"""Joint search: one support for all operating points, coefficients free at each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.discovery.last_fit import assemble_model, reweighted
+from ep2sindy.library.library import Library
+from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
+from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
+from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.search.front import Candidate, ParetoFront, fit_supports, front_order
+from ep2sindy.search.searches import BestSubset, Search
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.rule import Selection
+
+
+@dataclass(frozen=True, eq=False)
+class JointFront:
+    """The best supports of every size for one equation at all points, the empty one first.
+
+    errors: (supports,), geometric mean over the points of 1 - R2 (held-out rows, if any); the
+    best falls with size. points: point -> the fit of every support there, in the same order; a
+    term that depends on earlier ones at a point, or is zero there, is left out of that fit.
+    """
+
+    equation: str
+    supports: Sequence[tuple[str, ...]]
+    errors: Float[np.ndarray, " supports"]
+    points: Mapping[str, ParetoFront]
+
+
+@dataclass(frozen=True, eq=False)
+class JointDiscovery:
+    """What a joint search leaves: per state a front, scores and the support; per point a model.
+
+    scores: by state, one per support, summed over the points; the lowest is chosen.
+    ambiguities: by point, terms that its data cannot tell apart.
+    """
+
+    fronts: Mapping[str, JointFront] = field(repr=False)
+    scores: Mapping[str, Float[np.ndarray, " supports"]] = field(repr=False)
+    chosen: Mapping[str, tuple[str, ...]]
+    models: Mapping[str, SparseModel] = field(repr=False)
+    ambiguities: Mapping[str, Sequence[Ambiguity]] = field(repr=False)
+
+
+def discover_jointly(
+    points: Mapping[str, Sequence[Trajectory]],
+    library: Library,
+    *,
+    formulation: Formulation,
+    search: Search,
+    selection: Selection,
+    depth: int = 1,
+    rng: np.random.Generator,
+) -> JointDiscovery:
+    """Find equations whose terms are the same at every operating point, coefficients free.
+
+    Each point is assembled on its own, with its own sampling, noise and scale. The search finds
+    the supports whose product of residuals over the points is least: a term is in or out
+    everywhere. `selection` scores the fits at each point and the scores are added: for AICc, BIC
+    and EBIC that is the criterion of the joint likelihood, the count of supports paid once. A
+    term may vanish at some points, if it shows at others. One point gives what `discover` does
+    without bootstraps.
+    points: name -> trajectories. Points are assembled in the order of their names.
+    Raises ValueError for no point, points whose states, variables or units differ, or a search
+    that cannot serve several points.
+    Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
+    """
+    if not isinstance(search, BestSubset):
+        raise ValueError(
+            f"a joint search must weigh all points at once: {search} cannot; use BestSubset"
+        )
+    _check_points(points, library)
+    problems = {
+        point: formulation.assemble(points[point], library, rng=rng) for point in sorted(points)
+    }
+    fronts = {
+        equation: _joint_front(
+            {p: parts[k] for p, parts in problems.items()}, equation, search, depth
+        )
+        for k, problem in enumerate(next(iter(problems.values())))
+        for equation in problem.equations
+    }
+    scores = _summed_scores(list(fronts.values()), selection)
+    best = {state: int(np.argmin(each)) for state, each in zip(fronts, scores, strict=True)}
+    provenance = {
+        "formulation": repr(formulation),
+        "search": repr(search),
+        "selection": repr(selection),
+        "joint": ", ".join(points),
+    }
+    return JointDiscovery(
+        fronts=fronts,
+        scores=dict(zip(fronts, scores, strict=True)),
+        chosen={state: front.supports[best[state]] for state, front in fronts.items()},
+        models=_models(points, library, fronts, best, provenance),
+        ambiguities={
+            point: tuple(dict.fromkeys(a for part in problems[point] for a in ambiguities(part)))
+            for point in points
+        },
+    )
+
+
+def _models(
+    points: Mapping[str, Sequence[Trajectory]],
+    library: Library,
+    fronts: Mapping[str, JointFront],
+    best: Mapping[str, int],
+    provenance: Mapping[str, str],
+) -> dict[str, SparseModel]:
+    """The best support of every equation, with each point's own coefficients."""
+    return {
+        point: assemble_model(
+            library,
+            [_last_fit(front.points[point], best[state]) for state, front in fronts.items()],
+            units=runs[0].units,
+            provenance={**provenance, "point": point},
+        )
+        for point, runs in points.items()
+    }
+
+
+def _check_points(points: Mapping[str, Sequence[Trajectory]], library: Library) -> None:
+    if not points or not all(points.values()):
+        empty = [point for point, runs in points.items() if not runs]
+        raise ValueError(
+            "a joint search needs operating points with a trajectory each: "
+            + (f"{empty} came without" if empty else "no point came")
+        )
+    first, reference = next((point, runs[0]) for point, runs in points.items())
+    for point, runs in points.items():
+        try:
+            check_agreement([reference, *runs], library.variables)
+        except ValueError as error:
+            raise ValueError(
+                f"points must agree: {point!r} does not with trajectory 0 of {first!r}: {error}"
+            ) from error
+
+
+def _joint_front(
+    problems: Mapping[str, Regression], equation: str, search: BestSubset, depth: int
+) -> JointFront:
+    """Search the Gram matrices of all points at once, and fit what is found at each of them."""
+    any_problem = next(iter(problems.values()))
+    k = any_problem.equations.index(equation)
+    grams = [problem.train_gram for problem in problems.values()]
+    # A term that repeats another at one point may stand for it there, if they differ elsewhere.
+    usable = np.any([usable_terms(problem) for problem in problems.values()], axis=0)
+    masks = search.joint_supports(
+        np.stack([gram.xx[0] * usable[:, None] * usable for gram in grams]),
+        np.stack([gram.xy[0, k] * usable for gram in grams]),
+        np.array([gram.yy[0, k] for gram in grams]),
+    )
+    fits = {
+        p: fit_supports(each, equation, _determined(each, masks)) for p, each in problems.items()
+    }
+    by_point = [ParetoFront(equation, fits[p], each).errors for p, each in problems.items()]
+    errors = np.exp(np.log(np.maximum(by_point, ROUNDING)).mean(axis=0))
+    order = front_order(masks.sum(axis=1), errors, depth=depth)
+    names = np.array(any_problem.term_names)
+    return JointFront(
+        equation=equation,
+        supports=tuple(tuple(names[mask].tolist()) for mask in masks[order]),
+        errors=errors[order],
+        points={
+            p: ParetoFront(equation, [fits[p][i] for i in order], each)
+            for p, each in problems.items()
+        },
+    )
+
+
+def _determined(
+    problem: Regression, masks: Bool[np.ndarray, "supports terms"]
+) -> Bool[np.ndarray, "supports terms"]:
+    """The terms of each support that the rows of one point determine, earlier terms first."""
+    found = masks.copy()
+    for mask in found:
+        columns = np.flatnonzero(mask)
+        mask[columns] = independent_terms(problem.train_gram.xx[0][np.ix_(columns, columns)])
+    return found
+
+
+def _summed_scores(
+    fronts: Sequence[JointFront], selection: Selection
+) -> list[Float[np.ndarray, " supports"]]:
+    points = list(fronts[0].points)
+    rule = selection.shared_by(len(points)) if isinstance(selection, EBIC) else selection
+    by_point = [rule.scores([front.points[point] for front in fronts]) for point in points]
+    return [np.sum(scores, axis=0) for scores in zip(*by_point, strict=True)]
+
+
+def _last_fit(front: ParetoFront, k: int) -> Candidate:
+    """One support as fitted at one point, with weights where the noise is known."""
+    candidate, problem = front.candidates[k], front.problem
+    return candidate if problem.noisy is None else reweighted(problem, candidate)

@@ -1,0 +1,251 @@
+"""Maps of the pointwise study and its regimes; along a line where the field has one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from ep2sindy.discovery.regimes import Regimes
+from ep2sindy.figures.panels import (
+    CM,
+    COUNTS,
+    SHARES,
+    draw_map,
+    draw_values,
+    finish_panels,
+    map_figure,
+    space_axes,
+)
+from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, unit_text
+from ep2sindy.library.equations import latex_derivative, latex_term, latex_term_name
+from ep2sindy.thruster.parameters import Thruster
+
+ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
+
+
+GAP = 0.12  # half width of the colour bar's middle, where terms are absent
+
+
+SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
+
+
+MEDIANS = "terms that act, with medians over the regime's points that have them"
+
+
+STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
+
+
+def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
+    """Every coefficient over the field: a row per equation, a column per term, signed and log.
+
+    result: as `studies.pointwise` gives it. Red is a positive coefficient (a source), blue a
+    negative one, darker the larger its magnitude; grey a term that is not in the equation; white
+    a point without equations. A column has one scale of whole decades; terms that no point
+    selected have no column. outline: the thruster whose channel is drawn.
+    Over one axis alone, magnitudes are points over it.
+    """
+    terms = [t for t in result["term"].values if (np.abs(result["coef"].sel(term=t)) > 0).any()]
+    if not terms:
+        raise ValueError("coefficient maps need a term: no point of the study selected any")
+    coef = result["coef"].sel(term=terms)
+    flat = len(space_axes(coef)) == 1
+    shape = coef.sizes["equation"], len(terms)
+    figure = map_figure(coef, shape, extra=1.1)
+    axes = figure.subplots(*shape, squeeze=False, sharex=True, sharey="col" if flat else True)
+    for column, term in zip(axes.T, terms, strict=True):
+        column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=10)
+        if flat:
+            _signed_points(list(column), coef.sel(term=term))
+        else:
+            _signed_maps(figure, list(column), coef.sel(term=term))
+    for row, equation in zip(axes, coef["equation"].values, strict=True):
+        name = f"${latex_derivative(str(equation))}$"
+        row[0].annotate(
+            name, (-0.42, 0.5), xycoords="axes fraction", fontsize=12, ha="right", va="center"
+        )
+    finish_panels(axes, coef, outline)
+    entries = {"source (+)": SOURCE, "sink (−)": SINK} | ({} if flat else {"not selected": ABSENT})
+    figure.legend(
+        handles=[Patch(color=colour, label=label) for label, colour in entries.items()],
+        loc="outside upper center", ncols=len(entries), frameon=False, fontsize=9,
+    )  # fmt: skip
+    return figure
+
+
+def _signed_maps(figure: Figure, column: Sequence[Axes], coef: xr.DataArray) -> None:
+    """One term in all equations, with their colour bar: the grey in its middle ends at +-10^low."""
+    low, high = _decades(coef.values)
+    scale = _signed_colours()
+    for ax, values in zip(column, coef, strict=True):
+        draw_map(
+            ax, values.copy(data=_signed_log(values.values, low, high)), scale, Normalize(-1, 1)
+        )
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(-1, 1), scale), ax=column, location="bottom", aspect=14,
+        pad=0.02, shrink=0.95,
+    )  # fmt: skip
+    units = dict.fromkeys(map(_coef_unit, coef))
+    bar.set_label(" / ".join(units), fontsize=8, labelpad=1)
+    bar.set_ticks(
+        [-1.0, 0.0, 1.0], labels=[f"$-10^{{{high}}}$", rf"$\pm 10^{{{low}}}$", f"$10^{{{high}}}$"]
+    )
+    inner = _place(np.arange(low + 1, high), low, high)
+    bar.set_ticks([*-inner, *inner], minor=True)
+    bar.ax.tick_params(labelsize=7, length=2)
+
+
+def _coef_unit(coef: xr.DataArray) -> str:
+    unit = str(coef["coef_units"].values)
+    return "dimensionless" if unit == "1" else unit_text(unit)
+
+
+def _decades(coef: Float[np.ndarray, "*shape"]) -> tuple[int, int]:
+    """Whole decades around the magnitudes, all but the smallest and largest hundredth of them."""
+    magnitudes = np.log10(np.abs(coef[np.isfinite(coef) & (coef != 0.0)]))
+    low, high = np.percentile(magnitudes, [1, 99])
+    return int(np.floor(low)), max(int(np.ceil(high)), int(np.floor(low)) + 1)
+
+
+def _place(exponent: np.ndarray, low: int, high: int) -> np.ndarray:
+    """Where a magnitude stands between the colour bar's middle and its end."""
+    return np.clip(GAP + (1.0 - GAP) * (exponent - low) / (high - low), GAP, 1.0)
+
+
+def _signed_log(
+    coef: Float[np.ndarray, "*shape"], low: int, high: int
+) -> Float[np.ndarray, "*shape"]:
+    """-1 to -GAP and GAP to 1 for coefficients, 0 for absent terms; NaN stays."""
+    exponent = np.log10(np.abs(coef), where=coef != 0.0, out=np.full(coef.shape, float(low)))
+    return np.sign(coef) * _place(exponent, low, high)
+
+
+def _signed_colours() -> ListedColormap:
+    n = 200
+    half = round((1.0 - GAP) * n) + 1  # the faintest shade begins before GAP: rounding
+    shades = np.linspace(0.3, 1.0, half)
+    return ListedColormap(
+        [
+            *colormaps["Blues"](shades[::-1]),
+            *[ABSENT] * (2 * (n - half)),
+            *colormaps["Reds"](shades),
+        ]
+    )
+
+
+def _signed_points(column: Sequence[Axes], coef: xr.DataArray) -> None:
+    """Magnitudes of one term in all equations along the one axis, sources and sinks apart."""
+    (axis,) = space_axes(coef)
+    for ax, values in zip(column, coef, strict=True):
+        for sign, colour, marker in ((1, SOURCE, "^"), (-1, SINK, "v")):
+            chosen = sign * values.values > 0
+            ax.semilogy(
+                CM * coef[axis].values[chosen], np.abs(values.values[chosen]), marker, ms=3,
+                color=colour,
+            )  # fmt: skip
+        ax.set_ylabel(_coef_unit(values), fontsize=7, labelpad=2)
+
+
+def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
+    """Where each regime lies, how sure that is, and the terms that act in it.
+
+    Coefficients are medians over the regime's points that have the term, so no point need have
+    the equation as it stands. White: points without equations.
+    """
+    n, n_equations = regimes.n_regimes, regimes.table["equation"].nunique()
+    colours = MORE_COLOURS if n <= len(MORE_COLOURS) else colormaps["tab20"](np.arange(n) % 20)
+    flat = len(space_axes(regimes.labels)) == 1
+    n_columns = 1 if flat or n <= 3 else 2
+    text = -(-n // n_columns) * (0.15 * (1 + n_equations) + 0.12)
+    shape = (2, 1) if flat else (1, 2)
+    figure = map_figure(regimes.labels, shape, scale=2.2, extra=text + 0.75)
+    heights = [1, 2] if flat else None
+    axes = figure.subplots(
+        *shape, squeeze=False, sharex=True, sharey=not flat, height_ratios=heights
+    )
+    labels = regimes.labels.where(regimes.labels >= 0)
+    norm = BoundaryNorm(np.arange(n + 1) - 0.5, n)
+    draw_map(axes.flat[0], labels, ListedColormap(list(colours[:n])), norm)
+    axes.flat[0].set_title("regime", fontsize=10)
+    draw_values(figure, axes.flat[1], regimes.confidence, SHARES, Normalize(0.0, 1.0))
+    axes.flat[1].set_title("confidence", fontsize=10)
+    finish_panels(axes, regimes.labels, outline)
+    figure.legend(
+        handles=[Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)],
+        loc="outside lower center", ncols=n_columns, frameon=False, fontsize=8, labelspacing=0.8,
+        handlelength=1.2, title=MEDIANS, title_fontsize=9,
+    )  # fmt: skip
+    return figure
+
+
+def _regime_text(regimes: Regimes, regime: int) -> str:
+    row = regimes.table[regimes.table["regime"] == regime].iloc[0]
+    equations = "\n".join(
+        _equation_latex(state, terms) for state, terms in regimes.equations(regime).items()
+    )
+    points = f"{row['n_points']} point{'s' if row['n_points'] > 1 else ''}"
+    return f"regime {regime}: {points}, confidence {row['confidence']:.2f}\n{equations}"
+
+
+def _equation_latex(state: str, terms: Mapping[str, float]) -> str:
+    right = " ".join(
+        latex_term(name, coef, 3, first=k == 0) for k, (name, coef) in enumerate(terms.items())
+    )
+    return f"${latex_derivative(state)} = {right or '0'}$"
+
+
+def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
+    """R2 and number of terms of every equation; what became of the points, unless all are fitted.
+
+    R2 is that of the held-out rows, or of the training rows where none were held out; below 0 is
+    drawn as 0.
+    """
+    held_out = bool(np.isfinite(result["r2_test"]).any())
+    r2 = result["r2_test" if held_out else "r2_train"]
+    n_equations = result.sizes["equation"]
+    n_columns = 3 if (result["status"] != 0).any() else 2
+    figure = map_figure(r2, (n_equations, n_columns), scale=1.4, extra=0.9)
+    axes = figure.subplots(n_equations, n_columns, squeeze=False, sharex=True)
+    most = max(1, int(result["n_terms"].max()))
+    counts = BoundaryNorm(np.arange(most + 2) - 0.5, 256)
+    for row, equation in zip(axes, result["equation"].values, strict=True):
+        name = latex_derivative(str(equation))
+        draw_values(
+            figure, row[0], r2.sel(equation=equation).clip(min=0.0), SHARES, Normalize(0.0, 1.0)
+        )
+        row[0].set_title(f"${name}$: $R^2$, {'held-out' if held_out else 'training'}", fontsize=9)
+        draw_values(figure, row[1], result["n_terms"].sel(equation=equation), COUNTS, counts)
+        row[1].set_title(f"${name}$: number of terms", fontsize=9)
+    finish_panels(axes[:, :2], r2, outline)
+    if n_columns == 3:
+        _status(figure, axes[0, 2], result["status"])
+        for ax in axes[1:, 2]:
+            ax.remove()
+        finish_panels(axes[:1, 2:], r2, outline)
+    return figure
+
+
+def _status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
+    meanings = str(status.attrs["flag_meanings"]).split()
+    found = [k for k in range(len(meanings)) if (status == k).any()]
+    norm = BoundaryNorm(np.arange(len(meanings) + 1) - 0.5, len(meanings))
+    draw_map(ax, status.astype(float), ListedColormap(list(STATUS_COLOURS)), norm)
+    ax.set_title("status of the points", fontsize=9)
+    figure.legend(
+        handles=[
+            Patch(
+                facecolor=STATUS_COLOURS[k], edgecolor=DATA, lw=0.5,
+                label=f"{meanings[k].replace('_', ' ')} ({int((status == k).sum())})",
+            )
+            for k in found
+        ],
+        loc="outside lower center", ncols=len(found), frameon=False, fontsize=8,
+    )  # fmt: skip

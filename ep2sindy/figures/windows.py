@@ -1,0 +1,88 @@
+"""Figures of windows: their number and length against error and loss."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ep2sindy.figures.style import COLOURS, DATA, GREY
+
+
+def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
+    """Loss of refinement, and frequency error and nrmse on held-out data, by window length.
+
+    rows: method, window (samples), loss, f_error, nrmse, f_error_started, nrmse_started.
+    period: of the data, in samples.
+    """
+    figure = Figure(figsize=(10.0, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3, sharex=True)
+    lengths = [int(n) for n in rows["window"].unique()]
+    titles = ("loss (1: a constant)", "frequency error (%)", "nrmse on held-out data")
+    for (name, each), colour in zip(rows.groupby("method", sort=False), COLOURS, strict=False):
+        style = {"color": colour, "marker": "o", "ms": 3.5, "lw": 1.2}
+        axes[0].plot(each["window"], each["loss"], label=name, **style)
+        for ax, key, factor in ((axes[1], "f_error", 100.0), (axes[2], "nrmse", 1.0)):
+            ax.plot(each["window"], factor * each[key].abs(), label=name, **style)
+            dashed = style | {"ls": "--", "mfc": "none"}
+            started = factor * each[f"{key}_started"].abs()
+            ax.plot(each["window"], started, label=f"{name}, start fitted", **dashed)
+    for ax, title in zip(axes, titles, strict=True):
+        ax.set_xscale("log")
+        ax.set_xticks(lengths, [str(n) for n in lengths], fontsize=8)
+        ax.set_xticks([], minor=True)
+        ax.axvline(period, color=DATA, lw=0.8, ls=":")
+        ax.set_title(title, fontsize=10)
+        ax.set_xlabel("samples in a window")
+        ax.grid(which="major", alpha=0.3)
+    axes[0].set_ylim(bottom=0.0)
+    axes[1].axhline(1.0, color=GREY, lw=0.8)
+    axes[1].set_yscale("log")
+    axes[2].set_ylim(bottom=0.0)
+    handles, labels = axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
+    return figure
+
+
+def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Figure:
+    """Coefficient error against noise: a panel per window length, a line per number of windows.
+
+    cells: as `studies.weak_windows.window_cells` gives them. references: settings without
+    windows to choose, drawn in every panel.
+    """
+    # Without noise the errors are those of the integrals, decades below: the table has them.
+    noisy = cells[cells["noise"] > 0.0]
+    shown = noisy if len(noisy) else cells
+    lengths = cells["n_points"].dropna().unique()
+    figure = Figure(figsize=(2.9 * len(lengths) + 0.4, 3.6), layout="constrained")
+    axes = figure.subplots(1, len(lengths), squeeze=False, sharex=True, sharey=True)[0]
+    for ax, n_points in zip(axes, lengths, strict=True):
+        for style, name in zip(("--", "-", ":"), references, strict=False):
+            label = name.replace("_", ", ")
+            _error_line(ax, shown[shown["setting"] == name], label=label, color=DATA, ls=style)
+        panel = shown[shown["n_points"] == n_points]
+        for colour, n_windows in zip(COLOURS, panel["n_windows"].unique(), strict=False):
+            one = panel[panel["n_windows"] == n_windows]
+            _error_line(ax, one, label=f"{n_windows} windows", color=colour, marker="o", ms=3.5)
+        ax.set_title(f"{n_points} points per window", fontsize=10)
+        ax.set_xlabel("noise (% of RMS)")
+        ax.grid(which="major", alpha=0.3)
+    axes[0].set_yscale("log")
+    if len(noisy):
+        axes[0].set_xscale("log")
+    levels = 100.0 * np.unique(shown["noise"])
+    axes[0].set_xticks(levels, [f"{level:g}" for level in levels])
+    axes[0].set_xticks([], minor=True)
+    axes[0].set_ylabel(r"coefficient error $\|\beta - \beta_{true}\| / \|\beta_{true}\|$")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    return figure
+
+
+def _error_line(ax: Axes, cells: pd.DataFrame, *, label: str, **style: Any) -> None:
+    ordered = cells.sort_values("noise")
+    ax.plot(100.0 * ordered["noise"], ordered["error_mean"], label=label, lw=1.2, **style)

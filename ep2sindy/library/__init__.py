@@ -1,0 +1,1 @@
+"""The library: candidate terms, their names and units, and how equations are written."""

@@ -1,0 +1,1 @@
+"""Sparse models: equations that are evaluated, integrated, scored and stored."""

@@ -1,0 +1,149 @@
+"""Many models of the same states at once: integrated together over the same windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import make_interp_spline
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
+
+# Steps of the integration per sample. One would do for the truth of every noise-free system of
+# `systems`: its error stays below 1e-9 variances; the second is for sparser samples.
+N_SUBSTEPS = 2
+
+
+# A window's error at most, in variances: a model that always gives the mean has 1.
+MAX_ERROR = 10.0
+
+
+# A state this many standard deviations from its mean has diverged.
+BLOW_UP = 20.0
+
+
+# Runs that advance together: more, and their terms leave the cache.
+RUN_BLOCK = 2560
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenWindows:
+    """Windows of one trajectory: where they start, what they should follow, what drives them.
+
+    steps_s: (steps, windows), of the integration. drive: inputs at the start, middle and end of
+    every step. start: smoothed. truth: the samples that follow, each N_SUBSTEPS steps apart.
+    """
+
+    steps_s: Float[np.ndarray, "steps windows"]
+    drive: Float[np.ndarray, "n_inputs steps 3 windows"]
+    start: Float[np.ndarray, "n_states windows"]
+    truth: Float[np.ndarray, "n_states samples windows"]
+
+    @staticmethod
+    def of(
+        run: Trajectory,
+        smoothed: Float[np.ndarray, "_ n_states"],
+        states: Sequence[str],
+        inputs: Sequence[str],
+        starts: Int[np.ndarray, " windows"],
+        n_steps: int,
+    ) -> DrivenWindows:
+        samples = starts + np.arange(n_steps + 1)[:, None]
+        t = run.t[samples]
+        steps_s = np.repeat(np.diff(t, axis=0) / N_SUBSTEPS, N_SUBSTEPS, axis=0)
+        begins = t[0] + np.cumsum(steps_s, axis=0) - steps_s
+        nodes = begins[:, None] + np.array([0.0, 0.5, 1.0])[:, None] * steps_s[:, None]
+        drive = np.empty((0, *nodes.shape))
+        if inputs:
+            spline = make_interp_spline(run.t, run.columns(inputs), k=min(3, run.n_samples - 1))
+            drive = np.moveaxis(spline(nodes), -1, 0)
+        return DrivenWindows(
+            steps_s, drive, smoothed[starts].T, run.columns(states).T[:, samples[1:]]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Models x' = library(states, inputs) coef that differ in their coefficients.
+
+    coef: (terms, states, models), in SI. Terms that no model uses are not evaluated.
+    """
+
+    library: Library
+    states: Sequence[str]
+    coef: Float[np.ndarray, "terms n_states models"]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Variables of the library that are not states."""
+        return tuple(v for v in self.library.variables if v not in self.states)
+
+    @cached_property
+    def _gather(self) -> np.ndarray:
+        """Where each variable of the library stands among states, then inputs."""
+        known = [*self.states, *self.inputs]
+        return np.array([known.index(v) for v in self.library.variables], dtype=np.int64)
+
+    @cached_property
+    def _used(self) -> tuple[Library, np.ndarray]:
+        """The terms that any model uses, and their coefficients."""
+        used = np.abs(self.coef).max(axis=(1, 2)) > 0.0
+        used[0] = True  # a library needs a term
+        return Library(self.library.variables, self.library.exponents[used]), self.coef[used]
+
+    def errors(
+        self,
+        windows: DrivenWindows,
+        *,
+        centre: Float[np.ndarray, " n_states"],
+        spread: Float[np.ndarray, " n_states"],
+    ) -> Float[np.ndarray, "models windows"]:
+        """Mean over samples and states of the squared error, in variances; at most MAX_ERROR.
+
+        Runge-Kutta of fourth order. A run whose state leaves centre by BLOW_UP times spread has
+        diverged: it stops, and its error is MAX_ERROR.
+        """
+        n_models, n_together = self.coef.shape[2], max(1, RUN_BLOCK // windows.start.shape[1])
+        blocks = [self.coef[:, :, k : k + n_together] for k in range(0, n_models, n_together)]
+        centre, spread = centre[:, None, None], spread[:, None, None]
+        return np.concatenate(
+            [replace(self, coef=block)._errors(windows, centre, spread) for block in blocks]
+        )
+
+    def _errors(self, windows: DrivenWindows, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        # States first: each operation then runs along models and windows, in one stretch.
+        x = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)
+        total = np.zeros(x.shape[1:])
+        bounded = np.ones(x.shape[1:], dtype=np.bool_)
+        n_samples = windows.truth.shape[1]
+        # What overflows has left the bounds: seen at the next sample, it stays where it was.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(n_samples):
+                moved = x
+                for step in range(k * N_SUBSTEPS, (k + 1) * N_SUBSTEPS):
+                    moved = self._rk4_step(moved, windows.drive[:, step], windows.steps_s[step])
+                bounded &= (np.abs(moved - centre) <= BLOW_UP * spread).all(axis=0)
+                x = np.where(bounded, moved, x)
+                total += np.square((x - windows.truth[:, k, None]) / spread).mean(axis=0)
+        return np.where(bounded, np.minimum(total / n_samples, MAX_ERROR), MAX_ERROR)
+
+    def _rk4_step(self, x: np.ndarray, drive: np.ndarray, step_s: np.ndarray) -> np.ndarray:
+        k1 = self._derivative(x, drive[:, 0])
+        k2 = self._derivative(x + 0.5 * step_s * k1, drive[:, 1])
+        k3 = self._derivative(x + 0.5 * step_s * k2, drive[:, 1])
+        k4 = self._derivative(x + step_s * k3, drive[:, 2])
+        return x + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+    def _derivative(self, x: np.ndarray, drive: np.ndarray) -> np.ndarray:
+        """x and the result: (states, models, windows). drive: (inputs, windows)."""
+        driven = np.broadcast_to(drive[:, None], (len(drive), *x.shape[1:]))
+        values = np.moveaxis(np.concatenate([x, driven])[self._gather], 0, -1)
+        library, coefs = self._used
+        slope = np.zeros(x.shape)
+        for term, coef in zip(np.moveaxis(library.evaluate(values), -1, 0), coefs, strict=True):
+            slope += coef[..., None] * term
+        return slope

@@ -1,0 +1,278 @@
+"""A sparse model: a few terms per equation, readable, runnable and storable."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from scipy.integrate import solve_ivp
+from scipy.interpolate import make_interp_spline
+from scipy.special import ndtri
+
+from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.library.equations import latex_derivative
+from ep2sindy.library.library import Library, named_terms
+from ep2sindy.machine.files import write_text
+
+if TYPE_CHECKING:
+    import sympy
+from ep2sindy.library.equations import equation_text, latex_term
+from ep2sindy.model.rollout import Rollout, ending_text
+
+FORMAT = "ep2sindy.SparseModel/1"
+
+
+@dataclass(frozen=True, eq=False)
+class SparseModel:
+    """Equations x' = library(states, inputs) coef, in SI units.
+
+    coef: (terms, equations), zero outside the support. states: one name per equation.
+    units: of the states and of the library's variables. provenance: where it came from.
+    covariance: (coefs, coefs) of the coefficients that are not zero, equation by equation and
+    within one in the order of the library, in SI; None where it is not known.
+    """
+
+    library: Library
+    states: Sequence[str]
+    coef: Float[np.ndarray, "terms equations"]
+    units: Mapping[str, str] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    covariance: Float[np.ndarray, "_ _"] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "states", tuple(self.states))
+        object.__setattr__(self, "coef", read_only(self.coef))
+        names = dict.fromkeys((*self.states, *self.library.variables))
+        units = {name: self.units.get(name, "1") for name in names}
+        object.__setattr__(self, "units", MappingProxyType(units))
+        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        if self.coef.shape != (len(self.library), len(self.states)):
+            raise ValueError(
+                "coef must have one row per term and one column per equation: shape "
+                f"{self.coef.shape} came for {len(self.library)} terms and {list(self.states)}"
+            )
+        if not np.isfinite(self.coef).all():
+            raise ValueError(f"coefficients must be finite: {self.coef.tolist()} came")
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", read_only(self.covariance))
+            n_coefs = int(np.count_nonzero(self.coef))
+            if self.covariance.shape != (n_coefs, n_coefs):
+                raise ValueError(
+                    "covariance must have a row and a column per coefficient that is not zero: "
+                    f"shape {self.covariance.shape} came for {n_coefs}"
+                )
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Variables of the library that are not states."""
+        return tuple(v for v in self.library.variables if v not in self.states)
+
+    def terms(self, state: str) -> dict[str, float]:
+        """Term name -> SI coefficient, of one equation, in the order of the library."""
+        column = self.coef[:, self._equation(state)]
+        return {n: float(c) for n, c in zip(self.library.names, column, strict=True) if c != 0.0}
+
+    def intervals(self, state: str, *, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Term name -> lower and upper bound of its coefficient, for Gaussian errors.
+
+        Raises ValueError for a model without covariance.
+        """
+        if self.covariance is None:
+            raise ValueError(
+                "intervals need a covariance: this model has none; discover it with the "
+                "formulation Weak"
+            )
+        used = self.coef.T != 0.0
+        std = np.zeros(used.shape)
+        std[used] = np.sqrt(np.diag(self.covariance))
+        row = self._equation(state)
+        reach = ndtri(0.5 + 0.5 * level) * std[row, used[row]]
+        return {
+            name: (value - r, value + r)
+            for (name, value), r in zip(self.terms(state).items(), reach.tolist(), strict=True)
+        }
+
+    def derivative(
+        self,
+        states: Float[np.ndarray, "... n_states"],
+        inputs: Float[np.ndarray, "... n_inputs"],
+    ) -> Float[np.ndarray, "... n_states"]:
+        """Right-hand side at any number of samples; inputs in the order of `inputs`."""
+        values = np.concatenate([states, inputs], axis=-1)
+        return self.library.evaluate(values[..., self._gather]) @ self.coef
+
+    def rollout(
+        self,
+        trajectory: Trajectory,
+        *,
+        start: int = 0,
+        n_samples: int | None = None,
+        initial: Float[np.ndarray, " n_states"] | None = None,
+        blow_up: float = 100.0,
+        rtol: float = 1e-8,
+    ) -> Rollout:
+        """Integrate from one sample of a trajectory, driven by its inputs (cubic splines).
+
+        initial: the state at that sample, in SI; None takes the data's.
+        The states are scaled by their largest value in the window, so that one tolerance fits
+        all. A state that exceeds `blow_up` times that value ends the run as diverged.
+        Raises ValueError for a window outside the trajectory or a missing variable.
+        """
+        stop = trajectory.n_samples if n_samples is None else start + n_samples
+        window = trajectory.window(start, stop)
+        data = window.columns(self.states)
+        scale = np.abs(data).max(axis=0)
+
+        def too_large(t: float, y: np.ndarray) -> float:
+            return blow_up - float(np.abs(y).max())
+
+        too_large.terminal = True  # type: ignore[attr-defined]
+        # An overflow on the way to a blow-up is caught by the event, or ends the solver.
+        with np.errstate(over="ignore", invalid="ignore"):
+            solution = solve_ivp(
+                self._scaled_rhs(window, scale),
+                (window.t[0], window.t[-1]),
+                (data[0] if initial is None else initial) / scale,
+                method="DOP853",
+                t_eval=window.t,
+                events=too_large,
+                rtol=rtol,
+                atol=rtol,
+            )
+        return Rollout(
+            t=solution.t,
+            states=solution.y.T * scale,
+            diverged=solution.status != 0,
+            message=ending_text(solution, blow_up),
+        )
+
+    def text(self, *, digits: int = 3) -> str:
+        """One line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
+        return "\n".join(equation_text(s, self.terms(s), digits=digits) for s in self.states)
+
+    def sympy(self) -> dict[str, sympy.Expr]:
+        """State name -> right-hand side as a sympy expression, coefficients as floats."""
+        import sympy  # half a second that most runs do not need
+
+        symbols = [sympy.Symbol(v) for v in self.library.variables]
+        powers = dict(zip(self.library.names, self.library.exponents.tolist(), strict=True))
+
+        def monomial(name: str) -> sympy.Expr:
+            pairs = zip(symbols, powers[name], strict=True)
+            return sympy.Mul(*(symbol**power for symbol, power in pairs))
+
+        return {
+            s: sympy.Add(*(sympy.Float(c) * monomial(n) for n, c in self.terms(s).items()))
+            for s in self.states
+        }
+
+    def latex(self, *, digits: int = 3) -> str:
+        """An `aligned` block with one equation per line."""
+        lines = []
+        for state in self.states:
+            right = " ".join(
+                latex_term(name, coef, digits, first=k == 0)
+                for k, (name, coef) in enumerate(self.terms(state).items())
+            )
+            lines.append(f"{latex_derivative(state)} &= {right or '0'}")
+        return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
+
+    def to_json(self) -> str:
+        """Everything in the model; floats in their shortest exact form."""
+        content = {
+            "format": FORMAT,
+            "states": list(self.states),
+            "variables": list(self.library.variables),
+            "library": list(self.library.names),
+            "equations": {s: self.terms(s) for s in self.states},
+            "units": dict(self.units),
+            "provenance": dict(self.provenance),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+        }
+        return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+    @staticmethod
+    def from_json(text: str) -> SparseModel:
+        """Inverse of `to_json`, exact. Raises ValueError for anything else."""
+        try:
+            content = json.loads(text)
+            if content["format"] != FORMAT:
+                raise ValueError(f"format {content['format']!r}")
+            library = named_terms(content["variables"], content["library"])
+            equations = content["equations"]
+            covariance = content.get("covariance")  # files of version 0.1 have none
+            return SparseModel(
+                library=library,
+                states=content["states"],
+                coef=coef_matrix(library, [equations[s] for s in content["states"]]),
+                units=content["units"],
+                provenance=content["provenance"],
+                covariance=None if covariance is None else _square(covariance),
+            )
+        except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
+            raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
+
+    def save(self, path: str | Path) -> None:
+        write_text(Path(path), self.to_json())
+
+    @staticmethod
+    def load(path: str | Path) -> SparseModel:
+        return SparseModel.from_json(Path(path).read_text(encoding="utf-8"))
+
+    def _equation(self, state: str) -> int:
+        if state not in self.states:
+            raise ValueError(f"unknown state {state!r}; this model has {list(self.states)}")
+        return list(self.states).index(state)
+
+    @cached_property
+    def _gather(self) -> np.ndarray:
+        """Where each variable of the library stands among states, then inputs."""
+        known = [*self.states, *self.inputs]
+        return np.array([known.index(v) for v in self.library.variables], dtype=np.int64)
+
+    def _scaled_rhs(
+        self, window: Trajectory, scale: np.ndarray
+    ) -> Callable[[float, np.ndarray], np.ndarray]:
+        """The right-hand side for scaled states, with the absent terms left out."""
+        present = self.coef.any(axis=1)
+        coef = self.coef[present] / scale
+        # One gather and one product per call: index -1 of the padded values is a one.
+        places = np.append(self._gather, -1)
+        factors = places[self.library.factors[present]]
+        padded = np.ones(len(self.states) + len(self.inputs) + 1)
+        n = len(self.states)
+        drive = None
+        if self.inputs:
+            inputs = window.columns(self.inputs)
+            drive = make_interp_spline(window.t, inputs, k=min(3, len(inputs) - 1))
+
+        def rhs(t: float, y: np.ndarray) -> np.ndarray:
+            padded[:n] = y * scale
+            if drive is not None:
+                padded[n:-1] = drive(t)
+            return padded[factors].prod(axis=1) @ coef
+
+        return rhs
+
+
+def coef_matrix(
+    library: Library, equations: Sequence[Mapping[str, float]]
+) -> Float[np.ndarray, "terms equations"]:
+    """Coefficients by term name, as a matrix over the library."""
+    coef = np.zeros((len(library), len(equations)))
+    for k, terms in enumerate(equations):
+        for name, value in terms.items():
+            coef[library.index(name), k] = value
+    return coef
+
+
+def _square(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "_ _"]:
+    """Rows of a stored matrix, which may be empty."""
+    return np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))

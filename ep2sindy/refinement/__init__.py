@@ -1,0 +1,1 @@
+"""Refinement: coefficients fitted to integrated trajectories; PyTorch lives here."""

@@ -1,0 +1,223 @@
+"""A known right-hand side plus a learned one: a torch module trained along with a sparse model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.judge import FLAT
+from ep2sindy.refinement.methods.gradient_descent import GradientDescent
+from ep2sindy.refinement.methods.gradient_descent import trajectories as integrate
+from ep2sindy.refinement.ode import ODE, unconstrained
+from ep2sindy.refinement.problem import Fit, Iteration, Problem
+from ep2sindy.refinement.refine import with_coef
+from ep2sindy.refinement.windows import WindowBatch, cut_windows
+
+# A step is fine enough when half of it moves the trajectories by less than either of these.
+ERROR_PER_RESIDUAL, LEAST_ERROR = 0.1, 1e-3  # rms, the second in std
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A model and a learned term whose sum follows the data, x' = model + learned.
+
+    model: the known part, its coefficients trained, without covariance: a flexible term can
+    imitate the known ones, so the data fix the sum and not its parts. Name the learned term,
+    add it to the model and `refine` that for coefficients with errors.
+    correction: a trained copy, in float64 on the CPU. It takes states, then inputs, in units of
+    `scale` and returns the learned derivative in units of `rate`; both in SI.
+    loss_before: of the known part alone, as given, from the data's own initial states, infinite
+    if it blows up. loss: mean of window_loss, the mean square of (trajectory - data) / std.
+    status: converged; max_iter; coarse_step: the learned term makes up for the error of the time
+    step; flat: no better than a constant; non_finite: what was given comes back.
+    history: one entry per iteration. trajectories: the fitted states in SI; data cut by `batch`.
+    """
+
+    model: SparseModel
+    correction: nn.Module
+    scale: Float[np.ndarray, " variables"]
+    rate: Float[np.ndarray, " n_states"]
+    loss_before: float
+    loss: float
+    window_loss: Float[np.ndarray, " windows"]
+    status: str
+    history: tuple[Iteration, ...]
+    batch: WindowBatch
+    trajectories: Float[np.ndarray, "windows samples n_states"]
+
+    def learned(
+        self,
+        states: Float[np.ndarray, "... n_states"],
+        inputs: Float[np.ndarray, "... n_inputs"] | None = None,
+    ) -> Float[np.ndarray, "... n_states"]:
+        """What the correction adds to the derivative, in SI; inputs in the order of the model's.
+
+        Far from the samples it was trained on, it means nothing.
+        Raises ValueError if the columns are not the model's states and inputs.
+        """
+        values = states if inputs is None else np.concatenate([states, inputs], axis=-1)
+        if values.shape[-1] != len(self.scale):
+            raise ValueError(
+                f"the learned term takes {list(self.model.states)} and inputs "
+                f"{list(self.model.inputs)}: {values.shape[-1]} columns came"
+            )
+        flat = torch.tensor((values / self.scale).reshape(-1, len(self.scale)))
+        with torch.no_grad():
+            rate = self.correction(flat).numpy()
+        return rate.reshape(states.shape) * self.rate
+
+
+def refine_with_correction(
+    model: SparseModel,
+    trajectories: Sequence[Trajectory],
+    correction: nn.Module,
+    *,
+    window: int,
+    n_windows: int = 30,
+    method: GradientDescent | None = None,
+    constraint: Constraint | None = None,
+    free_start: bool = True,
+    n_reweights: int = 0,
+    rng: np.random.Generator,
+    callback: Callable[[Iteration], None] | None = None,
+    device: str = "cpu",
+) -> Corrected:
+    """Train x' = model + correction(states, inputs) to follow windows of the trajectories.
+
+    correction: maps (rows, states + inputs) to (rows, states): each state in units of its
+    standard deviation, each input of its rms, to a derivative of which one is as much as the
+    known part has over the data. Best zero at first (last layer of zeros), so that training
+    starts from the known part. It is copied; its initial weights, and so the only randomness
+    besides the windows, are the caller's: seed them by torch.manual_seed.
+    window: short at first: long windows of a model that lacks a term are hard to follow.
+    method: None means GradientDescent(max_iter=60, tolerance=1e-3, patience=5).
+    constraint: relations, or known coefficients that shall not move. The rest as in `refine`.
+    Raises ValueError as `refine`, and for a correction of the wrong shape. A failed fit is a
+    result: see `status`.
+    Source: Rackauckas et al. 2020, arXiv:2001.04385.
+    """
+    batch = cut_windows(
+        trajectories,
+        states=model.states,
+        inputs=model.inputs,
+        n_windows=n_windows,
+        window=window,
+        rng=rng,
+    )
+    known = ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=constraint).to(device)
+    term = _Scaled(deepcopy(correction), _typical_rate(known, batch)).to(device, torch.float64)
+    _check_shape(term, known, device)
+    ode = ODE(
+        model, scale=batch.scale, step_s=batch.step_s, constraint=constraint, correction=term
+    ).to(device)
+    history: list[Iteration] = []
+
+    def observe(iteration: Iteration) -> None:
+        history.append(iteration)
+        if callback is not None:
+            callback(iteration)
+
+    problem = Problem((ode,), (batch,), free_start, n_reweights, observe)
+    method = GradientDescent(max_iter=60, tolerance=1e-3, patience=5) if method is None else method
+    nodes, window_loss, status = _judged(problem, method.fit(problem), method.n_substeps)
+    trained = status != "non_finite"
+    relations = unconstrained(model) if constraint is None else constraint
+    coef = (ode if trained else known).coef.detach().cpu().numpy()
+    state_scale = batch.scale[: len(model.states)]
+    return Corrected(
+        model=with_coef(model, relations, coef)[0],
+        correction=(term.inner if trained else deepcopy(correction)).to("cpu", torch.float64),
+        scale=batch.scale,
+        rate=float(term.rate) * state_scale / batch.step_s,
+        loss_before=_loss_from_data(known, problem, method.n_substeps),
+        loss=float(window_loss.mean()) if trained else float("inf"),
+        window_loss=window_loss,
+        status=status,
+        history=tuple(history),
+        batch=batch,
+        trajectories=nodes * state_scale,
+    )
+
+
+class _Scaled(nn.Module):
+    """A correction times a typical rate, so that its output and weights are of order one."""
+
+    rate: torch.Tensor
+
+    def __init__(self, inner: nn.Module, rate: float) -> None:
+        super().__init__()
+        self.inner = inner
+        self.register_buffer("rate", torch.tensor(rate, dtype=torch.float64))
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        return self.rate * self.inner(values)
+
+
+def _typical_rate(known: ODE, batch: WindowBatch) -> float:
+    """Rms of the known part over the windows, in std per sample; one where it vanishes."""
+    n_inputs = batch.inputs.shape[-1]
+    values = np.concatenate([batch.data[:, :-1], batch.inputs[:, :, -1]], axis=-1)
+    flat = torch.tensor(values.reshape(-1, known.n_states + n_inputs), device=known.free0.device)
+    with torch.no_grad():
+        rate = float((known.library.evaluate(flat) @ known.matrix).square().mean().sqrt())
+    return rate if rate > 0.0 else 1.0
+
+
+def _check_shape(term: nn.Module, known: ODE, device: str) -> None:
+    rows = torch.zeros((3, len(known.variables)), dtype=torch.float64, device=device)
+    with torch.no_grad():
+        out = term(rows)
+    if out.shape != (3, known.n_states):
+        raise ValueError(
+            f"a correction must map (rows, {len(known.variables)}) to (rows, {known.n_states}), "
+            f"one column per state {list(known.variables[: known.n_states])}: "
+            f"{tuple(out.shape)} came from {tuple(rows.shape)}"
+        )
+
+
+def _judged(problem: Problem, fit: Fit, n_substeps: int) -> tuple[np.ndarray, np.ndarray, str]:
+    """Trajectories in std, the loss of each window, and the gravest status that applies."""
+    nodes, data = fit.nodes[0], problem.data[0]
+    with np.errstate(over="ignore", invalid="ignore"):  # a blow-up is a status
+        window_loss = np.square(nodes - data).mean(axis=(1, 2))
+    loss = window_loss.mean()
+    level = data.mean(axis=1, keepdims=True) if problem.free_start else data[:, :1]
+    if not (fit.finite[0] and np.isfinite(loss)):
+        status = "non_finite"
+    elif loss > FLAT * np.square(data - level).mean():
+        status = "flat"
+    elif not fit.finished[0]:
+        status = "max_iter"
+    elif not _step_error(problem, nodes, n_substeps) < max(
+        ERROR_PER_RESIDUAL * np.sqrt(loss), LEAST_ERROR
+    ):
+        status = "coarse_step"
+    else:
+        status = "converged"
+    return nodes, window_loss, status
+
+
+def _step_error(problem: Problem, nodes: np.ndarray, n_substeps: int) -> float:
+    """Rms change of the trajectories, in std, under half the time step."""
+    start = torch.tensor(nodes[:, 0].copy(), device=problem.device)
+    with torch.no_grad():
+        finer = integrate(problem.odes[0], problem.whole, start, nodes.shape[1], 2 * n_substeps)
+    return float((finer - torch.tensor(nodes, device=problem.device)).square().mean().sqrt())
+
+
+def _loss_from_data(known: ODE, problem: Problem, n_substeps: int) -> float:
+    """Of a module that follows each window from its first sample."""
+    data = torch.tensor(problem.data[0], device=problem.device)
+    with torch.no_grad():
+        path = integrate(known, problem.whole, data[:, 0], data.shape[1], n_substeps)
+    loss = float((path - data).square().mean())
+    return loss if np.isfinite(loss) else float("inf")

@@ -1,0 +1,133 @@
+"""Integral least squares by gradients from autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from torchdiffeq import odeint
+
+from ep2sindy.refinement.ode import ODE, Drive
+from ep2sindy.refinement.problem import Fit, Iteration, Problem, joined, residual_weights, single
+from ep2sindy.refinement.steps import RungeKutta
+
+Optimizer = Callable[[list[nn.Parameter]], torch.optim.Optimizer]
+
+
+LBFGS: Optimizer = partial(torch.optim.LBFGS, line_search_fn="strong_wolfe")
+
+
+@dataclass(frozen=True)
+class GradientDescent:
+    """A torch optimiser through torchdiffeq's `rk4`, by plain reverse mode.
+
+    optimizer: makes one from parameters, such as `partial(torch.optim.Adam, lr=1e-2)`.
+    It has converged when the last `patience` steps gained less than `tolerance` of the loss.
+    """
+
+    optimizer: Optimizer = LBFGS
+    max_iter: int = 200
+    tolerance: float = 1e-8
+    patience: int = 10
+    n_substeps: int = 1
+
+    def fit(self, problem: Problem) -> Fit:
+        return joined([self._fit_point(single(problem, p), p) for p in range(len(problem.odes))])
+
+    def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> None:
+        """Set `n_substeps` instead."""
+        return
+
+    def _fit_point(self, problem: Problem, point: int) -> Fit:
+        ode, data = problem.odes[0], torch.tensor(problem.data[0], device=problem.device)
+        start = nn.Parameter(data[:, 0].clone(), requires_grad=problem.free_start)
+        weights, used = np.ones((1, data.shape[-1])), np.ones((1, data.shape[-1]))
+        finished, path = False, data
+        for _ in range(problem.n_reweights + 1):
+            used = weights
+            finished = self.descend(
+                ode,
+                problem.whole,
+                data,
+                start,
+                weights[0],
+                observe=lambda loss: problem.observe(_iteration(point, data, ode, loss)),
+            )
+            with torch.no_grad():
+                path = trajectories(ode, problem.whole, start, data.shape[1], self.n_substeps)
+            if not torch.isfinite(path).all():
+                break
+            weights = residual_weights(path[None].cpu().numpy(), problem.data)
+        scaling = ode.scaling.detach().cpu().numpy()[None].copy()
+        return Fit(
+            scaling=scaling,
+            nodes=path[None].cpu().numpy(),
+            weights=used,
+            finished=np.array([finished]),
+            finite=np.array(
+                [bool(torch.isfinite(path).all()) and bool(np.isfinite(scaling).all())]
+            ),
+            step=RungeKutta(self.n_substeps),
+        )
+
+    def descend(
+        self,
+        ode: ODE,
+        drive: Drive,
+        data: torch.Tensor,
+        start: nn.Parameter,
+        weights: np.ndarray,
+        *,
+        observe: Callable[[float], None],
+    ) -> bool:
+        """Train every parameter of a module, and the starts where they ask for a gradient.
+
+        data: (windows, samples, n_states). Returns whether the loss has settled.
+        """
+        parameters = [*ode.parameters(), *([start] if start.requires_grad else [])]
+        optimizer = self.optimizer(parameters)
+        factor = torch.tensor(weights, device=data.device)
+        losses: list[float] = []
+
+        def closure() -> torch.Tensor:
+            optimizer.zero_grad()
+            path = trajectories(ode, drive, start, data.shape[1], self.n_substeps)
+            loss = (factor * (path - data)).square().mean()
+            loss.backward()
+            return loss
+
+        for _ in range(self.max_iter):
+            loss: Any = optimizer.step(closure)  # type: ignore[arg-type]
+            losses.append(float(loss.detach()))
+            observe(losses[-1])
+            if not np.isfinite(losses[-1]):
+                return False
+            recent = losses[-self.patience - 1 :]
+            if (
+                len(recent) > self.patience
+                and recent[0] - min(recent) <= self.tolerance * recent[0]
+            ):
+                return True
+        return False
+
+
+def trajectories(
+    ode: ODE, drive: Drive, start: torch.Tensor, n_samples: int, n_substeps: int = 1
+) -> torch.Tensor:
+    """(windows, samples, n_states) from starts (windows, n_states), differentiable."""
+    ode.drive = drive
+    last = n_samples - 1
+    t = torch.arange(n_samples, dtype=torch.float64, device=start.device)
+    grid = torch.linspace(0.0, float(last), n_substeps * last + 1, dtype=torch.float64)
+    options = {"grid_constructor": lambda func, y0, t: grid, "perturb": True}
+    return odeint(ode, start, t, method="rk4", options=options).transpose(0, 1)
+
+
+def _iteration(point: int, data: torch.Tensor, ode: ODE, loss: float) -> Iteration:
+    scaling = ode.scaling.detach().cpu().numpy().copy()
+    return Iteration(point, data.shape[1], loss, scaling, 0.0, 0.0)

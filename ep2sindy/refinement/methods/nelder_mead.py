@@ -1,0 +1,103 @@
+"""Integral least squares without gradients, by the simplex of Nelder and Mead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy.integrate import odeint as lsoda
+from scipy.optimize import minimize
+
+from ep2sindy.refinement.problem import Fit, Iteration, Problem, joined, residual_weights, single
+
+CUBIC = np.arange(3, -1, -1)  # powers, as a window batch stores them
+
+
+@dataclass(frozen=True)
+class NelderMead:
+    """The thesis's way, for comparison: a simplex on the scalings, scipy's odeint per window.
+
+    Starts must come from the data: their number is beyond a simplex.
+    Source: thesis II-F.
+    """
+
+    tolerance: float = 1e-6
+    max_iter: int = 2000
+
+    def fit(self, problem: Problem) -> Fit:
+        if problem.free_start:
+            raise ValueError(
+                "NelderMead cannot fit initial states: pass free_start=False, or use "
+                "MultipleShooting"
+            )
+        return joined([self._fit_point(single(problem, p), p) for p in range(len(problem.odes))])
+
+    def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> None:
+        """odeint chooses its own steps."""
+        return
+
+    def _fit_point(self, problem: Problem, point: int) -> Fit:
+        data, n_free = problem.data[0], problem.n_free
+        weights, used = np.ones((1, data.shape[-1])), np.ones((1, data.shape[-1]))
+        scaling, finished = np.ones(n_free), False
+        path = window_paths(problem, scaling)
+        for _ in range(problem.n_reweights + 1):
+            if not np.isfinite(path).all():
+                break
+            used = weights
+            objective = partial(_weighted_loss, problem, used[0])
+            found = minimize(
+                objective,
+                scaling,
+                method="Nelder-Mead",
+                callback=partial(_observe, problem, point),
+                options={"xatol": self.tolerance, "fatol": np.inf, "maxiter": self.max_iter},
+            )
+            scaling, finished = found.x, bool(found.success)
+            path = window_paths(problem, scaling)
+            weights = residual_weights(path[None], problem.data)
+        return Fit(
+            scaling=scaling[None],
+            nodes=path[None],
+            weights=used,
+            finished=np.array([finished]),
+            finite=np.array([bool(np.isfinite(path).all())]),
+        )
+
+
+def window_paths(problem: Problem, scaling: np.ndarray) -> np.ndarray:
+    """Trajectories by scipy's odeint, window after window, from the data: NaN where it fails."""
+    ode, batch = problem.odes[0], problem.batches[0]
+    basis, offset = (part.detach().cpu().numpy() for part in ode.linear_parts())
+    matrix = basis @ scaling + offset
+    path = np.full(batch.data.shape, np.nan)
+    factors, n = ode.library.factors, ode.n_states
+    padded = np.ones(len(ode.variables) + 1)
+    for w, data in enumerate(batch.data):
+        t = np.append(0.0, np.cumsum(batch.steps[w]))
+
+        def rhs(x: np.ndarray, now: float, t: np.ndarray = t, w: int = w) -> np.ndarray:
+            padded[:n] = x
+            if len(padded) > n + 1:
+                k = min(max(int(np.searchsorted(t, now, side="right")) - 1, 0), len(t) - 2)
+                share = (now - t[k]) / (t[k + 1] - t[k])
+                padded[n:-1] = share**CUBIC @ batch.inputs[w, k]
+            return padded[factors].prod(axis=1) @ matrix
+
+        with np.errstate(over="ignore", invalid="ignore"):
+            states, info = lsoda(rhs, data[0], t, full_output=True)
+        if info["message"] == "Integration successful.":
+            path[w] = states
+    return path
+
+
+def _weighted_loss(problem: Problem, weights: np.ndarray, scaling: np.ndarray) -> float:
+    loss = np.square(weights * (window_paths(problem, scaling) - problem.data[0])).mean()
+    return float(loss) if np.isfinite(loss) else np.inf
+
+
+def _observe(problem: Problem, point: int, scaling: np.ndarray) -> None:
+    loss = _weighted_loss(problem, np.ones(problem.data.shape[-1]), scaling)
+    window = problem.data.shape[2]
+    problem.observe(Iteration(point, window, loss, scaling.copy(), 0.0, 0.0))

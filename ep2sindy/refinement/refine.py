@@ -1,0 +1,253 @@
+"""Integral least squares: refine a model's coefficients until its trajectories follow the data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.judge import Verdict, judge
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.ode import ODE, unconstrained
+from ep2sindy.refinement.problem import Fit, Iteration, Method, Problem
+from ep2sindy.refinement.windows import WindowBatch, cut_windows, dominant_window
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A model fitted to trajectories, and how far to trust it.
+
+    model: with the covariance of its coefficients, a sandwich with windows as clusters.
+    covariance_naive: the same for residuals that are white and independent.
+    window_loss: mean square of (trajectory - data) / std, integrated again from the fitted
+    starts; loss: its mean, one being that of a constant.
+    status: converged; max_iter; coarse_step: the error of the time step shows in a coefficient;
+    unidentifiable: the 95 % interval of a free coefficient reaches zero; flat: no better than a
+    constant; non_finite: the model given comes back, without covariance.
+    history: one entry per iteration. trajectories: the fitted states in SI; data cut by `batch`.
+    """
+
+    model: SparseModel
+    covariance_naive: Float[np.ndarray, "_ _"] | None
+    loss: float
+    window_loss: Float[np.ndarray, " windows"]
+    status: str
+    history: tuple[Iteration, ...]
+    batch: WindowBatch
+    trajectories: Float[np.ndarray, "windows samples n_states"]
+
+
+def refine(
+    model: SparseModel,
+    trajectories: Sequence[Trajectory],
+    *,
+    n_windows: int = 30,
+    window: int | None = None,
+    method: Method | None = None,
+    constraint: Constraint | None = None,
+    free_start: bool = True,
+    n_reweights: int = 1,
+    rng: np.random.Generator,
+    callback: Callable[[Iteration], None] | None = None,
+    device: str = "cpu",
+) -> Refinement:
+    """Fit the free coefficients to windows spread over trajectories, by least squares.
+
+    window: samples in each; None takes one and a half periods of the dominant frequency.
+    method: None means MultipleShooting(). free_start: fit each window's initial state as well,
+    without which noise in it biases the coefficients; False starts at the data, as the thesis.
+    n_reweights: passes with each state weighted by 1/std of its residuals.
+    Raises ValueError for a window that fits no trajectory, a missing variable, a model without
+    terms or a constraint that leaves out one of them. A failed fit is a result: see `status`.
+    """
+    (found,) = refine_many(
+        [model],
+        [trajectories],
+        n_windows=n_windows,
+        window=dominant_window(trajectories, model.states) if window is None else window,
+        method=method,
+        constraint=constraint,
+        free_start=free_start,
+        n_reweights=n_reweights,
+        rng=rng,
+        callback=callback,
+        device=device,
+    )
+    return found
+
+
+def refine_many(
+    models: Sequence[SparseModel],
+    trajectories: Sequence[Sequence[Trajectory]],
+    *,
+    window: int,
+    n_windows: int = 30,
+    method: Method | None = None,
+    constraint: Constraint | None = None,
+    free_start: bool = True,
+    n_reweights: int = 1,
+    points_per_batch: int = 8,
+    rng: np.random.Generator,
+    callback: Callable[[Iteration], None] | None = None,
+    device: str = "cpu",
+) -> list[Refinement]:
+    """Refine models of the same states, each on trajectories of its own; as `refine` for the rest.
+
+    points_per_batch: points integrated together, few enough to stay in the processor's cache;
+    on a GPU, thousands. A point that has converged leaves its batch.
+    Models may differ in their terms; those of a batch all cost what the largest does.
+    Raises ValueError if the models differ in their variables or the windows in their number.
+    """
+    found: list[Refinement] = []
+    for first in range(0, len(models), points_per_batch):
+        chunk = models[first : first + points_per_batch]
+        batches = [
+            cut_windows(
+                data,
+                states=model.states,
+                inputs=model.inputs,
+                n_windows=n_windows,
+                window=window,
+                rng=rng,
+            )
+            for model, data in zip(chunk, trajectories[first:], strict=False)
+        ]
+        found += _refined(
+            chunk,
+            batches,
+            method=MultipleShooting() if method is None else method,
+            constraint=constraint,
+            free_start=free_start,
+            n_reweights=n_reweights,
+            callback=callback,
+            device=device,
+        )
+    return found
+
+
+def loss_against_window(
+    model: SparseModel,
+    trajectories: Sequence[Trajectory],
+    windows: Sequence[int],
+    *,
+    n_windows: int = 30,
+    method: Method | None = None,
+    constraint: Constraint | None = None,
+    free_start: bool = True,
+    n_reweights: int = 1,
+    rng: np.random.Generator,
+) -> dict[int, Refinement]:
+    """Refine once per window length; the loss of each says where the model ceases to follow."""
+    return {
+        window: refine(
+            model,
+            trajectories,
+            n_windows=n_windows,
+            window=window,
+            method=method,
+            constraint=constraint,
+            free_start=free_start,
+            n_reweights=n_reweights,
+            rng=rng,
+        )
+        for window in windows
+    }
+
+
+def _refined(
+    models: Sequence[SparseModel],
+    batches: Sequence[WindowBatch],
+    *,
+    method: Method,
+    constraint: Constraint | None,
+    free_start: bool,
+    n_reweights: int,
+    callback: Callable[[Iteration], None] | None,
+    device: str,
+) -> list[Refinement]:
+    """One batch of points, from windows to results."""
+    odes = [
+        ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=constraint).to(device)
+        for model, batch in zip(models, batches, strict=True)
+    ]
+    history: list[Iteration] = []
+
+    def observe(iteration: Iteration) -> None:
+        history.append(iteration)
+        if callback is not None:
+            callback(iteration)
+
+    problem = Problem(
+        odes=tuple(odes),
+        batches=tuple(batches),
+        free_start=free_start,
+        n_reweights=n_reweights,
+        observe=observe,
+    )
+    fit, verdicts = judge(problem, method.fit(problem))
+    while coarse := [p for p, verdict in enumerate(verdicts) if verdict.status == "coarse_step"]:
+        again = method.finer(problem, fit, np.array(coarse))
+        if again is None:
+            break
+        fit, verdicts = judge(problem, again)
+    return [
+        _result(model, problem, fit, p, verdict, constraint or unconstrained(model), history)
+        for p, (model, verdict) in enumerate(zip(models, verdicts, strict=True))
+    ]
+
+
+def _result(
+    model: SparseModel,
+    problem: Problem,
+    fit: Fit,
+    point: int,
+    verdict: Verdict,
+    constraint: Constraint,
+    history: Sequence[Iteration],
+) -> Refinement:
+    """Back to SI and to the model's own order of coefficients."""
+    batch, ode = problem.batches[point], problem.odes[point]
+    finite = verdict.status != "non_finite"
+    robust = naive = None
+    refined = replace(model, covariance=None)
+    if finite:
+        with torch.no_grad():
+            ode.scaling.copy_(torch.tensor(fit.scaling[point, : len(ode.free0)]))
+            values = ode.coef.cpu().numpy()
+        refined, order = with_coef(model, constraint, values)
+        by_scaling = (constraint.C * ode.free0.cpu().numpy())[order]
+        robust, naive = (
+            by_scaling @ each @ by_scaling.T
+            for each in (verdict.covariance, verdict.covariance_naive)
+        )
+        refined = replace(refined, covariance=robust)
+    return Refinement(
+        model=refined,
+        covariance_naive=naive,
+        loss=float(verdict.window_loss.mean()) if finite else float("inf"),
+        window_loss=verdict.window_loss,
+        status=verdict.status,
+        history=tuple(entry for entry in history if entry.point == point),
+        batch=batch,
+        trajectories=fit.nodes[point] * batch.scale[: fit.nodes.shape[-1]],
+    )
+
+
+def with_coef(
+    model: SparseModel, constraint: Constraint, values: np.ndarray
+) -> tuple[SparseModel, list[int]]:
+    """The model with these coefficients, and where its own order finds them among `values`."""
+    coef = np.zeros_like(model.coef)
+    places = {}
+    for k, (state, term) in enumerate(constraint.coefficients):
+        equation, row = model.states.index(state), model.library.index(term)
+        coef[row, equation] = values[k]
+        if values[k] != 0.0:
+            places[equation, row] = k
+    return replace(model, coef=coef, covariance=None), [places[at] for at in sorted(places)]

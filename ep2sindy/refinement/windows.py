@@ -1,0 +1,163 @@
+"""Windows of trajectories cut out together, scaled, with their inputs as cubics in time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import CubicSpline
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
+
+PERIODS = 1.5  # of the dominant frequency in a window, where nobody says otherwise
+
+
+MIN_SAMPLES = 5  # of a window: fewer say nothing about the dynamics
+
+
+@dataclass(frozen=True, eq=False)
+class WindowBatch:
+    """Equally long windows of one set of trajectories.
+
+    scale: of states, then inputs: standard deviation of each state, rms of each input, in SI.
+    step_s: mean time step; steps: (windows, samples - 1) in units of it.
+    data: (windows, samples, n_states) in units of scale.
+    inputs: (windows, samples - 1, 4, n_inputs), cubics in the share of a step that has passed,
+    highest power first, in units of scale.
+    trajectory, start: (windows,), where each window was cut.
+    """
+
+    scale: Float[np.ndarray, " variables"]
+    step_s: float
+    steps: Float[np.ndarray, "windows segments"]
+    data: Float[np.ndarray, "windows samples n_states"]
+    inputs: Float[np.ndarray, "windows segments 4 n_inputs"]
+    trajectory: Int[np.ndarray, " windows"]
+    start: Int[np.ndarray, " windows"]
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                copy = value.copy()
+                copy.flags.writeable = False
+                object.__setattr__(self, item.name, copy)
+
+    @property
+    def multiplicity(self) -> float:
+        """How many windows an average sample sits in: one, unless windows overlap."""
+        window = self.data.shape[1]
+        order = np.lexsort((self.start, self.trajectory))
+        gaps = np.diff(self.start[order])
+        apart = np.diff(self.trajectory[order]) != 0
+        covered = window + np.where(apart, window, np.minimum(gaps, window)).sum()
+        return float(window * len(order) / covered)
+
+
+def cut_windows(
+    trajectories: Sequence[Trajectory],
+    *,
+    states: Sequence[str],
+    inputs: Sequence[str],
+    n_windows: int,
+    window: int,
+    rng: np.random.Generator,
+) -> WindowBatch:
+    """Cut `n_windows` windows of `window` samples, fewer where there are not that many places.
+
+    Raises ValueError for no trajectory, a window that no trajectory can hold or of under five
+    samples, or a missing variable.
+    """
+    _check(trajectories, n_windows, window)
+    values = [trajectory.columns([*states, *inputs]) for trajectory in trajectories]
+    joined = np.concatenate(values)
+    n = len(states)
+    scale = np.append(joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0)))
+    scale[scale == 0.0] = 1.0
+    step_s = float(np.mean(np.concatenate([np.diff(each.t) for each in trajectories])))
+    index, start = _places([len(v) for v in values], n_windows, window, rng)
+    cubics = [
+        _cubics(each.t, v[:, n:] / scale[n:]) for each, v in zip(trajectories, values, strict=True)
+    ]
+    places = list(zip(index, start, strict=True))
+    cut = slice(0, window - 1)
+    return WindowBatch(
+        scale=scale,
+        step_s=step_s,
+        steps=np.stack([np.diff(trajectories[j].t[k:][:window]) / step_s for j, k in places]),
+        data=np.stack([values[j][k:][:window, :n] / scale[:n] for j, k in places]),
+        inputs=np.stack([cubics[j][k:][cut] for j, k in places]),
+        trajectory=index,
+        start=start,
+    )
+
+
+def dominant_window(trajectories: Sequence[Trajectory], states: Sequence[str]) -> int:
+    """One and a half periods of the dominant frequency, in samples, as the data allow.
+
+    The frequency is that of the state whose peak holds the largest share of its power, the
+    median over trajectories. At most half of the longest trajectory.
+    """
+    samples = []
+    for each in trajectories:
+        columns = each.columns(states).T
+        sharpest = columns[int(np.argmax([_peak_share(each.t, column) for column in columns]))]
+        frequency = dominant_frequency(each.t, sharpest)
+        samples += [PERIODS / (frequency * each.dt_s)] if frequency > 0.0 else []
+    longest = max(each.n_samples for each in trajectories)
+    wanted = np.median(samples) if samples else longest / 2
+    return int(np.clip(round(float(wanted)), min(10, longest), max(longest // 2, 10)))
+
+
+def _peak_share(t: np.ndarray, x: np.ndarray) -> float:
+    """Share of the power, mean apart, in the highest bin and its neighbours."""
+    power = power_spectrum(t, x)[1][1:]
+    k = int(np.argmax(power))
+    return float(power[max(k - 1, 0) : k + 2].sum() / max(power.sum(), 1e-300))
+
+
+def _check(trajectories: Sequence[Trajectory], n_windows: int, window: int) -> None:
+    if not trajectories:
+        raise ValueError("refinement needs at least one trajectory: none came")
+    if n_windows < 1 or window < MIN_SAMPLES:
+        raise ValueError(
+            f"at least one window of {MIN_SAMPLES} samples is needed: n_windows={n_windows}, "
+            f"window={window}"
+        )
+    longest = max(each.n_samples for each in trajectories)
+    if window > longest:
+        raise ValueError(
+            f"a window must fit into a trajectory: {window} samples were asked of trajectories "
+            f"of at most {longest}; shorten it, or leave it out to have it chosen"
+        )
+
+
+def _places(
+    lengths: Sequence[int], n_windows: int, window: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Trajectory and first sample of every window, trajectories served by the room they have."""
+    room = np.array([max(n - window + 1, 0) for n in lengths])
+    share = np.minimum(np.round(n_windows * np.cumsum(room) / room.sum()), np.cumsum(room))
+    counts = np.minimum(np.diff(share, prepend=0.0).astype(int), room)
+    firsts = [_spread(int(r), int(m), window, rng) for r, m in zip(room, counts, strict=True)]
+    return np.repeat(np.arange(len(lengths)), counts), np.concatenate(firsts)
+
+
+def _spread(room: int, count: int, window: int, rng: np.random.Generator) -> np.ndarray:
+    """First samples: apart with random gaps where the trajectory is long enough, else even."""
+    slack = room - 1 - (count - 1) * window
+    if count and slack >= 0:
+        return np.sort(rng.integers(slack + 1, size=count)) + window * np.arange(count)
+    return np.round(np.linspace(0, room - 1, count)).astype(np.int64)
+
+
+def _cubics(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(segments, 4, columns): a cubic spline in the share of each step that has passed."""
+    if not values.shape[1]:
+        return np.zeros((len(t) - 1, 4, 0))
+    powers = np.diff(t)[:, None, None] ** np.arange(3, -1, -1)[:, None]
+    kind = "not-a-knot" if len(t) > 3 else "natural"
+    return CubicSpline(t, values, bc_type=kind).c.transpose(1, 0, 2) * powers

@@ -1,0 +1,62 @@
+"""The differential form: derivatives at samples regressed on terms at samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.library.library import Library
+from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.splits import RandomSplit, Split
+from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
+
+
+@dataclass(frozen=True)
+class Differential:
+    """Regress the derivative at every sample on the library at that sample.
+
+    smooth_library: evaluate the terms on smoothed samples (the default: with noise in them a
+    wrong support can score best) or on raw ones (the thesis).
+    """
+
+    smoother: Smoother = field(default_factory=SavitzkyGolay)
+    smooth_library: bool = True
+    split: Split = field(default_factory=RandomSplit)
+
+    def assemble(
+        self,
+        trajectories: Sequence[Trajectory],
+        library: Library,
+        *,
+        rng: np.random.Generator,
+    ) -> tuple[Regression, ...]:
+        """Rows of all trajectories below one another; every row uses one trajectory alone.
+
+        All equations share their rows, so there is one regression.
+        Raises ValueError for no trajectory, trajectories with other states, or a variable of
+        the library that a trajectory lacks.
+        """
+        check_agreement(trajectories, library.variables)
+        parts = [self._rows(run, library) for run in trajectories]
+        test = [self.split.held_out(run.n_samples, rng) for run in trajectories]
+        n_rows = sum(run.n_samples for run in trajectories)
+        problem = Regression(
+            theta=np.concatenate([theta for theta, _ in parts]),
+            target=np.concatenate([target for _, target in parts]),
+            library=library,
+            equations=trajectories[0].state_names,
+            groups=np.arange(n_rows),
+            test=np.concatenate(test),
+            trajectories=tuple(trajectories),
+        )
+        return (problem,)
+
+    def _rows(self, run: Trajectory, library: Library) -> tuple[np.ndarray, np.ndarray]:
+        values = run.columns(library.variables)
+        if self.smooth_library:
+            values = self.smoother.smooth(run.t, values)
+        with np.errstate(over="ignore"):  # Regression names a term that is not finite
+            return library.evaluate(values), self.smoother.derivative(run.t, run.states)

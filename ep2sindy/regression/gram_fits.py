@@ -1,0 +1,85 @@
+"""Compiled least squares on supports, from Gram matrices alone.
+
+xx: (terms, terms) is a Gram matrix of columns in comparable units; a mask: (terms,) of bool is a
+support.
+"""
+
+import numpy as np
+from numba import njit
+
+# A column counts as dependent on others when what they leave of its square falls below this.
+DEPENDENT = 1e-11
+
+
+# What is left of a target's square below this share of it is rounding.
+ROUNDING = 1e-15
+
+
+@njit(cache=True)
+def solve(xx, rhs, active, n_active, out):
+    """Solve xx[active][:, active] out = rhs[active] by Cholesky; False if columns depend."""
+    lower = np.empty((n_active, n_active))
+    for i in range(n_active):
+        for j in range(i + 1):
+            total = xx[active[i], active[j]]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i > j:
+                lower[i, j] = total / lower[j, j]
+            elif total <= DEPENDENT * xx[active[i], active[i]]:
+                return False
+            else:
+                lower[i, i] = np.sqrt(total)
+    for i in range(n_active):
+        total = rhs[active[i]]
+        for k in range(i):
+            total -= lower[i, k] * out[k]
+        out[i] = total / lower[i, i]
+    for i in range(n_active - 1, -1, -1):
+        total = out[i]
+        for k in range(i + 1, n_active):
+            total -= lower[k, i] * out[k]
+        out[i] = total / lower[i, i]
+    return True
+
+
+@njit(cache=True)
+def independent_terms(xx):
+    """Mask of a maximal independent set, earlier terms first."""
+    n_terms = len(xx)
+    mask = np.zeros(n_terms, dtype=np.bool_)
+    lower = np.zeros((n_terms, n_terms))
+    rows = np.empty(n_terms, dtype=np.int64)
+    n_kept = 0
+    for j in range(n_terms):
+        rest = xx[j, j]
+        for i in range(n_kept):
+            total = xx[j, rows[i]]
+            for k in range(i):
+                total -= lower[n_kept, k] * lower[i, k]
+            lower[n_kept, i] = total / lower[i, i]
+            rest -= lower[n_kept, i] ** 2
+        if rest > DEPENDENT * xx[j, j]:
+            lower[n_kept, n_kept] = np.sqrt(rest)
+            rows[n_kept] = j
+            n_kept += 1
+            mask[j] = True
+    return mask
+
+
+@njit(cache=True)
+def solve_masks(xx, rhs, masks):
+    """Solve xx coef = rhs on each support; NaN where its columns depend on each other.
+
+    rhs, masks and the returned coef: (masks, terms); coef is zero outside the support.
+    """
+    n_masks, n_terms = masks.shape
+    coef = np.zeros((n_masks, n_terms))
+    solution = np.empty(n_terms)
+    for m in range(n_masks):
+        active = np.flatnonzero(masks[m])
+        if solve(xx, rhs[m], active, len(active), solution):
+            coef[m, active] = solution[: len(active)]
+        else:
+            coef[m] = np.nan
+    return coef

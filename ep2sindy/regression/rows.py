@@ -1,0 +1,178 @@
+"""The regression problem target = theta coef: its rows, their split, and its Gram matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
+
+from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.library.library import Library
+
+ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Grams:
+    """Weighted sums of products of scaled columns: all that least squares needs of the rows.
+
+    One per draw of row weights. xx: (draws, terms, terms), xy: (draws, equations, terms),
+    yy: (draws, equations).
+    """
+
+    xx: Float[np.ndarray, "draws terms terms"]
+    xy: Float[np.ndarray, "draws equations terms"]
+    yy: Float[np.ndarray, "draws equations"]
+
+
+@dataclass(frozen=True, eq=False)
+class NoisyRows:
+    """How the training rows of one equation follow from noisy samples x.
+
+    Targets are slope @ x[state], terms are mean @ library(x); both sparse, (rows, samples).
+    values: (samples, variables), the library's variables and then states that it lacks;
+    smoothed: an estimate of their true values; noise_std: of their independent noise.
+    """
+
+    mean: csr_array
+    slope: csr_array
+    state: int
+    values: Float[np.ndarray, "samples variables"]
+    smoothed: Float[np.ndarray, "samples variables"]
+    noise_std: Float[np.ndarray, "samples variables"]
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Rows of library terms and targets, in SI units, ready for a search.
+
+    theta: (rows, terms). target: (rows, equations).
+    groups: (rows,), rows that share samples share a number, and stay together in a split or a
+    bootstrap. test: (rows,), true for held-out rows.
+    trajectories: what the rows were made from, for judges that integrate. noisy: where the noise
+    of the samples can be followed into the training rows, how; then there is one equation.
+    Raises ValueError for values that are not finite or fewer training rows than terms.
+    """
+
+    theta: Float[np.ndarray, "rows terms"]
+    target: Float[np.ndarray, "rows equations"]
+    library: Library
+    equations: Sequence[str]
+    groups: Int[np.ndarray, " rows"]
+    test: Bool[np.ndarray, " rows"]
+    trajectories: Sequence[Trajectory] = ()
+    noisy: NoisyRows | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", read_only(self.theta))
+        object.__setattr__(self, "target", read_only(self.target))
+        object.__setattr__(self, "equations", tuple(self.equations))
+        rates = [f"d({e})/dt" for e in self.equations]
+        for names, values in ((self.library.names, self.theta), (rates, self.target)):
+            finite = np.isfinite(values)
+            if not finite.all():
+                row, column = np.argwhere(~finite)[0]
+                raise ValueError(
+                    f"every term must be finite on every row: {names[column]!r} is not on row "
+                    f"{row}; lower the degree or rescale the variables"
+                )
+        n_train = int((~self.test).sum())
+        if n_train < len(self.library):
+            raise ValueError(
+                f"a library of {len(self.library)} terms needs at least as many training rows: "
+                f"{n_train} of {len(self.theta)} rows are for training; use a smaller library "
+                "or more data"
+            )
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        return self.library.names
+
+    @cached_property
+    def theta_scale(self) -> Float[np.ndarray, " terms"]:
+        """L2 norm of each column over the training rows; 1 for a column of zeros."""
+        return _column_norms(self.theta[~self.test])
+
+    @cached_property
+    def target_scale(self) -> Float[np.ndarray, " equations"]:
+        return _column_norms(self.target[~self.test])
+
+    @cached_property
+    def train_rows(self) -> Float[np.ndarray, "train columns"]:
+        """Scaled terms, then scaled targets, of the training rows."""
+        return self._scaled(~self.test)
+
+    @cached_property
+    def test_rows(self) -> Float[np.ndarray, "test columns"]:
+        return self._scaled(self.test)
+
+    @cached_property
+    def train_gram(self) -> Grams:
+        return self._grams((self.train_rows.T @ self.train_rows)[None])
+
+    @cached_property
+    def test_gram(self) -> Grams:
+        return self._grams((self.test_rows.T @ self.test_rows)[None])
+
+    def resampled_grams(self, weights: Float[np.ndarray, "draws train"]) -> Grams:
+        """Gram matrices of the training rows, each row counted `weights` times, per draw.
+
+        All draws share the products of pairs of columns, so each draw is one row of a matrix
+        product; blocks of rows keep those products small.
+        """
+        rows = self.train_rows
+        first, second = np.triu_indices(rows.shape[1])
+        sums = np.zeros((len(weights), len(first)))
+        for start in range(0, len(rows), ROW_BLOCK):
+            columns = np.ascontiguousarray(rows[start : start + ROW_BLOCK].T)
+            products = columns[first] * columns[second]
+            sums += weights[:, start : start + ROW_BLOCK] @ products.T
+        whole = np.empty((len(weights), rows.shape[1], rows.shape[1]))
+        whole[:, first, second] = sums
+        whole[:, second, first] = sums
+        return self._grams(whole)
+
+    def _scaled(self, rows: np.ndarray) -> np.ndarray:
+        index, n = np.flatnonzero(rows), len(self.library)
+        # Filled in place: joining narrow arrays side by side takes ten times as long.
+        scaled = np.empty((len(index), n + len(self.equations)))
+        scaled[:, :n], scaled[:, n:] = self.theta[index], self.target[index]
+        scaled /= np.concatenate([self.theta_scale, self.target_scale])
+        return scaled
+
+    def _grams(self, products: np.ndarray) -> Grams:
+        n = len(self.library)
+        return Grams(
+            xx=products[:, :n, :n],
+            xy=products[:, n:, :n],
+            yy=products.diagonal(axis1=1, axis2=2)[:, n:],
+        )
+
+
+def _column_norms(values: np.ndarray) -> np.ndarray:
+    """L2 norms without overflow at densities to high powers."""
+    columns = np.abs(values.T, order="C")  # each in one stretch of memory
+    largest = columns.max(axis=1)
+    largest[largest == 0.0] = 1.0
+    columns /= largest[:, None]
+    norms = largest * np.sqrt(np.einsum("cr,cr->c", columns, columns))
+    norms[norms == 0.0] = 1.0
+    return norms
+
+
+@runtime_checkable
+class Formulation(Protocol):
+    """Turns trajectories into regressions: one, or one per equation where rows differ."""
+
+    def assemble(
+        self,
+        trajectories: Sequence[Trajectory],
+        library: Library,
+        *,
+        rng: np.random.Generator,
+    ) -> tuple[Regression, ...]: ...

@@ -1,0 +1,48 @@
+"""Splits: which groups of rows are held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool
+
+
+@runtime_checkable
+class Split(Protocol):
+    """Chooses the held-out groups of one trajectory; groups are numbered along time."""
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]: ...
+
+
+@dataclass(frozen=True)
+class RandomSplit:
+    """Hold out a random share of the groups of each trajectory, as in the thesis."""
+
+    test_fraction: float = 0.25
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+        _check_fraction(self.test_fraction)
+        chosen = rng.permutation(n_groups)[: round(self.test_fraction * n_groups)]
+        return np.isin(np.arange(n_groups), chosen)
+
+
+@dataclass(frozen=True)
+class BlockSplit:
+    """Hold out contiguous blocks of each trajectory: neighbours of a time series are alike, so
+    random rows would let the model see the answers."""
+
+    test_fraction: float = 0.25
+    n_blocks: int = 20
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+        _check_fraction(self.test_fraction)
+        n_blocks = min(self.n_blocks, n_groups)
+        chosen = rng.permutation(n_blocks)[: round(self.test_fraction * n_blocks)]
+        return np.isin(np.arange(n_groups) * n_blocks // max(n_groups, 1), chosen)
+
+
+def _check_fraction(fraction: float) -> None:
+    if not 0.0 <= fraction < 1.0:
+        raise ValueError(f"test_fraction must lie in [0, 1): {fraction} came")

@@ -1,0 +1,216 @@
+"""Windows over samples, and the weights that integrate a signal against test functions in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+
+from ep2sindy.signals.spectrum import is_uniform
+
+# A bump is this large, relative to its centre, at the first sample inside its edge.
+EDGE = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Test functions phi on stretches of one trajectory, ordered by their first sample.
+
+    mean: (windows, samples), sparse; mean @ values is the integral of phi * values over that of
+    phi. slope: the same for a derivative, by parts: slope @ x is the integral of phi * x',
+    without differencing x, over that of phi.
+    """
+
+    mean: csr_array
+    slope: csr_array
+
+    @property
+    def first(self) -> Int[np.ndarray, " windows"]:
+        return self.mean.indices[self.mean.indptr[:-1]]
+
+    @property
+    def last(self) -> Int[np.ndarray, " windows"]:
+        return self.mean.indices[self.mean.indptr[1:] - 1]
+
+
+@runtime_checkable
+class WindowFunctions(Protocol):
+    """What the alternatives share: windows for one sampled signal."""
+
+    def windows(
+        self,
+        t: Float[np.ndarray, " samples"],
+        x: Float[np.ndarray, " samples"],
+        *,
+        rng: np.random.Generator,
+    ) -> Windows: ...
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The thesis's test functions: 1 over `n_windows` random windows of `n_points` samples.
+
+    Integrals by the trapezoidal rule; what is left of the derivative is x at the ends. Two
+    points give the difference quotient and the mean of two samples: the differential form.
+    Steps may be unequal.
+    Source: the thesis, Eqs. 10 and 11.
+    """
+
+    n_windows: int = 3000
+    n_points: int = 100
+
+    def __post_init__(self) -> None:
+        if self.n_windows < 1 or self.n_points < 2:
+            raise ValueError(
+                "windows must number one or more, of two samples or more: "
+                f"n_windows={self.n_windows}, n_points={self.n_points} came"
+            )
+
+    def windows(
+        self,
+        t: Float[np.ndarray, " samples"],
+        x: Float[np.ndarray, " samples"],
+        *,
+        rng: np.random.Generator,
+    ) -> Windows:
+        """Raises ValueError for windows longer than the trajectory."""
+        _check_width(self.n_points, len(t), "n_points")
+        first = np.sort(rng.integers(len(t) - self.n_points + 1, size=self.n_windows))
+        last = first + self.n_points - 1
+        half_steps = 0.5 * np.diff(t)
+        weights = np.append(half_steps, 0.0) + np.insert(half_steps, 0, 0.0)
+        inside = first[:, None] + np.arange(self.n_points)
+        mean = weights[inside]
+        mean[:, 0] = half_steps[first]
+        mean[:, -1] = half_steps[last - 1]
+        length_s = (t[last] - t[first])[:, None]
+        ends = np.stack([first, last], axis=1)
+        difference = np.tile([-1.0, 1.0], (self.n_windows, 1)) / length_s
+        return Windows(_rows(inside, mean / length_s, len(t)), _rows(ends, difference, len(t)))
+
+
+@dataclass(frozen=True)
+class Bumps:
+    """Smooth test functions phi = (1 - s^2)^p on windows that overlap, s from -1 to 1.
+
+    half_width_s: half the length of a window, in s, or None to take it from the spectrum of
+    each state: the change point between signal and noise lies `tau_hat` standard deviations into
+    the tail of the bump's own spectrum (see `spectral_half_width`). The source takes 2; narrower
+    bumps keep more of the fast parts, and let in noise that smooth states and the covariance
+    of the rows can bear.
+    overlap: windows follow one another at half_width / overlap. The power p makes phi fall to
+    1e-10 at the edge, so that the trapezoidal rule is as good as exact.
+    Source: Messenger & Bortz 2021, doi:10.1137/20M1343166.
+    """
+
+    half_width_s: float | None = None
+    tau_hat: float = 0.7
+    overlap: int = 4
+
+    def __post_init__(self) -> None:
+        if self.half_width_s is not None and not self.half_width_s > 0.0:
+            raise ValueError(
+                f"half_width_s must be positive: {self.half_width_s} came; leave it out to "
+                "have it chosen from the spectrum"
+            )
+        if not self.tau_hat > 0.0 or self.overlap < 1:
+            raise ValueError(
+                "tau_hat must be positive and overlap at least 1: "
+                f"tau_hat={self.tau_hat}, overlap={self.overlap} came"
+            )
+
+    def windows(
+        self,
+        t: Float[np.ndarray, " samples"],
+        x: Float[np.ndarray, " samples"],
+        *,
+        rng: np.random.Generator,
+    ) -> Windows:
+        """Raises ValueError for unequal steps, or windows that do not fit the trajectory."""
+        if not is_uniform(t):
+            steps = np.diff(t)
+            raise ValueError(
+                f"smooth test functions need equal time steps: {steps.min():.4g} s to "
+                f"{steps.max():.4g} s came; interpolate onto equal steps first, or use Boxes"
+            )
+        dt_s = (t[-1] - t[0]) / (len(t) - 1)
+        half_width = self._half_width(x, dt_s)
+        _check_width(2 * half_width + 1, len(t), "half_width_s")
+        power = bump_power(half_width)
+        s = np.arange(-half_width, half_width + 1) / half_width
+        phi = (1.0 - s**2) ** power
+        fall = s * (1.0 - s**2) ** (power - 1.0)
+        # Scaled so that a straight line has its own slope however few samples a bump spans.
+        fall /= fall @ s * half_width * dt_s
+        first = np.arange(0, len(t) - 2 * half_width, max(1, half_width // self.overlap))
+        inside = first[:, None] + np.arange(2 * half_width + 1)
+        return Windows(
+            mean=_rows(inside, np.broadcast_to(phi / phi.sum(), inside.shape), len(t)),
+            slope=_rows(inside, np.broadcast_to(fall, inside.shape), len(t)),
+        )
+
+    def _half_width(self, x: np.ndarray, dt_s: float) -> int:
+        if self.half_width_s is None:
+            return spectral_half_width(x, tau_hat=self.tau_hat)
+        half_width = round(self.half_width_s / dt_s)
+        if half_width < 2:
+            raise ValueError(
+                f"half_width_s must span two steps or more: {self.half_width_s:g} s came with "
+                f"steps of {dt_s:g} s"
+            )
+        return half_width
+
+
+def bump_power(half_width: Any) -> Any:
+    """Power p that makes (1 - s^2)^p fall to EDGE one sample inside the edge; two or more."""
+    edge = 1.0 - (1.0 - 1.0 / np.asarray(half_width)) ** 2
+    return np.maximum(2.0, np.ceil(np.log(EDGE) / np.log(edge)))
+
+
+def spectral_half_width(x: Float[np.ndarray, " samples"], *, tau_hat: float) -> int:
+    """Half-width in samples of the narrowest bump whose spectrum stays below the signal's end.
+
+    The spectrum of (1 - s^2)^p is close to a Gaussian of standard deviation
+    n sqrt(2p + 3) / (2 pi half_width) bins, `tau_hat` of which must lie below the change point.
+    """
+    n = len(x)
+    widths = np.arange(2, max(3, (n - 1) // 4))
+    deviation = n * np.sqrt(2.0 * bump_power(widths) + 3.0) / (2.0 * np.pi * widths)
+    fits = tau_hat * deviation <= spectral_change_point(x)
+    return int(widths[np.argmax(fits)] if fits.any() else widths[-1])
+
+
+def spectral_change_point(x: Float[np.ndarray, " samples"]) -> int:
+    """Frequency bin where the cumulated amplitude spectrum bends most: signal, then noise.
+
+    The bend is where two chords, from the first and to the last bin, leave the least squares.
+    """
+    total = np.cumsum(np.abs(np.fft.rfft(x - x.mean())))
+    bins = np.arange(len(total))
+    if len(bins) < 3:
+        return 1
+    # Two hundred corners, closer together where the bins are few, tell the bend well enough.
+    corners = np.unique(np.geomspace(1, len(bins) - 2, 200).astype(int))
+    misfit = [
+        np.square(total - np.interp(bins, [0, c, bins[-1]], total[[0, c, -1]])).sum()
+        for c in corners
+    ]
+    return int(corners[np.argmin(misfit)])
+
+
+def _check_width(n_points: int, n_samples: int, name: str) -> None:
+    if n_points > n_samples:
+        raise ValueError(
+            f"a window must fit the trajectory: {n_points} samples were asked of {n_samples}; "
+            f"lower {name} or use more data"
+        )
+
+
+def _rows(columns: np.ndarray, weights: np.ndarray, n_samples: int) -> csr_array:
+    """One sparse row per window: `weights` (windows, width) at the samples `columns`."""
+    n_windows, width = columns.shape
+    starts = np.arange(0, n_windows * width + 1, width)
+    return csr_array((weights.ravel(), columns.ravel(), starts), shape=(n_windows, n_samples))

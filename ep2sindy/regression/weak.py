@@ -1,0 +1,181 @@
+"""The weak form: regress integrals against test functions, so that no noise is differentiated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import block_diag, csr_array
+
+from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.library.library import Library
+from ep2sindy.regression.rows import NoisyRows, Regression
+from ep2sindy.regression.splits import RandomSplit, Split
+from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, Windows
+from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
+from ep2sindy.signals.smoothers import Smoother
+
+MAX_SEGMENTS = 20  # pieces of a trajectory that are held out or resampled as one
+
+
+@dataclass(frozen=True)
+class Weak:
+    """Regress mean derivatives over windows on mean library terms over the same windows.
+
+    test_functions: `Bumps`, of a width of its own for every state, or `Boxes`, the thesis's.
+    smooth_library: evaluate the terms on smoothed samples (the default) or on raw ones. The
+    left-hand side always comes from the raw samples.
+    split: holds out segments of time, each two windows long or longer, if there is room; a
+    window that reaches into both kinds is dropped, so that no training row shares a sample with
+    a held-out one.
+    errors_in_variables: carry the noise of the samples to the rows, so that criteria and the
+    last fit can weight them by their covariance (see the module of that name). For Bumps only:
+    Boxes may be more than there are samples, and then depend on each other.
+    """
+
+    test_functions: WindowFunctions = field(default_factory=Bumps)
+    smoother: Smoother = field(default_factory=KalmanSmoother)
+    smooth_library: bool = True
+    split: Split = field(default_factory=RandomSplit)
+    errors_in_variables: bool = True
+
+    def __post_init__(self) -> None:
+        if self.errors_in_variables and isinstance(self.test_functions, Boxes):
+            raise ValueError(
+                "errors_in_variables needs smooth test functions: Boxes came; use Bumps, or set "
+                "errors_in_variables to false"
+            )
+
+    def assemble(
+        self,
+        trajectories: Sequence[Trajectory],
+        library: Library,
+        *,
+        rng: np.random.Generator,
+    ) -> tuple[Regression, ...]:
+        """One regression per state, since every state has windows of its own.
+
+        Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
+        """
+        check_agreement(trajectories, library.variables)
+        runs = [self._sampled(run, library, rng) for run in trajectories]
+        return tuple(self._problem(state, runs, library) for state in range(len(runs[0].windows)))
+
+    def _sampled(self, run: Trajectory, library: Library, rng: np.random.Generator) -> _Sampled:
+        windows = [self.test_functions.windows(run.t, x, rng=rng) for x in run.states.T]
+        longest = max(int((w.last - w.first).max()) + 1 for w in windows)
+        n_segments = int(np.clip(run.n_samples // (2 * longest), 1, MAX_SEGMENTS))
+        segment = np.arange(run.n_samples) * n_segments // run.n_samples
+        names = tuple(dict.fromkeys([*library.variables, *run.state_names]))
+        at_hand, estimate = self._smoothed(run.t, run.columns(names))
+        with np.errstate(over="ignore"):  # Regression names a term that is not finite
+            terms = library.evaluate(at_hand[:, : len(library.variables)])
+        return _Sampled(
+            run=run,
+            names=names,
+            terms=terms,
+            estimate=estimate,
+            windows=windows,
+            segment=segment,
+            held_out=self.split.held_out(n_segments, rng)[segment],
+        )
+
+    def _smoothed(
+        self, t: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, KalmanEstimate | None]:
+        """Samples for the library, and what the Kalman smoother says of them, where asked."""
+        kalman = self.smoother if isinstance(self.smoother, KalmanSmoother) else None
+        if kalman is None and self.errors_in_variables:
+            kalman = KalmanSmoother()
+        estimate = None if kalman is None else kalman.estimate(t, values)
+        if not self.smooth_library:
+            return values, estimate
+        if estimate is not None and kalman is self.smoother:
+            return estimate.smoothed, estimate
+        return self.smoother.smooth(t, values), estimate
+
+    def _problem(self, state: int, runs: Sequence[_Sampled], library: Library) -> Regression:
+        name = runs[0].run.state_names[state]
+        parts = [run.rows(state) for run in runs]
+        test = np.concatenate([part.test for part in parts])
+        mean, slope = _stacked(p.mean for p in parts), _stacked(p.slope for p in parts)
+        n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
+        return Regression(
+            theta=mean @ np.concatenate([run.terms for run in runs]),
+            target=(slope @ np.concatenate([run.run.states[:, state] for run in runs]))[:, None],
+            library=library,
+            equations=(name,),
+            groups=np.concatenate(
+                [part.segment + n for part, n in zip(parts, n_segments[:-1], strict=True)]
+            ),
+            test=test,
+            trajectories=tuple(run.run for run in runs),
+            noisy=_noisy_rows(name, runs, mean[~test], slope[~test])
+            if self.errors_in_variables
+            else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """One trajectory on its way to rows: its terms, its windows per state, its segments.
+
+    names: the library's variables, then states that it lacks.
+    segment, held_out: (samples,), which piece of the time a sample is in, and if that is held out.
+    """
+
+    run: Trajectory
+    names: tuple[str, ...]
+    terms: Float[np.ndarray, "samples terms"]
+    estimate: KalmanEstimate | None
+    windows: Sequence[Windows]
+    segment: Int[np.ndarray, " samples"]
+    held_out: Bool[np.ndarray, " samples"]
+
+    def rows(self, state: int) -> _Rows:
+        """The windows that lie in one kind of segment, and which kind."""
+        windows = self.windows[state]
+        first, last = windows.first, windows.last
+        n_held_out = np.append(0, np.cumsum(self.held_out))
+        share = (n_held_out[last + 1] - n_held_out[first]) / (last + 1 - first)
+        pure = np.flatnonzero((share == 0.0) | (share == 1.0))
+        return _Rows(
+            mean=windows.mean[pure],
+            slope=windows.slope[pure],
+            segment=self.segment[(first + last) // 2][pure],
+            test=share[pure] == 1.0,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of one state on one trajectory; segment: (rows,), where a window has its middle."""
+
+    mean: csr_array
+    slope: csr_array
+    segment: Int[np.ndarray, " rows"]
+    test: Bool[np.ndarray, " rows"]
+
+
+def _stacked(blocks: Iterable[csr_array]) -> csr_array:
+    """Windows of all trajectories, over the samples of all trajectories."""
+    return block_diag(list(blocks), format="csr")
+
+
+def _noisy_rows(
+    name: str, runs: Sequence[_Sampled], mean: csr_array, slope: csr_array
+) -> NoisyRows:
+    names = runs[0].names
+    estimates = [run.estimate for run in runs if run.estimate is not None]
+    return NoisyRows(
+        mean=mean,
+        slope=slope,
+        state=names.index(name),
+        values=np.concatenate([run.run.columns(names) for run in runs]),
+        smoothed=np.concatenate([estimate.smoothed for estimate in estimates]),
+        noise_std=np.concatenate(
+            [np.broadcast_to(e.noise_std, e.smoothed.shape) for e in estimates]
+        ),
+    )

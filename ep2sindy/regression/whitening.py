@@ -1,0 +1,162 @@
+"""Rows weighed by the covariance that the noise of the samples gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import cholesky_banded
+from scipy.linalg.lapack import dtbtrs
+from scipy.sparse import csr_array
+
+from ep2sindy.regression.rows import NoisyRows, Regression
+
+# No sample is moved by more standard deviations of its noise: a wrong model would never end.
+LARGEST_CORRECTION = 4.0
+
+
+# Added to the variance of every row: a share of the mean variance, since rows of overlapping
+# windows are nearly dependent, and the square of what rounding leaves of the target.
+RIDGE = 1e-8
+
+
+ROUNDING = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedRows:
+    """Training rows of one equation, linearised about corrected samples, of unit variance.
+
+    theta: (rows, terms) and target: (rows,), combined so that target - theta coef is white
+    with variance 1 for the true coefficients. Columns and target are scaled by the regression's
+    theta_scale and target_scale. corrected: (samples, variables), the samples less the noise
+    that the residuals reveal.
+    """
+
+    theta: Float[np.ndarray, "rows terms"]
+    target: Float[np.ndarray, " rows"]
+    corrected: Float[np.ndarray, "samples variables"]
+
+
+def whitened_rows(
+    problem: Regression,
+    terms: Bool[np.ndarray, " terms"],
+    coef: Float[np.ndarray, " terms"],
+    *,
+    n_steps: int = 2,
+) -> WhitenedRows:
+    """Weigh the rows of one equation by their covariance under the model that `terms` spans.
+
+    The residuals depend on the noise of the samples through target and terms alike; to first
+    order they are M e, with covariance M Sigma M^T. Each step is one of Gauss-Newton for the
+    coefficients and samples that are most likely together: fit the coefficients with weights,
+    move the samples by the most likely noise, linearise again. Without the move, the noise in
+    the terms would bias the coefficients.
+    coef: (terms,), a first guess in scaled columns.
+    Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance;
+    Britt & Luecke 1973, Technometrics 15, 233, for the steps.
+    """
+    assert problem.noisy is not None
+    x = problem.noisy.smoothed
+    for _ in range(n_steps):
+        rows = _Linearised.at(problem, x, coef)
+        coef = rows.fitted(terms)
+        x = rows.corrected(coef)
+    rows = _Linearised.at(problem, x, coef)
+    return WhitenedRows(
+        theta=rows.theta, target=rows.target - (rows.drifted - rows.theta) @ coef, corrected=x
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Whitened rows about some samples x and coefficients, and the way back to the samples.
+
+    drifted: the terms at x plus their change from x to the raw samples, to first order.
+    noise: one sparse (rows, samples) per variable, from its unit noise to the residuals.
+    """
+
+    theta: Float[np.ndarray, "rows terms"]
+    drifted: Float[np.ndarray, "rows terms"]
+    target: Float[np.ndarray, " rows"]
+    noise: list[csr_array]
+    factor: Float[np.ndarray, "band rows"]
+    source: NoisyRows
+
+    @staticmethod
+    def at(
+        problem: Regression,
+        x: Float[np.ndarray, "samples variables"],
+        coef: Float[np.ndarray, " terms"],
+    ) -> _Linearised:
+        rows, library = problem.noisy, problem.library
+        assert rows is not None
+        n_variables = len(library.variables)
+        known = x[:, :n_variables]
+        slopes = library.jacobian(known) / problem.theta_scale
+        change = np.einsum("vst,sv->st", slopes, rows.values[:, :n_variables] - known)
+        terms = library.evaluate(known) / problem.theta_scale
+        slope = rows.slope / problem.target_scale[0]
+        noise = []
+        for v, std in enumerate(rows.noise_std.T):
+            sensitivity = slopes[v] @ coef if v < n_variables else np.zeros(len(x))
+            residual = _times(rows.mean, sensitivity)
+            if v == rows.state:
+                residual = residual - slope
+            noise.append(_times(residual, std))
+        factor = _banded_cholesky(sum(m @ m.T for m in noise))
+        theta = rows.mean @ terms
+        columns = np.column_stack(
+            [theta, theta + rows.mean @ change, slope @ rows.values[:, rows.state]]
+        )
+        white = _solve(factor, columns)
+        n = len(library)
+        return _Linearised(white[:, :n], white[:, n:-1], white[:, -1], noise, factor, rows)
+
+    def fitted(self, terms: Bool[np.ndarray, " terms"]) -> Float[np.ndarray, " terms"]:
+        """Coefficients of the chosen terms; the rows at x are instruments for the noisy ones."""
+        coef = np.zeros(len(terms))
+        theta, drifted = self.theta[:, terms], self.drifted[:, terms]
+        scale = np.linalg.norm(theta, axis=0)
+        scale[scale == 0.0] = 1.0
+        instruments = theta / scale
+        coef[terms] = (
+            np.linalg.lstsq(instruments.T @ (drifted / scale), instruments.T @ self.target)[0]
+            / scale
+        )
+        return coef
+
+    def corrected(
+        self, coef: Float[np.ndarray, " terms"]
+    ) -> Float[np.ndarray, "samples variables"]:
+        """The samples less their most likely noise."""
+        weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
+        noise = np.stack([m.T @ weighted for m in self.noise], axis=1)
+        limited = np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION)
+        return self.source.values - limited * self.source.noise_std
+
+
+def _times(matrix: csr_array, columns: np.ndarray) -> csr_array:
+    """Multiply every column of a sparse matrix by a number."""
+    data = matrix.data * columns[matrix.indices]
+    return csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+
+
+def _banded_cholesky(covariance: csr_array) -> np.ndarray:
+    """Lower factor of a banded matrix: windows are ordered, and distant ones do not meet."""
+    entries = covariance.tocoo()
+    row, column = entries.coords
+    below = row >= column
+    band = np.zeros((int((row - column).max(initial=0)) + 1, covariance.shape[0]))
+    band[(row - column)[below], column[below]] = entries.data[below]
+    band[0] += RIDGE * band[0].mean() + ROUNDING**2 / len(band[0])
+    return cholesky_banded(band, lower=True)
+
+
+def _solve(factor: np.ndarray, values: np.ndarray, *, transposed: bool = False) -> np.ndarray:
+    """L^-1 values, or L^-T values, for the banded factor L."""
+    columns = values.reshape(len(values), -1)
+    solution, info = dtbtrs(factor, columns, uplo="L", trans="T" if transposed else "N")
+    assert info == 0
+    return solution.reshape(values.shape)

@@ -1,0 +1,1 @@
+"""The report: a run folder, a screen, a page, TensorBoard, and where it all came from."""

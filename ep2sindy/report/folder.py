@@ -1,0 +1,96 @@
+"""A run's folder: everything a figure needs to be redrawn, and one page to read.
+
+config.yaml  provenance.json  run.log  summary.json  report.html
+models/*.json  tables/*.csv  figures/*.png, *.pdf  tensorboard/
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from ep2sindy.machine.files import replacing, write_text
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.provenance import commit, versions
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Writes a run's results, each file whole or not at all."""
+
+    path: Path
+
+    @staticmethod
+    def create(root: Path, experiment: str, *, now: datetime) -> RunFolder:
+        """Make `root/experiment/<date>_<time>`, with a suffix if another run took that name.
+
+        Raises OSError, with the way out, where no folder can be written.
+        """
+        parent = root / experiment
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            stamp = f"{now:%Y-%m-%d_%H%M%S}"
+            for name in [stamp, *(f"{stamp}_{k}" for k in range(2, 1000))]:
+                try:
+                    (parent / name).mkdir()
+                except FileExistsError:
+                    continue
+                return RunFolder(parent / name)
+        except OSError as error:
+            raise OSError(
+                f"a run needs a folder it can write to: {parent} failed with {error.strerror!r}; "
+                "choose another with output=PATH"
+            ) from error
+        raise OSError(f"1000 runs started in one second in {parent}; wait and start again")
+
+    def write_text(self, name: str, text: str) -> None:
+        write_text(self.path / name, text)
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """NaN becomes null: JSON has no word for it."""
+        text = json.dumps(_without_nan(content), indent=2, allow_nan=False)
+        self.write_text(name, text + "\n")
+
+    def write_model(self, name: str, model: SparseModel) -> None:
+        model.save(self.path / "models" / f"{name}.json")
+
+    def write_table(self, name: str, table: pd.DataFrame) -> None:
+        self.write_text(f"tables/{name}.csv", table.to_csv(index=False))
+
+    def write_figures(self, figures: Mapping[str, Figure]) -> None:
+        for name, figure in figures.items():
+            for suffix in ("png", "pdf"):
+                # Without a date the same run gives the same file.
+                dated = {"CreationDate": None} if suffix == "pdf" else {}
+                with replacing(self.path / "figures" / f"{name}.{suffix}") as temporary:
+                    figure.savefig(temporary, dpi=150, metadata=dated)
+
+    def write_provenance(self, *, seed: int, command: Sequence[str]) -> None:
+        self.write_json(
+            "provenance.json",
+            {
+                "commit": commit(Path(__file__).parent),
+                "seed": seed,
+                "command": list(command),
+                "versions": {"python": platform.python_version(), **versions()},
+            },
+        )
+
+
+def _without_nan(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {key: _without_nan(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_without_nan(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content

@@ -1,0 +1,208 @@
+"""Bootstraps: a search repeated on resampled rows, its supports pooled and their terms counted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.gram_fits import solve_masks
+from ep2sindy.regression.resampling import moving_block_counts
+from ep2sindy.regression.rows import Grams, Regression
+from ep2sindy.search.searches import Search
+
+
+@dataclass(frozen=True)
+class Bootstraps:
+    """Resampled rows and a reduced library, over and over, so that no support hangs on a few.
+
+    Each of the `n` draws takes, with replacement, a random share of the training groups
+    between `smallest` and `largest`, and leaves out `n_culled` random terms.
+    block: training groups drawn together, side by side; 1 draws them one by one, as the thesis
+    does, and then says too little of a time series, whose neighbours are alike. Above 1 for one
+    trajectory only. A draw of fewer rows than there are varies more than the whole record would.
+    n = 0: one search on all training rows and terms. Source: the thesis, II-C and II-H.
+    """
+
+    n: int = 32
+    n_culled: int = 1
+    smallest: float = 0.2
+    largest: float = 0.8
+    block: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("n", "n_culled"):
+            count = getattr(self, name)
+            if not isinstance(count, int) or count < 0:
+                raise ValueError(f"{name} must be a whole number, zero or more: {count!r} came")
+        if not 0.0 < self.smallest <= self.largest:
+            raise ValueError(
+                "shares must satisfy 0 < smallest <= largest: "
+                f"smallest={self.smallest}, largest={self.largest} came"
+            )
+        if not isinstance(self.block, int) or self.block < 1:
+            raise ValueError(f"block must be a whole number, one or more: {self.block!r} came")
+
+    def draw(
+        self, problem: Regression, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
+    ) -> tuple[Grams, Bool[np.ndarray, "draws terms"]]:
+        """Gram matrices and kept terms of every bootstrap, out of the terms that may be used."""
+        if self.n == 0:
+            return problem.train_gram, terms[None]
+        usable = np.flatnonzero(terms)
+        if self.n_culled >= len(usable):
+            raise ValueError(
+                f"n_culled must leave a term: {self.n_culled} of {len(usable)} would go; lower it "
+                "or use a larger library"
+            )
+        if self.block > 1 and len(problem.trajectories) > 1:
+            raise ValueError(
+                f"blocks of {self.block} would cross from one trajectory to the next: "
+                f"{len(problem.trajectories)} trajectories came; use block=1"
+            )
+        _, group = np.unique(problem.groups[~problem.test], return_inverse=True)
+        n_groups = int(group.max()) + 1
+        counts = np.empty((self.n, n_groups))
+        kept = np.repeat(terms[None], self.n, axis=0)
+        for k in range(self.n):
+            size = max(1, round(rng.uniform(self.smallest, self.largest) * n_groups))
+            counts[k] = moving_block_counts(n_groups, n_drawn=size, block=self.block, rng=rng)
+            kept[k, rng.permutation(usable)[: self.n_culled]] = False
+        if n_groups < len(group):
+            counts = counts[:, group]
+        return problem.resampled_grams(counts), kept
+
+
+@dataclass(frozen=True, eq=False)
+class Supports:
+    """What the bootstraps found for one equation, pooled.
+
+    masks: (supports, terms), each once. share: (supports,), share of bootstraps that found it.
+    inclusion: (terms + 1, terms), row k: of the bootstraps that had a term at hand, the share
+    in which it stood in a support of k terms. Without bootstraps both are NaN.
+    """
+
+    equation: str
+    masks: Bool[np.ndarray, "supports terms"]
+    share: Float[np.ndarray, " supports"]
+    inclusion: Float[np.ndarray, "sizes terms"]
+
+
+@dataclass(frozen=True, eq=False)
+class Resamples:
+    """Bootstraps of one problem, columns scaled to unit norm in every draw.
+
+    xx: (draws, terms, terms), xy: (draws, equations, terms), yy: (draws, equations); a term that
+    a draw lacks is a column of zeros. at_hand: (draws, terms). scale: from the problem's scaled
+    columns to these. counted: False for the one search on all rows.
+    """
+
+    equations: Sequence[str]
+    xx: Float[np.ndarray, "draws terms terms"]
+    xy: Float[np.ndarray, "draws equations terms"]
+    yy: Float[np.ndarray, "draws equations"]
+    at_hand: Bool[np.ndarray, "draws terms"]
+    scale: Float[np.ndarray, "draws terms"]
+    kept: Bool[np.ndarray, "draws terms"]
+    counted: bool
+
+    def searched(self, search: Search, equation: int) -> list[Bool[np.ndarray, "_ terms"]]:
+        """What a search proposes in every draw."""
+        draws = zip(self.xx, self.xy[:, equation], self.yy[:, equation].tolist(), strict=True)
+        return [search.supports(*draw) for draw in draws]
+
+    def fits(
+        self,
+        equation: int,
+        found: Sequence[Bool[np.ndarray, "_ terms"]],
+        support: Bool[np.ndarray, " terms"],
+    ) -> Float[np.ndarray, "draws terms"]:
+        """Each draw's own best support of this support's size, fitted to the draw.
+
+        found: as `searched` gives it; where a draw has none of that size, the support itself
+        serves, as far as its terms are at hand. In units of the problem's scaled columns.
+        """
+        coef = np.empty(self.at_hand.shape)
+        for k, masks in enumerate(found):
+            same_size = masks[masks.sum(axis=1) == support.sum()]
+            if not len(same_size):
+                same_size = (support & self.at_hand[k])[None]
+            xx, xy = self.xx[k], self.xy[k, equation]
+            fits = solve_masks(xx, np.where(same_size, xy, 0.0), same_size)
+            explained = (fits * (2.0 * xy - fits @ xx)).sum(axis=1)
+            coef[k] = fits[int(np.argmax(explained))] * self.scale[k]
+        return coef
+
+
+def resamples(
+    problem: Regression, bootstraps: Bootstraps, *, rng: np.random.Generator
+) -> Resamples:
+    """Draw bootstraps of the training rows, once for all equations.
+
+    Terms that are zero, or repeat an earlier term, are left out (see `ambiguities`).
+    """
+    grams, kept = bootstraps.draw(problem, usable_terms(problem), rng)
+    # A resample changes the norms: unit columns again, so that no unit or draw leaks in; a
+    # culled term becomes a column of zeros.
+    diagonal = np.diagonal(grams.xx, axis1=1, axis2=2)
+    at_hand = kept & (diagonal > 0.0)
+    scale = at_hand / np.sqrt(np.where(at_hand, diagonal, 1.0))
+    return Resamples(
+        equations=problem.equations,
+        xx=grams.xx * scale[:, :, None] * scale[:, None, :],
+        xy=grams.xy * scale[:, None, :],
+        yy=grams.yy,
+        at_hand=at_hand,
+        scale=scale,
+        kept=kept,
+        counted=bootstraps.n > 0,
+    )
+
+
+def pooled_supports(
+    problem: Regression,
+    search: Search,
+    bootstraps: Bootstraps,
+    *,
+    rng: np.random.Generator,
+) -> tuple[Supports, ...]:
+    """Search every bootstrap of the training rows; one `Supports` per equation."""
+    draws = resamples(problem, bootstraps, rng=rng)
+    return tuple(pooled(draws, k, draws.searched(search, k)) for k in range(len(draws.equations)))
+
+
+def pooled(
+    draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]
+) -> Supports:
+    """Count supports and terms over the draws, as `searched` found them."""
+    n_terms = draws.kept.shape[1]
+    source = np.repeat(np.arange(len(found)), [len(masks) for masks in found])
+    masks = np.concatenate(found)
+    sizes = masks.sum(axis=1)
+    included = np.zeros((len(found), n_terms + 1, n_terms), dtype=np.bool_)
+    rows, columns = np.nonzero(masks)
+    included[source[rows], sizes[rows], columns] = True
+    # One byte string per mask: sorting those is much faster than sorting rows.
+    packed = np.packbits(masks, axis=1)
+    keys = packed.view(f"S{packed.shape[1]}")[:, 0]
+    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
+    found_in = np.zeros((len(first), len(found)), dtype=np.bool_)
+    found_in[which, source] = True
+    order = np.argsort(sizes[first], kind="stable")
+    supports = Supports(
+        equation=draws.equations[equation],
+        masks=masks[first[order]],
+        share=found_in.mean(axis=1)[order],
+        inclusion=included.sum(axis=0) / np.maximum(draws.kept.sum(axis=0), 1),
+    )
+    if draws.counted:
+        return supports
+    # One search on all rows says nothing of how often another would agree.
+    return replace(
+        supports,
+        share=np.full_like(supports.share, np.nan),
+        inclusion=np.full_like(supports.inclusion, np.nan),
+    )

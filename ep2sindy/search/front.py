@@ -1,0 +1,213 @@
+"""The Pareto front of error against number of terms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ep2sindy.model.scores import r2
+from ep2sindy.regression.gram_fits import solve_masks
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.bootstraps import Supports
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One support of one equation, with its least-squares fit to the training rows.
+
+    coef: (terms of the support,), in SI. r2_train, r2_test: 1 - SS_res/SS_tot with the data as
+    truth. share: share of bootstraps that found this support. inclusion: for each of its
+    terms, the share of bootstraps in which the term stood in a support of this size.
+    covariance: (support, support) of coef, in SI, where noise has been followed to it.
+    """
+
+    equation: str
+    terms: tuple[str, ...]
+    coef: Float[np.ndarray, " support"]
+    r2_train: float
+    r2_test: float
+    share: float
+    inclusion: Float[np.ndarray, " support"]
+    covariance: Float[np.ndarray, "support support"] | None = None
+
+    @property
+    def n_terms(self) -> int:
+        return len(self.terms)
+
+    @property
+    def coef_by_term(self) -> dict[str, float]:
+        return dict(zip(self.terms, self.coef.tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class ParetoFront:
+    """The best candidates of every size, the empty model first.
+
+    From `pareto_front` they are sorted by size, and within a size by error: the first of each
+    size is the front proper, whose error falls, any others are runners-up. A joint search ranks
+    by all of its points: at one of them errors may rise. problem: the rows they were fitted to.
+    """
+
+    equation: str
+    candidates: Sequence[Candidate]
+    problem: Regression = field(repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "candidates", tuple(self.candidates))
+        assert self.candidates
+        assert self.candidates[0].n_terms == 0
+
+    @property
+    def errors(self) -> Float[np.ndarray, " candidates"]:
+        """1 - R2 on held-out rows, or on the training rows where none are held out."""
+        return np.array([1.0 - _score(c) for c in self.candidates])
+
+    @property
+    def sizes(self) -> Float[np.ndarray, " candidates"]:
+        return np.array([float(c.n_terms) for c in self.candidates])
+
+    @property
+    def leading(self) -> Bool[np.ndarray, " candidates"]:
+        """Whether a candidate is the best of its size."""
+        return np.diff(self.sizes, prepend=-1.0) > 0
+
+
+def _score(candidate: Candidate) -> float:
+    return candidate.r2_train if np.isnan(candidate.r2_test) else candidate.r2_test
+
+
+def fit_support(problem: Regression, equation: str, terms: Sequence[str]) -> Candidate:
+    """Fit one given support of one equation to the training rows; no bootstrap stands behind it.
+
+    Raises ValueError for an unknown term, or terms that depend on each other on these rows.
+    """
+    mask = np.zeros((1, len(problem.library)), dtype=np.bool_)
+    mask[0, [problem.library.index(name) for name in terms]] = True
+    (candidate,) = fit_supports(problem, equation, mask)
+    if not np.isfinite(candidate.coef).all():
+        raise ValueError(f"terms must be independent to be fitted: {list(terms)} are not")
+    return candidate
+
+
+def fit_supports(
+    problem: Regression, equation: str, masks: Bool[np.ndarray, "supports terms"]
+) -> list[Candidate]:
+    """Fit given supports, as `fit_support`; coefficients of dependent terms are NaN."""
+    unknown = np.full(len(masks), np.nan)
+    nothing = np.full((len(problem.library) + 1, len(problem.library)), np.nan)
+    return _candidates(problem, Supports(equation, masks, unknown, nothing))
+
+
+def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> ParetoFront:
+    """Fit every support on all training rows and keep the `depth` best of each size.
+
+    "Best" is by held-out rows, as in the thesis, or by the training rows where none are held out.
+    A size whose best does not beat a smaller one is left out, and so are supports whose terms
+    depend on each other. With noise in the library a wrong support can lead the true one of its
+    size by a hair; a depth of 3 keeps both for a better judge.
+    """
+    n_terms = len(problem.library)
+    equation = problem.equations.index(supports.equation)
+    best = _best_of_each_size(problem, equation, supports.masks, depth)
+    empty = np.zeros((1, n_terms), dtype=np.bool_)
+    chosen = Supports(
+        equation=supports.equation,
+        masks=np.concatenate([empty, supports.masks[best]]),
+        share=np.append(supports.share[~supports.masks.any(axis=1)].sum(), supports.share[best]),
+        inclusion=supports.inclusion,
+    )
+    candidates = _candidates(problem, chosen)
+    order = front_order(
+        np.array([c.n_terms for c in candidates]),
+        np.array([-_score(c) for c in candidates]),
+        depth=depth,
+    )
+    return ParetoFront(supports.equation, [candidates[k] for k in order], problem)
+
+
+def front_order(
+    sizes: Int[np.ndarray, " candidates"], errors: Float[np.ndarray, " candidates"], *, depth: int
+) -> list[int]:
+    """The `depth` of least error of each size whose best beats all smaller sizes, in order."""
+    if depth < 1:
+        raise ValueError(f"depth must be at least 1: {depth} came")
+    front: list[int] = []
+    lowest = np.inf
+    for _, same_size in groupby(np.lexsort((errors, sizes)).tolist(), key=lambda k: sizes[k]):
+        ranked = list(same_size)[:depth]
+        if errors[ranked[0]] < lowest:
+            lowest = errors[ranked[0]]
+            front += ranked
+    return front
+
+
+def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
+    """Every support fitted to the training rows and scored on both kinds of rows."""
+    n_terms = len(problem.library)
+    equation = problem.equations.index(supports.equation)
+    coef = _fit(problem, equation, supports.masks)
+    coef_SI = coef * problem.target_scale[equation] / problem.theta_scale
+    r2_train = _r2(problem.train_rows, n_terms, equation, coef)
+    r2_test = _r2(problem.test_rows, n_terms, equation, coef)
+    return [
+        Candidate(
+            equation=supports.equation,
+            terms=tuple(problem.term_names[j] for j in columns),
+            coef=coef_SI[k, columns],
+            r2_train=float(r2_train[k]),
+            r2_test=float(r2_test[k]),
+            share=float(supports.share[k]),
+            inclusion=supports.inclusion[len(columns), columns],
+        )
+        for k, columns in enumerate(map(np.flatnonzero, supports.masks))
+    ]
+
+
+def _best_of_each_size(
+    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"], depth: int
+) -> Int[np.ndarray, " best"]:
+    """Indices of the supports of least error, by number of terms, from Gram matrices alone."""
+    train = problem.train_gram
+    judge = problem.test_gram if problem.test.any() else train
+    coef = solve_masks(train.xx[0], np.where(masks, train.xy[0, equation], 0.0), masks)
+    explained = (coef * (2.0 * judge.xy[0, equation] - coef @ judge.xx[0])).sum(axis=1)
+    sizes = masks.sum(axis=1)
+    order = np.lexsort((-explained, sizes))
+    order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
+    _, first, count = np.unique(sizes[order], return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(first, count)
+    return order[rank < depth]
+
+
+def _fit(
+    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"]
+) -> Float[np.ndarray, "supports terms"]:
+    """Least squares on the training rows, in scaled columns.
+
+    The Gram matrix squares the condition of the rows, so its solution is refined against the
+    residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
+    """
+    gram, n_terms = problem.train_gram, len(problem.library)
+    xx = gram.xx[0]
+    theta, target = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms + equation]
+    coef = solve_masks(xx, np.where(masks, gram.xy[0, equation], 0.0), masks)
+    for _ in range(2):
+        residual = target - coef @ theta.T
+        coef = coef + solve_masks(xx, residual @ theta, masks)
+    return coef
+
+
+def _r2(
+    rows: Float[np.ndarray, "rows columns"],
+    n_terms: int,
+    equation: int,
+    coef: Float[np.ndarray, "supports terms"],
+) -> Float[np.ndarray, " supports"]:
+    """R2 of every support on some rows; NaN where there are none."""
+    if not len(rows):
+        return np.full(len(coef), np.nan)
+    return r2(truth=rows[:, n_terms + equation], prediction=coef @ rows[:, :n_terms].T)

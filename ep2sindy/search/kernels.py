@@ -1,0 +1,252 @@
+"""Compiled kernels that work on Gram matrices alone: lasso paths, thresholding, subsets, fits.
+
+In every kernel xx: (terms, terms) is a Gram matrix of columns in comparable units and
+xy: (terms,) their products with one target; a mask: (terms,) of bool is a support.
+"""
+
+import numpy as np
+from numba import njit
+
+from ep2sindy.regression.gram_fits import DEPENDENT, ROUNDING, independent_terms, solve, solve_masks
+
+
+@njit(cache=True)
+def _next_event(coef, slope, correlation, drift, level, active, n_active, barred):
+    """First knot as the lasso's penalty falls from `level`: step, term, joins or leaves."""
+    step, term, joins = level, -1, False
+    is_active = np.zeros(len(coef), dtype=np.bool_)
+    for i in range(n_active):
+        j = active[i]
+        is_active[j] = True
+        if coef[j] * slope[i] < 0.0 and -coef[j] / slope[i] < step:
+            step, term, joins = -coef[j] / slope[i], j, False
+    for j in range(len(coef)):
+        if is_active[j] or barred[j]:
+            continue
+        for sign in (1.0, -1.0):
+            closing = 1.0 - sign * drift[j]
+            if closing > 1e-12:
+                distance = max((level - sign * correlation[j]) / closing, 0.0)
+                if distance < step:
+                    step, term, joins = distance, j, True
+    return step, term, joins
+
+
+@njit(cache=True)
+def lasso_supports(xx, xy, max_terms):
+    """Every support on the exact lasso path, from the empty one to `max_terms` or all terms.
+
+    Homotopy in the penalty with terms joining and leaving (Osborne, Presnell & Turlach 2000,
+    doi:10.1093/imanum/20.3.389; Efron et al. 2004, doi:10.1214/009053604000000067).
+    """
+    n_terms = len(xy)
+    limit = 8 * n_terms + 8
+    masks = np.zeros((limit, n_terms), dtype=np.bool_)
+    coef, correlation = np.zeros(n_terms), xy.copy()
+    slope, signs = np.empty(n_terms), np.zeros(n_terms)
+    active = np.empty(n_terms, dtype=np.int64)
+    barred = np.zeros(n_terms, dtype=np.bool_)
+    n_active, n_masks, left = 0, 1, -1
+    level = np.abs(xy).max() if n_terms else 0.0
+    floor = 1e-13 * level
+    while level > floor and n_masks < limit:
+        drift = _drift(xx, slope, active, n_active)
+        if left >= 0:
+            barred[left] = True  # at this very knot it would come straight back
+        step, term, joins = _next_event(
+            coef, slope, correlation, drift, level, active, n_active, barred
+        )
+        if left >= 0:
+            barred[left] = False
+            left = -1
+        for i in range(n_active):
+            coef[active[i]] += step * slope[i]
+        correlation -= step * drift
+        level -= step
+        if term < 0:
+            break
+        if joins:
+            active[n_active] = term
+            n_active += 1
+        else:
+            n_active = _leave(active, n_active, term)
+            coef[term] = 0.0
+            left = term
+        signs[active[:n_active]] = np.sign(correlation[active[:n_active]])
+        if not solve(xx, signs, active, n_active, slope):
+            barred[term] = True  # it repeats what is active: the path goes on without it
+            n_active = _leave(active, n_active, term)
+            solve(xx, signs, active, n_active, slope)
+            continue
+        if n_active > max_terms:
+            break
+        masks[n_masks, active[:n_active]] = True
+        n_masks += 1
+    return masks[:n_masks]
+
+
+@njit(cache=True)
+def _drift(xx, slope, active, n_active):
+    """How fast each term's correlation falls along the path."""
+    drift = np.zeros(len(xx))
+    for i in range(n_active):
+        for j in range(len(xx)):
+            drift[j] += xx[j, active[i]] * slope[i]
+    return drift
+
+
+@njit(cache=True)
+def adaptive_lasso_supports(xx, xy, gamma, max_terms):
+    """Supports on the path of the lasso with penalties |b_ols|^-gamma (Zou 2006).
+
+    Scaling each column by |b_ols|^gamma makes it a plain lasso. A term that depends on earlier
+    ones has no least-squares coefficient of its own and never joins.
+    """
+    everything = independent_terms(xx).reshape(1, -1)
+    scale = np.abs(solve_masks(xx, xy.reshape(1, -1), everything)[0]) ** gamma
+    return lasso_supports(xx * scale.reshape(-1, 1) * scale, xy * scale, max_terms)
+
+
+@njit(cache=True)
+def _leave(active, n_active, term):
+    kept = 0
+    for i in range(n_active):
+        if active[i] != term:
+            active[kept] = active[i]
+            kept += 1
+    return kept
+
+
+@njit(cache=True)
+def thresholded_supports(xx, xy, thresholds):
+    """Sequentially thresholded least squares, iterated to its end, for every threshold."""
+    n_terms = len(xy)
+    masks = np.zeros((len(thresholds), n_terms), dtype=np.bool_)
+    start = independent_terms(xx)
+    solution = np.empty(n_terms)
+    for m in range(len(thresholds)):
+        masks[m] = start
+        while True:
+            active = np.flatnonzero(masks[m])
+            solve(xx, xy, active, len(active), solution)
+            n_dropped = 0
+            for i in range(len(active)):
+                if abs(solution[i]) <= thresholds[m]:
+                    masks[m, active[i]] = False
+                    n_dropped += 1
+            if n_dropped == 0:
+                break
+    return masks
+
+
+@njit(cache=True)
+def _sweep(source, target, j, size):
+    """Remove from rows and columns after j what column j explains of them."""
+    for a in range(j + 1, size):
+        ratio = source[a, j] / source[j, j]
+        for b in range(a, size):
+            target[a, b] = source[a, b] - ratio * source[b, j]
+            target[b, a] = target[a, b]
+
+
+@njit(cache=True)
+def _joined(total, residual, rounding, n_problems):
+    """Carry the product of residuals on by one: as a logarithm, or plainly if it is the only."""
+    return residual if n_problems == 1 else total + np.log(max(residual, rounding))
+
+
+@njit(cache=True)
+def _least_residual(matrices, first, size, smallest, scratch):
+    """The same when every column from `first` on is used: a bound for a whole subtree."""
+    total = 0.0
+    for p in range(len(matrices)):
+        scratch[first:size, first:size] = matrices[p, first:size, first:size]
+        for j in range(first, size - 1):
+            if scratch[j, j] > smallest[p, j]:
+                _sweep(scratch, scratch, j, size)
+        total = _joined(total, scratch[size - 1, size - 1], smallest[p, size - 1], len(matrices))
+    return total
+
+
+@njit(cache=True)
+def _offer(residual, chosen, n_chosen, best, best_masks):
+    """Keep a subset among the best of its size, sorted by residual."""
+    rank = best.shape[1]
+    while rank > 0 and residual < best[n_chosen, rank - 1]:
+        rank -= 1
+    if rank == best.shape[1]:
+        return
+    for r in range(best.shape[1] - 1, rank, -1):
+        best[n_chosen, r] = best[n_chosen, r - 1]
+        best_masks[n_chosen, r] = best_masks[n_chosen, r - 1]
+    best[n_chosen, rank] = residual
+    best_masks[n_chosen, rank] = False
+    for i in range(n_chosen):
+        best_masks[n_chosen, rank, chosen[i]] = True
+
+
+@njit(cache=True)
+def best_subsets(xx, xy, yy, max_terms, n_best):
+    """The `n_best` supports of least residual of every size up to max_terms, proven best.
+
+    One support serves several problems, each with its own coefficients: what is least is the
+    product of their residuals (for one problem, the residual), so that no scale of a target
+    counts. A problem in which a column depends on those chosen keeps its residual.
+    Depth first over subsets with the residual Gram matrices carried along, so a leaf costs one
+    division; a branch is cut when even all of its columns together leave more than the best
+    known (Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231).
+    xx: (problems, terms, terms), columns ordered with the most telling first for early cuts;
+    xy: (problems, terms); yy: (problems,).
+    Returns (supports, terms) of bool, the empty support first.
+    """
+    n_problems, n_terms = xy.shape
+    size = n_terms + 1
+    depth = min(max_terms, n_terms)
+    levels = np.zeros((depth + 1, n_problems, size, size))
+    levels[0, :, :n_terms, :n_terms] = xx
+    levels[0, :, :n_terms, n_terms], levels[0, :, n_terms, :n_terms] = xy, xy
+    levels[0, :, n_terms, n_terms] = yy
+    smallest = np.empty((n_problems, size))
+    for p in range(n_problems):
+        smallest[p, :n_terms] = DEPENDENT * np.diag(xx[p])
+        smallest[p, n_terms] = ROUNDING * yy[p] if yy[p] > 0.0 else 1.0
+    scratch = np.empty((size, size))
+    best = np.full((depth + 1, n_best), np.inf)
+    best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
+    best[0, 0] = 0.0
+    chosen = np.zeros(depth + 1, dtype=np.int64)
+    following = np.zeros(depth + 1, dtype=np.int64)
+    level = 0
+    while level >= 0:
+        j = following[level]
+        if j >= n_terms or level == depth:
+            level -= 1
+            continue
+        following[level] = j + 1
+        residual, adds = 0.0, False
+        for p in range(n_problems):  # in place: views would cost more than the work
+            left, pivot = levels[level, p, n_terms, n_terms], levels[level, p, j, j]
+            if pivot > smallest[p, j]:
+                left -= levels[level, p, j, n_terms] ** 2 / pivot
+                adds = True
+            residual = _joined(residual, left, smallest[p, n_terms], n_problems)
+        if not adds:
+            continue
+        chosen[level] = j
+        _offer(residual, chosen, level + 1, best, best_masks)
+        if level + 1 == depth or j + 1 == n_terms:
+            continue
+        for p in range(n_problems):
+            here, below = levels[level, p], levels[level + 1, p]
+            if here[j, j] > smallest[p, j]:
+                _sweep(here, below, j, size)
+            else:
+                below[j + 1 :, j + 1 :] = here[j + 1 :, j + 1 :]
+        worth_bounding = n_terms - j > 6 and depth - level > 2
+        if worth_bounding and best[level + 2, n_best - 1] <= _least_residual(
+            levels[level + 1], j + 1, size, smallest, scratch
+        ):
+            continue
+        following[level + 1] = j + 1
+        level += 1
+    return best_masks.reshape(-1, n_terms)[np.isfinite(best.ravel())]

@@ -1,0 +1,1 @@
+"""Selection: rules that choose one candidate of every front."""

@@ -1,0 +1,155 @@
+"""Information criteria: likelihood against size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import comb, log
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.library.library import Library
+from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.search.front import Candidate, ParetoFront
+from ep2sindy.selection.rule import FLOOR
+
+# Rounds of weighting the rows by the covariance under the candidate that leads.
+MAX_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class AICc:
+    """Akaike's criterion for small samples: which model will predict best.
+
+    Assumes Gaussian residuals, white after weighting by the rows' covariance where it is known
+    (`Weak`), and independent from row to row where it is not (`Differential`: neighbours of a
+    smoothed series are not, so it keeps too many terms). Not consistent: even with endless data
+    it keeps a needless term now and then.
+    Source: Hurvich & Tsai 1989, doi:10.1093/biomet/76.2.297.
+    """
+
+    label: ClassVar[str] = "AICc"
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        return [_criterion(front, self._penalty) for front in fronts]
+
+    def _penalty(self, candidate: Candidate, n_rows: float) -> float:
+        k = candidate.n_terms
+        return 2.0 * k + 2.0 * k * (k + 1) / (n_rows - k - 1) if n_rows > k + 1 else np.inf
+
+
+@dataclass(frozen=True)
+class BIC:
+    """Schwarz's criterion: which model is most likely, all being equally likely before.
+
+    Assumes what `AICc` does of the residuals. There are many more models of middle size than
+    small ones, so with a library of any size it keeps too many terms.
+    Source: Schwarz 1978, doi:10.1214/aos/1176344136.
+    """
+
+    label: ClassVar[str] = "BIC"
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        return [_criterion(front, self._penalty) for front in fronts]
+
+    def _penalty(self, candidate: Candidate, n_rows: float) -> float:
+        return candidate.n_terms * log(n_rows)
+
+
+@dataclass(frozen=True)
+class EBIC:
+    """The extended criterion: sizes are equally likely before, not models.
+
+    score = n log(RSS / n) + k log n + 2 gamma log(number of supports of k terms). Libraries are
+    nested by degree, and the supports are counted in the smallest that holds this one: simple
+    terms need not pay for the many of high degree.
+    Assumes what `AICc` does of the residuals. coarsening: no model is exact, and with n rows any
+    discrepancy becomes significant; the likelihood is raised to the power 1 / (1 + n/coarsening),
+    so that evidence stops growing at about that many rows. None: trust the residuals to the end.
+    Source: Chen & Chen 2008, doi:10.1093/biomet/asn034; Miller & Dunson 2019,
+    doi:10.1080/01621459.2018.1469995.
+    """
+
+    gamma: float = 1.0
+    coarsening: float | None = 60.0
+    label: ClassVar[str] = "EBIC"
+
+    def __post_init__(self) -> None:
+        if not self.gamma >= 0.0:
+            raise ValueError(f"gamma must be zero or more: {self.gamma} came")
+        if self.coarsening is not None and not self.coarsening > 1.0:
+            raise ValueError(
+                f"coarsening counts rows, and must be above 1: {self.coarsening} came; None "
+                "trusts the residuals to the end"
+            )
+
+    def shared_by(self, n_points: int) -> EBIC:
+        """The rule at one of n points that share a support: together they pay its count once."""
+        return replace(self, gamma=self.gamma / n_points)
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        found = []
+        for front in fronts:
+            library = front.problem.library
+
+            def penalty(candidate: Candidate, n_rows: float, library: Library = library) -> float:
+                ways = log_supports(library, candidate.terms)
+                return candidate.n_terms * log(n_rows) + 2.0 * self.gamma * ways
+
+            found.append(_criterion(front, penalty, coarsening=self.coarsening))
+        return found
+
+
+def log_supports(library: Library, terms: Sequence[str]) -> float:
+    """Log of the number of supports of this size among terms of no higher degree than these."""
+    degrees = library.exponents.sum(axis=1)
+    highest = max((degrees[library.index(name)] for name in terms), default=0)
+    return log(comb(int((degrees <= highest).sum()), len(terms)))
+
+
+def _criterion(
+    front: ParetoFront,
+    penalty: Callable[[Candidate, float], float],
+    *,
+    coarsening: float | None = None,
+) -> Float[np.ndarray, " candidates"]:
+    """n log(RSS / n) + penalty of every candidate, its rows weighted where noise is known.
+
+    The weights depend on the model: those of the leading candidate serve all, in rounds, until
+    the leader stays.
+    """
+    problem = front.problem
+    n_rows, n_terms = len(problem.train_rows), len(problem.library)
+    n_effective = float(n_rows if coarsening is None else n_rows / (1.0 + n_rows / coarsening))
+    penalties = np.array([penalty(c, n_effective) for c in front.candidates])
+    masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
+    equation = problem.equations.index(front.equation)
+    theta, target = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms + equation]
+    leader = -1
+    for _ in range(MAX_ROUNDS):
+        squares, coef = _fits(theta, target, masks)
+        scores = n_effective * np.log(squares / n_rows) + penalties
+        if problem.noisy is None or int(np.argmin(scores)) == leader:
+            break
+        leader = int(np.argmin(scores))
+        white = whitened_rows(problem, masks[leader], coef[leader])
+        theta, target = white.theta, white.target
+    return scores
+
+
+def _fits(
+    theta: Float[np.ndarray, "rows terms"],
+    target: Float[np.ndarray, " rows"],
+    masks: Bool[np.ndarray, "candidates terms"],
+) -> tuple[Float[np.ndarray, " candidates"], Float[np.ndarray, "candidates terms"]]:
+    """Least squares of every support: residual squares, no lower than the floor, and coef."""
+    # The triangle keeps all that least squares needs of the rows, at the rows' own condition.
+    triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
+    columns, right = triangle[:, :-1], triangle[:, -1]
+    coef = np.zeros(masks.shape)
+    for fit, mask in zip(coef, masks, strict=True):
+        fit[mask] = np.linalg.lstsq(columns[:, mask], right)[0]
+    squares = np.square(right - coef @ columns.T).sum(axis=1)
+    return np.maximum(squares, FLOOR * (right @ right)), coef

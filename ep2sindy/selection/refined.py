@@ -1,0 +1,226 @@
+"""Selection by refinement: systems of equations at their best, judged on windows not fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.many import MAX_ERROR, Ensemble
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.many import follow_together, refine_together
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
+from ep2sindy.search.front import ParetoFront
+from ep2sindy.selection.integral import combinations, ensemble_of, joint_scores, records_of
+from ep2sindy.selection.rule import FLOOR
+
+# Pairs of windows that the records are cut into at least, where nobody sets the length.
+LEAST_PAIRS = 3
+
+
+# Steps of all windows of all points that are refined together: more leave the cache.
+BATCH_STEPS = 6000
+
+
+# Standard errors that the winner may lie above the best.
+N_ERRORS = 2.0
+
+
+@dataclass(frozen=True)
+class RefinedScore:
+    """Judge equations together, at their best: which system follows windows it never saw?
+
+    The records are cut into pairs of windows. Every combination of candidates, one per equation,
+    is refined on the first window of each pair and judged on the second, then the other way
+    round; the two share no samples. So coefficients that noise in the library has biased are
+    mended before they count. Judging holds them and fits each window's start: from a smoothed
+    start the truth, if it is chaotic, runs away from its own samples.
+    The error is the mean square distance to the samples in variances of each state, averaged
+    over the states with weights 1 / residual of the leader, the combination of greatest
+    likelihood; at most 10, which also stands for a window that a combination cannot run through.
+    A refinement that blows up, or does not converge and follows its own windows no better, leaves
+    the coefficients of the regression: they are a fit too, and are judged like any other.
+    Of the combinations within two standard errors of the leader the one of fewest terms wins.
+    The standard error is that of the difference between the two, in which noise that both meet
+    cancels: with n independent residuals an excess share of q in the error has the standard
+    error sqrt(4 q / n), so q = 16 / n is two of them. n is less than the residuals' number by
+    (1 - rho) / (1 + rho), rho being the autocorrelation of the leader's from sample to sample:
+    little is certain about models that miss more than white noise.
+    score = the least error of all combinations with the candidate, no less than that limit; the
+    winner's candidates a hair below.
+    window_s: None for one and a half dominant periods, or what leaves three pairs if that is less.
+    n_windows: judged, at most, over all records. max_combinations: more are refused.
+    """
+
+    window_s: float | None = None
+    n_windows: int = 20
+    max_combinations: int = 4096
+    label: ClassVar[str] = "refined error"
+
+    def __post_init__(self) -> None:
+        if self.window_s is not None and not self.window_s > 0.0:
+            raise ValueError(
+                f"window_s must be positive: {self.window_s} came; leave it out to have it chosen"
+            )
+        for name, least in (("n_windows", 2), ("max_combinations", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}: {getattr(self, name)} came")
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        """Raises ValueError for rows without trajectories, a state without a front, more than
+        max_combinations, or records too short for two windows.
+        """
+        places = combinations(fronts, self.max_combinations)
+        records = records_of(fronts)
+        ensemble = ensemble_of(fronts, places)
+        halves = self._halves(records.runs, ensemble)
+        spread = np.concatenate(records.smoothed).std(axis=0)
+        residuals = np.concatenate(
+            [
+                _residuals(_refined(ensemble, own), other) * (other.scale[: len(spread)] / spread)
+                for own, other in (halves, halves[::-1])
+            ],
+            axis=1,
+        )
+        errors, limit = _errors_and_limit(residuals)
+        return joint_scores(fronts, places, errors, limit=limit)
+
+    def _halves(self, runs: Sequence[Trajectory], ensemble: Ensemble) -> list[WindowBatch]:
+        """The first windows of all pairs, and the second."""
+        window = self._window(runs, ensemble.states)
+        n_samples = sum(run.n_samples for run in runs)
+        halves: list[list[Trajectory]] = [[], []]
+        for run in runs:
+            n_pairs = max(1, round(self.n_windows / 2 * run.n_samples / n_samples))
+            n_pairs = min(n_pairs, run.n_samples // (2 * window))
+            last = max(run.n_samples - 2 * window, 0)
+            for start in np.linspace(0, last, n_pairs).round().astype(np.int64).tolist():
+                halves[0].append(run.window(start, start + window))
+                halves[1].append(run.window(start + window, start + 2 * window))
+        nothing_left_to_chance = np.random.default_rng(0)  # a trajectory for every window
+        return [
+            cut_windows(
+                half,
+                states=ensemble.states,
+                inputs=ensemble.inputs,
+                n_windows=len(half),
+                window=window,
+                rng=nothing_left_to_chance,
+            )
+            for half in halves
+        ]
+
+    def _window(self, runs: Sequence[Trajectory], states: Sequence[str]) -> int:
+        """Samples in each window."""
+        longest = max(run.n_samples for run in runs)
+        if self.window_s is None:
+            room = sum(run.n_samples for run in runs) // (2 * LEAST_PAIRS)
+            wanted = min(dominant_window(runs, states), room)
+            window = min(max(wanted, MIN_SAMPLES), longest // 2)
+        else:
+            step_s = np.mean(np.concatenate([np.diff(run.t) for run in runs]))
+            window = round(self.window_s / step_s) + 1
+        if not MIN_SAMPLES <= window <= longest // 2:
+            raise ValueError(
+                "a record must hold a window to refine on and another to judge on, of "
+                f"{MIN_SAMPLES} samples or more: 2 x {window} were asked of at most {longest}; "
+                "change window_s, or use longer records"
+            )
+        return window
+
+
+def _models(ensemble: Ensemble, places: Int[np.ndarray, " models"]) -> list[SparseModel]:
+    states = list(ensemble.states)
+    return [SparseModel(ensemble.library, states, ensemble.coef[:, :, k]) for k in places]
+
+
+def _by_size(ensemble: Ensemble) -> Int[np.ndarray, " models"]:
+    """Models with terms, the smallest first: neighbours then cost each other little."""
+    n_terms = (ensemble.coef != 0.0).sum(axis=(0, 1))
+    order = np.argsort(n_terms, kind="stable")
+    return order[n_terms[order] > 0]
+
+
+def _refined(ensemble: Ensemble, batch: WindowBatch) -> Ensemble:
+    """Every model refined on the same windows; one without terms has nothing to refine."""
+    order = _by_size(ensemble)
+    if not order.size:
+        return ensemble
+    method, together = _budget(batch)
+    models, finished = refine_together(
+        _models(ensemble, order), batch, method=method, points_per_batch=together
+    )
+    coef = ensemble.coef.copy()
+    coef[:, :, order] = np.stack([model.coef for model in models], axis=2)
+    refined = replace(ensemble, coef=coef)
+    doubtful = order[~finished]
+    before, after = (
+        _bounded_squares(_residuals(replace(each, coef=each.coef[:, :, doubtful]), batch))
+        for each in (ensemble, refined)
+    )
+    worse = doubtful[after.mean(axis=(1, 2)) >= before.mean(axis=(1, 2))]
+    coef[:, :, worse] = ensemble.coef[:, :, worse]
+    return refined
+
+
+def _residuals(
+    ensemble: Ensemble, batch: WindowBatch
+) -> Float[np.ndarray, "models windows samples n_states"]:
+    """Distances of the best trajectories to the samples, in the batch's scale; NaN if none."""
+    # Without terms a state stays where it is, and best at the mean.
+    still = batch.data.mean(axis=1, keepdims=True) - batch.data
+    found = np.repeat(still[None], ensemble.coef.shape[2], axis=0)
+    order = _by_size(ensemble)
+    if order.size:
+        method, together = _budget(batch)
+        paths = follow_together(
+            _models(ensemble, order), batch, method=method, points_per_batch=together
+        )
+        found[order] = paths - batch.data
+    return found
+
+
+def _budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:
+    """How long to refine, and how many models together.
+
+    The regression's coefficients are close: whole windows at once, and few iterations. Those
+    that need more are the wrong ones.
+    """
+    method = MultipleShooting(first_block=batch.data.shape[1], tolerance=1e-3, max_iter=10)
+    return method, max(1, BATCH_STEPS // batch.steps.size)
+
+
+def _errors_and_limit(
+    residuals: Float[np.ndarray, "models windows samples n_states"],
+) -> tuple[Float[np.ndarray, " models"], float]:
+    """Error of every model, and up to where it cannot be told from the leader's."""
+    squares = _bounded_squares(residuals)
+    by_state = np.maximum(squares.mean(axis=1), FLOOR)
+    leader = int(np.argmin(np.log(by_state).sum(axis=1)))
+    least = by_state[leader]
+    errors = np.minimum((by_state / least).mean(axis=1) * least.mean(), MAX_ERROR)
+    n = _independent(np.nan_to_num(residuals[leader]))
+    return errors, float(least.mean() * (1.0 + (2.0 * N_ERRORS) ** 2 / n))
+
+
+def _bounded_squares(
+    residuals: Float[np.ndarray, "models windows samples n_states"],
+) -> Float[np.ndarray, "models windows n_states"]:
+    """Mean squares, MAX_ERROR at most and where there is no trajectory."""
+    with np.errstate(over="ignore"):
+        squares = np.square(residuals).mean(axis=2)
+    return np.where(squares < MAX_ERROR, squares, MAX_ERROR)
+
+
+def _independent(residuals: Float[np.ndarray, "windows samples n_states"]) -> float:
+    """How many independent residuals say as much about a mean, by their correlation in time."""
+    power = np.maximum(np.square(residuals).sum(axis=(0, 1)), 1e-300)
+    rho = (residuals[:, 1:] * residuals[:, :-1]).sum(axis=(0, 1)) / power
+    rho = np.clip(rho, 0.0, 1.0)
+    n_samples = residuals.shape[0] * residuals.shape[1]
+    return max(float((n_samples * (1.0 - rho) / (1.0 + rho)).sum()), 1.0)

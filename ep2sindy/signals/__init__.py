@@ -1,0 +1,1 @@
+"""Signals: smoothed samples and derivatives, spectra, and what describes an oscillation."""

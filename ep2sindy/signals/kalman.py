@@ -1,0 +1,174 @@
+"""Smooth and differentiate noisy samples with a Kalman smoother that finds the noise itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+
+from ep2sindy.data.trajectory import check_time, read_only
+from ep2sindy.signals.kernels import leverage, likelihood, smoothed
+
+# From a memory of some 200 samples to interpolation.
+LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
+
+
+# Below what data can tell: over 1000 samples the most likely one scatters by 0.03 and more.
+LOG10_RATIO_TOLERANCE = 0.01
+
+
+# Three samples start the filter; two more are the least that can tell noise from signal.
+MIN_SAMPLES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanEstimate:
+    """What the smoother makes of samples in u, column by column.
+
+    smoothed: in u, with its standard deviation smoothed_std; derivative: in u/s.
+    noise_std: of the white noise in the samples, in u.
+    log10_ratio: of process to measurement noise, with the mean step as the unit of time.
+    """
+
+    smoothed: Float[np.ndarray, "samples columns"]
+    derivative: Float[np.ndarray, "samples columns"]
+    smoothed_std: Float[np.ndarray, "samples columns"]
+    noise_std: Float[np.ndarray, " columns"]
+    log10_ratio: Float[np.ndarray, " columns"]
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+
+
+@dataclass(frozen=True)
+class KalmanSmoother:
+    """A twice integrated Wiener process seen through white noise, on whatever steps there are.
+
+    Its mean given all samples is the quintic smoothing spline. Each column has a ratio of
+    process to measurement noise of its own: the most likely one, unless log10_ratio sets it for
+    all. Nothing is assumed of the beginning, so a parabola passes unchanged.
+    Raises ValueError for a log10_ratio outside [-14, 4].
+    Source: Wahba 1978, doi:10.1111/j.2517-6161.1978.tb01050.x; Durbin & Koopman 2012,
+    doi:10.1093/acprof:oso/9780199641178.001.0001.
+    """
+
+    log10_ratio: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.log10_ratio is not None:
+            _check_ratio(self.log10_ratio)
+
+    def estimate(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> KalmanEstimate:
+        """Smooth every column; `smooth` and `derivative` give parts of this, at its full cost.
+
+        t: (samples,) in s. A column that never changes comes back as it is: without noise or
+        derivative, and with the smoothest ratio unless one is set.
+        Raises ValueError for fewer than five samples.
+        """
+        steps, step_s = _unit_steps(t, values)
+        spread = np.ptp(values, axis=0)
+        scaled = (values - values[0]) / np.where(spread > 0.0, spread, 1.0)
+        signal, slope, signal_std = np.empty((3, *values.shape))
+        noise_std, log10_ratio = np.empty((2, values.shape[1]))
+        for j in range(values.shape[1]):
+            column = np.ascontiguousarray(scaled[:, j])[:, None]
+            log10_ratio[j] = self._ratio(steps, column)
+            ratio = 10.0 ** log10_ratio[j]
+            signal[:, j : j + 1], slope[:, j : j + 1] = smoothed(steps, column, ratio)
+            noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1][0])
+            # Rounding can take a leverage below zero where samples nearly coincide.
+            signal_std[:, j] = noise_std[j] * np.sqrt(np.maximum(leverage(steps, ratio), 0.0))
+        return KalmanEstimate(
+            smoothed=values[0] + spread * signal,
+            derivative=spread * slope / step_s,
+            smoothed_std=spread * signal_std,
+            noise_std=spread * noise_std,
+            log10_ratio=log10_ratio,
+        )
+
+    def smooth(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]:
+        """Raises ValueError for fewer than five samples."""
+        return self.estimate(t, values).smoothed
+
+    def derivative(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]:
+        """Raises ValueError for fewer than five samples."""
+        return self.estimate(t, values).derivative
+
+    def _ratio(self, steps: np.ndarray, column: np.ndarray) -> float:
+        return most_likely_ratio(steps, column) if self.log10_ratio is None else self.log10_ratio
+
+
+def kalman_smooth(
+    t: Float[np.ndarray, " samples"],
+    values: Float[np.ndarray, "samples columns"],
+    *,
+    log10_ratio: float,
+) -> Float[np.ndarray, "samples columns"]:
+    """Smooth many columns with one ratio: the product of a symmetric matrix and `values`.
+
+    The matrix depends on t and log10_ratio alone, so this carries noise through the smoother.
+    Raises ValueError for fewer than five samples, or a log10_ratio outside [-14, 4].
+    """
+    _check_ratio(log10_ratio)
+    steps, _ = _unit_steps(t, values)
+    # A locked array would have the kernels compiled once more.
+    values = np.require(values, np.float64, ["C_CONTIGUOUS", "WRITEABLE"])
+    return smoothed(steps, values, 10.0**log10_ratio)[0]
+
+
+def most_likely_ratio(
+    steps: Float[np.ndarray, " steps"], values: Float[np.ndarray, "samples 1"]
+) -> float:
+    """log10 of the ratio under which one column is most likely, within [-14, 4].
+
+    The likelihood may be flat or have several maxima: a grid of whole decades finds the
+    highest, a bounded search between its neighbours refines it.
+    """
+
+    def misfit(log10_ratio: float) -> float:
+        return -likelihood(steps, values, 10.0**log10_ratio)[0][0]
+
+    decades = np.arange(LOG10_RATIO_MIN, LOG10_RATIO_MAX + 1.0)
+    misfits = [misfit(decade) for decade in decades]
+    best = int(np.argmin(misfits))
+    found = minimize_scalar(
+        misfit,
+        bounds=(decades[max(best - 1, 0)], decades[min(best + 1, len(decades) - 1)]),
+        method="bounded",
+        options={"xatol": LOG10_RATIO_TOLERANCE},
+    )
+    # The search never tries the bounds themselves.
+    return float(found.x if found.fun < misfits[best] else decades[best])
+
+
+def _check_ratio(log10_ratio: float) -> None:
+    if not LOG10_RATIO_MIN <= log10_ratio <= LOG10_RATIO_MAX:
+        raise ValueError(
+            f"log10_ratio must lie in [{LOG10_RATIO_MIN:g}, {LOG10_RATIO_MAX:g}]: "
+            f"{log10_ratio:g} came; leave it out to have the most likely one found"
+        )
+
+
+def _unit_steps(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Time steps in units of their mean, and that mean in s."""
+    if len(t) < MIN_SAMPLES:
+        raise ValueError(
+            f"the Kalman smoother needs at least {MIN_SAMPLES} samples: {len(t)} came; "
+            "join more data"
+        )
+    if len(values) != len(t):
+        raise ValueError(
+            f"values must have one row per time: {len(values)} rows came with {len(t)} times"
+        )
+    check_time(t)
+    step_s = (t[-1] - t[0]) / (len(t) - 1)
+    return np.diff(t) / step_s, step_s

@@ -1,0 +1,101 @@
+"""Smooth sampled states and differentiate them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import savgol_filter
+
+from ep2sindy.signals.spectrum import is_uniform
+
+
+@runtime_checkable
+class Smoother(Protocol):
+    """What the alternatives share: smoothed samples, and their time derivative."""
+
+    def smooth(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]: ...
+
+    def derivative(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]: ...
+
+
+def difference(
+    t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+) -> Float[np.ndarray, "samples columns"]:
+    """Second-order differences, exact for parabolas, on unequal steps and at the ends too."""
+    if len(t) < 3:
+        raise ValueError(f"second-order differences need three samples or more: {len(t)} came")
+    return np.gradient(values, t, axis=0, edge_order=2)
+
+
+@dataclass(frozen=True)
+class NoSmoothing:
+    """Take the samples as they are: for data without noise."""
+
+    def smooth(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]:
+        return values
+
+    def derivative(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]:
+        return difference(t, values)
+
+
+@dataclass(frozen=True)
+class SavitzkyGolay:
+    """Least-squares polynomial of `order` over `window` samples, at every sample.
+
+    The derivative is the second-order difference of the smoothed samples (the thesis's
+    "smoothed finite difference"). Near the ends the first and the last full window serve, so
+    nothing wraps around; on unequal steps the polynomial is fitted to the actual times.
+    Raises ValueError unless window is odd and above order.
+    Source: Savitzky & Golay 1964, doi:10.1021/ac60214a047.
+    """
+
+    window: int = 11
+    order: int = 3
+
+    def __post_init__(self) -> None:
+        if self.window % 2 == 0 or not 0 <= self.order < self.window:
+            raise ValueError(
+                "a Savitzky-Golay window must be odd and longer than its order: "
+                f"window={self.window}, order={self.order} came"
+            )
+
+    def smooth(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]:
+        """Raises ValueError when the trajectory is shorter than the window."""
+        if len(t) < self.window:
+            raise ValueError(
+                f"smoothing needs at least {self.window} samples (its window): {len(t)} came; "
+                "shorten the window or join more data"
+            )
+        if is_uniform(t):
+            return savgol_filter(values, self.window, self.order, axis=0, mode="interp")
+        return self._smooth_unequal(t, values)
+
+    def derivative(
+        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
+    ) -> Float[np.ndarray, "samples columns"]:
+        return difference(t, self.smooth(t, values))
+
+    def _smooth_unequal(self, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Fit each sample's own window, the nearest full one at the ends, in scaled time."""
+        first = np.clip(np.arange(len(t)) - self.window // 2, 0, len(t) - self.window)
+        window_t = sliding_window_view(t, self.window)[first] - t[:, None]
+        window_t = window_t / np.abs(window_t).max(axis=1, keepdims=True)
+        powers = window_t[:, :, None] ** np.arange(self.order + 1)
+        # Row 0 of the pseudo-inverse gives the constant: the polynomial at the sample itself.
+        weights = np.linalg.pinv(powers)[:, 0]
+        windows = sliding_window_view(values, self.window, axis=0)[first]
+        return np.einsum("sw,scw->sc", weights, windows)

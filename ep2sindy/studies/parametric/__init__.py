@@ -1,0 +1,1 @@
+"""The parametric study: one model at several operating points, its trends and laws."""

@@ -1,0 +1,1 @@
+"""Synthetic data: systems whose equations are known, to be found again."""

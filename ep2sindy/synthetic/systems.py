@@ -1,0 +1,102 @@
+"""Synthetic systems with known coefficients: the truth that searches are judged by."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.integrate import solve_ivp
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A known model and how the thesis samples it (appendix, II-E).
+
+    initial: (n_states,), the state at t = 0.
+    """
+
+    name: str
+    model: SparseModel
+    initial: Float[np.ndarray, " n_states"]
+    duration_s: float
+    rate_Hz: float
+
+    def trajectory(
+        self,
+        *,
+        initial: Float[np.ndarray, " n_states"] | None = None,
+        noise: float = 0.0,
+        rng: np.random.Generator | None = None,
+    ) -> Trajectory:
+        """Integrate to 1e-10 and add white noise of `noise` times each state's RMS.
+
+        Raises ValueError for negative noise, or noise without an rng.
+        """
+        if noise < 0.0 or (noise > 0.0 and rng is None):
+            raise ValueError(
+                f"noise must be zero, or positive together with an rng: noise={noise}, rng={rng}"
+            )
+        t = np.arange(round(self.duration_s * self.rate_Hz)) / self.rate_Hz
+        start = self.initial if initial is None else initial
+        solution = solve_ivp(
+            lambda _, x: self.model.derivative(x, np.empty(0)),
+            (0.0, t[-1]),
+            start,
+            method="DOP853",
+            t_eval=t,
+            rtol=1e-10,
+            atol=1e-10,
+        )
+        states = solution.y.T
+        if rng is not None:
+            rms = np.sqrt(np.square(states).mean(axis=0))
+            states = states + noise * rms * rng.standard_normal(states.shape)
+        return Trajectory(t=t, states=states, state_names=self.model.states, label=self.name)
+
+
+def damped_oscillator(*, zeta: float = 0.1, omega: float = 3.0) -> System:
+    """x' = v, v' = -2 zeta omega v - omega^2 x."""
+    equations = {"x": {"v": 1.0}, "v": {"x": -(omega**2), "v": -2.0 * zeta * omega}}
+    return _system("damped oscillator", equations, 2, [1.0, 0.0], 30.0, 100.0)
+
+
+def lotka_volterra(*, a: float = 2 / 3, b: float = 1.0, c: float = 1.0, d: float = 1 / 3) -> System:
+    """x' = a x - b x y, y' = c x y - d y."""
+    equations = {"x": {"x": a, "x*y": -b}, "y": {"y": -d, "x*y": c}}
+    return _system("Lotka-Volterra", equations, 2, [1.0, 0.5], 100.0, 10.0)
+
+
+def van_der_pol(*, mu: float = 2.0) -> System:
+    """x' = mu (x - x^3/3 - y), y' = x / mu: the Lienard form."""
+    equations = {"x": {"x": mu, "y": -mu, "x^3": -mu / 3.0}, "y": {"x": 1.0 / mu}}
+    return _system("Van der Pol", equations, 3, [1.0, 1.0], 20.0, 50.0)
+
+
+def lorenz(*, sigma: float = 10.0, rho: float = 28.0, beta: float = 8 / 3) -> System:
+    """x' = sigma (y - x), y' = x (rho - z) - y, z' = x y - beta z."""
+    equations = {
+        "x": {"x": -sigma, "y": sigma},
+        "y": {"x": rho, "x*z": -1.0, "y": -1.0},
+        "z": {"x*y": 1.0, "z": -beta},
+    }
+    return _system("Lorenz", equations, 2, [-8.0, 8.0, 27.0], 10.0, 300.0)
+
+
+def _system(
+    name: str,
+    equations: Mapping[str, Mapping[str, float]],
+    degree: int,
+    initial: Sequence[float],
+    duration_s: float,
+    rate_Hz: float,
+) -> System:
+    library = polynomial(list(equations), degree=degree)
+    coef = coef_matrix(library, list(equations.values()))
+    model = SparseModel(library, list(equations), coef, provenance={"truth": name})
+    return System(name, model, np.array(initial), duration_s, rate_Hz)

@@ -1,0 +1,63 @@
+"""The ionization rate of a field that holds the electron temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Float
+
+from ep2sindy.thruster import closures
+
+
+def ionization_rate(field: xr.Dataset, *, table: str | Path | None = None) -> xr.Dataset:
+    """Add R_ion in m^3/s, the ionization rate coefficient of xenon, from T_e_eV.
+
+    table: CSV file of T_e in eV (increasing) and rate in m^3/s, linear between its rows; any
+    further columns and lines of text are left out. By default the fits of
+    `ep2sindy.thruster.closures`.
+    Raises ValueError if the field has R_ion already or no T_e_eV, or if T_e_eV leaves the
+    table, which is never extrapolated.
+    """
+    if "R_ion" in field:
+        raise ValueError(
+            "the field already has R_ion: leave this step out, or R_ion out of the file's mapping"
+        )
+    if "T_e_eV" not in field:
+        raise ValueError(f"R_ion needs T_e_eV; this field has {list(field.data_vars)}")
+    T_e_eV = field["T_e_eV"].astype(np.float64)
+    if table is None:
+        rate: Callable = closures.ionization_rate
+    else:
+        T_eV, rates = read_rate_table(Path(table))
+        low, high = float(T_e_eV.min()), float(T_e_eV.max())
+        if low < T_eV[0] or high > T_eV[-1]:
+            raise ValueError(
+                f"T_e_eV must stay in the rate table, {T_eV[0]:g} to {T_eV[-1]:g} eV: it runs "
+                f"from {low:g} to {high:g} eV; extend {table}"
+            )
+
+        def rate(T: np.ndarray) -> np.ndarray:
+            return np.interp(T, T_eV, rates)
+
+    R_ion = xr.apply_ufunc(rate, T_e_eV, dask="parallelized", output_dtypes=[np.float64])
+    return field.assign(R_ion=R_ion.drop_attrs(deep=False).assign_attrs(units="m^3/s"))
+
+
+def read_rate_table(
+    path: Path,
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """First two columns of a CSV file: T_e in eV, increasing, and rate in m^3/s."""
+    if not path.is_file():
+        raise ValueError(f"no such rate table: {path.absolute()}")
+    frame = pd.read_csv(path, header=None, comment="#", dtype=str)
+    columns = frame.iloc[:, :2].apply(pd.to_numeric, errors="coerce").dropna().to_numpy(float)
+    if columns.shape[1:] != (2,) or len(columns) < 2 or np.any(np.diff(columns[:, 0]) <= 0):
+        raise ValueError(
+            f"a rate table must have two columns, T_e in eV (increasing) and rate in m^3/s, and "
+            f"two rows or more: {path} has numbers of shape {columns.shape}"
+        )
+    return columns[:, 0], columns[:, 1]
