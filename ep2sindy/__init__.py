@@ -1,1 +1,216 @@
-"""EP2-SINDy: governing equations of plasma-thruster oscillations, found in data."""
+"""EP2-SINDy: governing equations of oscillations, found in data; `import ep2sindy as ep`.
+
+Every name of the package's face stands here and is loaded when it is first used, so that the
+import itself costs nothing and PyTorch is loaded by those alone who refine.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table below
+    from ep2sindy.constraints.fit import constrained_fit as constrained_fit
+    from ep2sindy.constraints.relations import Constraint as Constraint
+    from ep2sindy.constraints.relations import Relation as Relation
+    from ep2sindy.constraints.relations import constraint as constraint
+    from ep2sindy.constraints.relations import relations_from_matrix as relations_from_matrix
+    from ep2sindy.data.open import Variable as Variable
+    from ep2sindy.data.open import open_field as open_field
+    from ep2sindy.data.open import read_field as read_field
+    from ep2sindy.data.open import write_field as write_field
+    from ep2sindy.data.prepare import crop as crop
+    from ep2sindy.data.prepare import decimate as decimate
+    from ep2sindy.data.prepare import derive as derive
+    from ep2sindy.data.prepare import keep_where as keep_where
+    from ep2sindy.data.prepare import low_pass as low_pass
+    from ep2sindy.data.trajectory import Trajectory as Trajectory
+    from ep2sindy.data.zones import Zone as Zone
+    from ep2sindy.data.zones import point as point
+    from ep2sindy.data.zones import zone_average as zone_average
+    from ep2sindy.discovery.blocks import Kept as Kept
+    from ep2sindy.discovery.coefficient_law import TiedFit as TiedFit
+    from ep2sindy.discovery.coefficient_law import tied_fit as tied_fit
+    from ep2sindy.discovery.control_law import ControlLaw as ControlLaw
+    from ep2sindy.discovery.control_law import control_law as control_law
+    from ep2sindy.discovery.discover import Discovery as Discovery
+    from ep2sindy.discovery.discover import discover as discover
+    from ep2sindy.discovery.pointwise import PointSearch as PointSearch
+    from ep2sindy.discovery.pointwise import pointwise as pointwise
+    from ep2sindy.discovery.regimes import Regimes as Regimes
+    from ep2sindy.discovery.regimes import regimes as regimes
+    from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
+    from ep2sindy.discovery.shared_support import discover_jointly as discover_jointly
+    from ep2sindy.library.library import Library as Library
+    from ep2sindy.library.library import named_terms as named_terms
+    from ep2sindy.library.library import polynomial as polynomial
+    from ep2sindy.machine.parallel import Dask as Dask
+    from ep2sindy.machine.parallel import Loky as Loky
+    from ep2sindy.machine.parallel import Serial as Serial
+    from ep2sindy.model.integrated import Integrated as Integrated
+    from ep2sindy.model.integrated import integrate as integrate
+    from ep2sindy.model.model import SparseModel as SparseModel
+    from ep2sindy.model.rollout import Rollout as Rollout
+    from ep2sindy.model.scores import r2 as r2
+    from ep2sindy.refinement.correction import Corrected as Corrected
+    from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
+    from ep2sindy.refinement.methods.gradient_descent import GradientDescent as GradientDescent
+    from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting as MultipleShooting
+    from ep2sindy.refinement.methods.nelder_mead import NelderMead as NelderMead
+    from ep2sindy.refinement.methods.single_shooting import SingleShooting as SingleShooting
+    from ep2sindy.refinement.ode import ODE as ODE
+    from ep2sindy.refinement.refine import Refinement as Refinement
+    from ep2sindy.refinement.refine import loss_against_window as loss_against_window
+    from ep2sindy.refinement.refine import refine as refine
+    from ep2sindy.refinement.refine import refine_many as refine_many
+    from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson
+    from ep2sindy.refinement.steps import RungeKutta as RungeKutta
+    from ep2sindy.refinement.windows import WindowBatch as WindowBatch
+    from ep2sindy.refinement.windows import cut_windows as cut_windows
+    from ep2sindy.regression.differential import Differential as Differential
+    from ep2sindy.regression.rows import Regression as Regression
+    from ep2sindy.regression.splits import BlockSplit as BlockSplit
+    from ep2sindy.regression.splits import RandomSplit as RandomSplit
+    from ep2sindy.regression.test_functions import Boxes as Boxes
+    from ep2sindy.regression.test_functions import Bumps as Bumps
+    from ep2sindy.regression.weak import Weak as Weak
+    from ep2sindy.regression.weighted_weak import WeightedWeak as WeightedWeak
+    from ep2sindy.search.bootstraps import Bootstraps as Bootstraps
+    from ep2sindy.search.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
+    from ep2sindy.search.estimators import STLSQRegressor as STLSQRegressor
+    from ep2sindy.search.front import Candidate as Candidate
+    from ep2sindy.search.front import ParetoFront as ParetoFront
+    from ep2sindy.search.front import fit_support as fit_support
+    from ep2sindy.search.searches import STLSQ as STLSQ
+    from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso
+    from ep2sindy.search.searches import BestSubset as BestSubset
+    from ep2sindy.selection.criteria import BIC as BIC
+    from ep2sindy.selection.criteria import EBIC as EBIC
+    from ep2sindy.selection.criteria import AICc as AICc
+    from ep2sindy.selection.integral import IntegralScore as IntegralScore
+    from ep2sindy.selection.knees import Knee as Knee
+    from ep2sindy.selection.knees import LogKnee as LogKnee
+    from ep2sindy.selection.refined import RefinedScore as RefinedScore
+    from ep2sindy.selection.resampled import CrossValidation as CrossValidation
+    from ep2sindy.selection.resampled import Stability as Stability
+    from ep2sindy.signals.kalman import KalmanSmoother as KalmanSmoother
+    from ep2sindy.signals.smoothers import NoSmoothing as NoSmoothing
+    from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay
+    from ep2sindy.signals.spectrum import dominant_frequency as dominant_frequency
+    from ep2sindy.signals.spectrum import power_spectrum as power_spectrum
+    from ep2sindy.studies.benchmark import SearchVariant as SearchVariant
+    from ep2sindy.studies.parametric.points import Refining as Refining
+    from ep2sindy.studies.parametric.quantities import Quantity as Quantity
+    from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap as TimeBootstrap
+    from ep2sindy.studies.pysindy_variants import PySINDyEnsemble as PySINDyEnsemble
+    from ep2sindy.studies.pysindy_variants import PySINDySsr as PySINDySsr
+    from ep2sindy.studies.pysindy_variants import PySINDyStlsq as PySINDyStlsq
+    from ep2sindy.studies.pysindy_variants import PySINDyVariant as PySINDyVariant
+    from ep2sindy.studies.pysindy_variants import PySINDyWeakForm as PySINDyWeakForm
+    from ep2sindy.synthetic.regions import three_regions as three_regions
+    from ep2sindy.synthetic.systems import System as System
+    from ep2sindy.synthetic.systems import damped_oscillator as damped_oscillator
+    from ep2sindy.synthetic.systems import lorenz as lorenz
+    from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra
+    from ep2sindy.synthetic.systems import van_der_pol as van_der_pol
+    from ep2sindy.thruster.cache import simulate_cached as simulate_cached
+    from ep2sindy.thruster.closures import ExponentialWall as ExponentialWall
+    from ep2sindy.thruster.closures import SheathWall as SheathWall
+    from ep2sindy.thruster.closures import TabulatedRates as TabulatedRates
+    from ep2sindy.thruster.closures import XenonFits as XenonFits
+    from ep2sindy.thruster.ionization import ionization_rate as ionization_rate
+    from ep2sindy.thruster.landmark import LANDMARK_POINT as LANDMARK_POINT
+    from ep2sindy.thruster.landmark import landmark_thruster as landmark_thruster
+    from ep2sindy.thruster.parameters import OPERATING_POINTS as OPERATING_POINTS
+    from ep2sindy.thruster.parameters import AnomalousTransport as AnomalousTransport
+    from ep2sindy.thruster.parameters import MagneticField as MagneticField
+    from ep2sindy.thruster.parameters import OperatingPoint as OperatingPoint
+    from ep2sindy.thruster.parameters import Thruster as Thruster
+    from ep2sindy.thruster.simulate import simulate as simulate
+
+    __version__: str
+
+# Module -> its names that users and configs see. Configs name `ep2sindy.EBIC`, never a module.
+_FACE = {
+    "constraints.fit": "constrained_fit",
+    "constraints.relations": "Relation Constraint constraint relations_from_matrix",
+    "data.open": "Variable open_field write_field read_field",
+    "data.prepare": "crop decimate low_pass derive keep_where",
+    "data.trajectory": "Trajectory",
+    "data.zones": "Zone zone_average point",
+    "discovery.blocks": "Kept",
+    "discovery.coefficient_law": "TiedFit tied_fit",
+    "discovery.control_law": "ControlLaw control_law",
+    "discovery.discover": "Discovery discover",
+    "discovery.pointwise": "PointSearch pointwise",
+    "discovery.regimes": "Regimes regimes",
+    "discovery.shared_support": "JointDiscovery discover_jointly",
+    "library.library": "Library polynomial named_terms",
+    "machine.parallel": "Serial Loky Dask",
+    "model.integrated": "Integrated integrate",
+    "model.model": "SparseModel",
+    "model.rollout": "Rollout",
+    "model.scores": "r2",
+    "refinement.correction": "Corrected refine_with_correction",
+    "refinement.methods.gradient_descent": "GradientDescent",
+    "refinement.methods.multiple_shooting": "MultipleShooting",
+    "refinement.methods.nelder_mead": "NelderMead",
+    "refinement.methods.single_shooting": "SingleShooting",
+    "refinement.ode": "ODE",
+    "refinement.refine": "Refinement refine refine_many loss_against_window",
+    "refinement.steps": "RungeKutta HermiteSimpson",
+    "refinement.windows": "WindowBatch cut_windows",
+    "regression.differential": "Differential",
+    "regression.rows": "Regression",
+    "regression.splits": "RandomSplit BlockSplit",
+    "regression.test_functions": "Boxes Bumps",
+    "regression.weak": "Weak",
+    "regression.weighted_weak": "WeightedWeak",
+    "search.bootstraps": "Bootstraps",
+    "search.estimators": "AdaptiveLassoRegressor STLSQRegressor",
+    "search.front": "Candidate ParetoFront fit_support",
+    "search.searches": "AdaptiveLasso STLSQ BestSubset",
+    "selection.criteria": "AICc BIC EBIC",
+    "selection.integral": "IntegralScore",
+    "selection.knees": "Knee LogKnee",
+    "selection.refined": "RefinedScore",
+    "selection.resampled": "Stability CrossValidation",
+    "signals.kalman": "KalmanSmoother",
+    "signals.smoothers": "SavitzkyGolay NoSmoothing",
+    "signals.spectrum": "power_spectrum dominant_frequency",
+    "studies.benchmark": "SearchVariant",
+    "studies.parametric.points": "Refining",
+    "studies.parametric.quantities": "Quantity",
+    "studies.parametric.time_bootstrap": "TimeBootstrap",
+    "studies.pysindy_variants": (
+        "PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm"
+    ),
+    "synthetic.regions": "three_regions",
+    "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz",
+    "thruster.cache": "simulate_cached",
+    "thruster.closures": "XenonFits TabulatedRates SheathWall ExponentialWall",
+    "thruster.ionization": "ionization_rate",
+    "thruster.landmark": "landmark_thruster LANDMARK_POINT",
+    "thruster.parameters": (
+        "MagneticField AnomalousTransport Thruster OperatingPoint OPERATING_POINTS"
+    ),
+    "thruster.simulate": "simulate",
+}
+_MODULES = {name: module for module, names in _FACE.items() for name in names.split()}
+__all__ = ["__version__", *_MODULES]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("ep2sindy")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'ep2sindy' has no attribute {name!r}; see dir(ep2sindy)")
+    value = getattr(import_module(f"ep2sindy.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

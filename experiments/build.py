@@ -104,8 +104,7 @@ def prepared_steps(config: DictConfig) -> list[Callable[[xr.Dataset], xr.Dataset
     for k, entry in enumerate(config.prepare):
         if not isinstance(entry, DictConfig):
             raise ValueError(
-                f"prepare[{k}] must be like {{_target_: ep2sindy.data.prepare.crop, start_s: 0}}: "
-                f"{entry!r} came"
+                f"prepare[{k}] must be like {{_target_: ep2sindy.crop, start_s: 0}}: {entry!r} came"
             )
         step = instantiate(entry, _partial_=True, _convert_="all")
         try:

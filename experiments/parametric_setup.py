@@ -20,7 +20,6 @@ from experiments.build import (
     terms_of,
 )
 
-STUDIES = "ep2sindy.studies.parametric"
 WITHOUT_OSCILLATION = (STEADY, "decaying", "diverged")  # what a simulation says of itself
 
 
@@ -37,8 +36,8 @@ def study_of(config: DictConfig) -> Study:
         library=library,
         cases=_cases(config, library, terms),
         formulation=instantiate(config.formulation),
-        bootstrap=instantiate(config.bootstrap, _target_=f"{STUDIES}.time_bootstrap.TimeBootstrap"),
-        refining=instantiate(config.refining, _target_=f"{STUDIES}.points.Refining"),
+        bootstrap=instantiate(config.bootstrap, _target_="ep2sindy.TimeBootstrap"),
+        refining=instantiate(config.refining, _target_="ep2sindy.Refining"),
         searching=Searching(
             library=_searched_library(config),
             search=instantiate(config.search),
@@ -68,7 +67,7 @@ def _cases(config: DictConfig, library: Library, terms: dict[str, list[str]]) ->
             raise ValueError(f"cases.{name} must have relations and quantities: {case!r} came")
         relations = case.relations and relations_of(case.relations, key=f"cases.{name}.relations")
         quantities = {
-            str(quantity): instantiate(how, _target_=f"{STUDIES}.quantities.Quantity")
+            str(quantity): instantiate(how, _target_="ep2sindy.Quantity")
             for quantity, how in case.quantities.items()
         }
         found[name] = Case(constraint(library, terms, relations), quantities)

@@ -137,7 +137,7 @@ def test_settings_that_cannot_work_are_refused(
 
 def test_a_rate_table_that_has_changed_has_other_blocks(grid: Path, tmp_path: Path) -> None:
     table = tmp_path / "rates.csv"
-    step = f"{{_target_: ep2sindy.thruster.ionization.ionization_rate, table: {table}}}"
+    step = f"{{_target_: ep2sindy.ionization_rate, table: {table}}}"
     table.write_text("1,1e-15\n100,1e-13\n")
     before = pointwise.blocks_key(composed(*on_file(grid, tmp_path), f"prepare=[{step}]"))
     table.write_text("1,5e-15\n100,5e-13\n")

@@ -333,7 +333,7 @@ def test_mistakes_end_in_one_clear_message(
         (["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this field has"),
         (["bootstraps.n_culled=6"], "n_culled must leave a term: 6 of 6 would go"),
         (
-            ["prepare=[{_target_:ep2sindy.data.prepare.crop,start:1}]"],
+            ["prepare=[{_target_:ep2sindy.crop,start:1}]"],
             "prepare[0], crop: got an unexpected keyword argument 'start'",
         ),
         (["output=Makefile"], "choose another with output=PATH"),

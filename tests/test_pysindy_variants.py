@@ -3,21 +3,21 @@ import pytest
 
 pytest.importorskip("pysindy")
 
-from benchmarks.pysindy_variants import (
-    Ensemble,
-    Rival,
+from ep2sindy.library.library import named_terms
+from ep2sindy.studies.pysindy_variants import (
+    PySINDyEnsemble,
+    PySINDySsr,
+    PySINDyStlsq,
+    PySINDyVariant,
+    PySINDyWeakForm,
     Rows,
     Smoothing,
-    Ssr,
-    Stlsq,
-    WeakForm,
     best_of_each_size,
     pysindy_library,
 )
-from ep2sindy.library.library import named_terms
 from ep2sindy.synthetic.systems import lotka_volterra, van_der_pol
 
-METHODS = [Stlsq(), Ssr(), Ensemble(), WeakForm()]
+METHODS = [PySINDyStlsq(), PySINDySsr(), PySINDyEnsemble(), PySINDyWeakForm()]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
@@ -34,7 +34,7 @@ def test_every_method_has_the_truth_on_the_front_without_noise(method) -> None:
     # Two runs give the same names, their rows put one after the other.
     halves = [run.window(0, 500), run.window(500, 1000)]
     for runs in ([run], halves):
-        finding = Rival(method).find(runs, system.model.library, rng=rng)
+        finding = PySINDyVariant(method).find(runs, system.model.library, rng=rng)
         assert finding.selected is None
         assert all(truth[state] in finding.kept[state] for state in truth)
 
@@ -59,7 +59,7 @@ def test_pysindy_columns_are_put_in_our_order() -> None:
     np.testing.assert_allclose(theta, library.evaluate(values), rtol=1e-14)
 
 
-@pytest.mark.parametrize("variant", [Ssr(), WeakForm()])
+@pytest.mark.parametrize("variant", [PySINDySsr(), PySINDyWeakForm()])
 def test_cubic_terms_carry_our_names(variant) -> None:
     system = van_der_pol()
     rng = np.random.default_rng(0)
@@ -79,7 +79,7 @@ def test_r2_is_that_of_a_least_squares_refit() -> None:
     run = system.trajectory(noise=0.05, rng=rng)
     library = system.model.library
     rows = Smoothing().rows([run], library)
-    for terms, r2 in Stlsq().candidates([run], library, rng=rng)["x"]:
+    for terms, r2 in PySINDyStlsq().candidates([run], library, rng=rng)["x"]:
         columns = rows.theta[:, [library.index(name) for name in terms]]
         coef = np.linalg.lstsq(columns, rows.x_dot[:, 0], rcond=None)[0]
         residual = rows.x_dot[:, 0] - columns @ coef
@@ -96,7 +96,9 @@ def test_the_triangle_keeps_the_gram_matrix() -> None:
     np.testing.assert_allclose(theta.T @ x_dot, rows.theta.T @ rows.x_dot, atol=1e-12)
 
 
-@pytest.mark.parametrize("variant", [Ensemble(n_thresholds=2), WeakForm(n_domains=60)])
+@pytest.mark.parametrize(
+    "variant", [PySINDyEnsemble(n_thresholds=2), PySINDyWeakForm(n_domains=60)]
+)
 def test_draws_come_from_the_rng_and_leave_the_global_state_alone(variant) -> None:
     system = lotka_volterra()
     run = system.trajectory(noise=0.05, rng=np.random.default_rng(5))

@@ -99,7 +99,7 @@ class Smoothing:
 
 
 @dataclass(frozen=True)
-class Stlsq:
+class PySINDyStlsq:
     """Sequentially thresholded least squares, the threshold swept."""
 
     n_thresholds: int = 20
@@ -115,7 +115,7 @@ class Stlsq:
 
 
 @dataclass(frozen=True)
-class Ssr:
+class PySINDySsr:
     """Stepwise sparse regression: the smallest normalised coefficient leaves, one at a time."""
 
     smoothing: Smoothing = Smoothing()
@@ -132,7 +132,7 @@ class Ssr:
 
 
 @dataclass(frozen=True)
-class Ensemble:
+class PySINDyEnsemble:
     """Library bagging: STLSQ on `n_models` libraries with `n_dropped` random terms left out.
 
     For every threshold, the supports are the terms whose inclusion probability over the
@@ -165,7 +165,7 @@ class Ensemble:
 
 
 @dataclass(frozen=True)
-class WeakForm:
+class PySINDyWeakForm:
     """Weak form on random domains of each run, the threshold of STLSQ swept.
 
     half_width: of a domain, as a share of the run.
@@ -204,13 +204,13 @@ class WeakForm:
 
 
 @dataclass(frozen=True)
-class Rival:
+class PySINDyVariant:
     """A method of PySINDy in our benchmark: candidates, of which the user would have to choose.
 
     kept: for every state the best support of each size by R2, and the empty one.
     """
 
-    method: Stlsq | Ssr | Ensemble | WeakForm
+    method: PySINDyStlsq | PySINDySsr | PySINDyEnsemble | PySINDyWeakForm
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
