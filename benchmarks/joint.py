@@ -10,7 +10,6 @@ right, and the errors of the coefficients, free and tied by the law.
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -18,42 +17,25 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.coefficient_law import tied_fit
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.machine.parallel import Loky, Workers
-from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.weighted_weak import WeightedWeak
-from ep2sindy.search.searches import BestSubset, Search
+from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 
 
-@dataclass(frozen=True)
-class Method:
-    """What joint search and single points have in common."""
-
-    formulation: Formulation
-    search: Search
-    selection: Selection
-    depth: int = 1
-
-    def find(self, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:
-        return discover_jointly(
-            points,
-            LIBRARY,
-            formulation=self.formulation,
-            search=self.search,
-            selection=self.selection,
-            depth=self.depth,
-            rng=np.random.default_rng(0),
-        )
+def find(recipe: Recipe, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:
+    """The same search for all points jointly and for one alone."""
+    return discover_jointly(points, LIBRARY, recipe, seed=0)
 
 
 def run_family(
-    method: Method,
+    recipe: Recipe,
     *,
     noises: Sequence[float],
     n_realizations: int,
@@ -75,20 +57,20 @@ def run_family(
         )
     tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
     rows = {}
-    for k, row in workers.run(partial(outcome, method, seed=seed), tasks):
+    for k, row in workers.run(partial(outcome, recipe, seed=seed), tasks):
         rows[k] = row
         progress(len(rows))
     return pd.DataFrame([rows[k] for k in range(len(tasks))])
 
 
-def outcome(method: Method, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
+def outcome(recipe: Recipe, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
     """One realization: one row of `run_family`."""
     noise, number = task
     points = realization(noise, number, seed=seed)
-    joint = method.find(points)
-    pooled = method.find({"all": [run for runs in points.values() for run in runs]})
+    joint = find(recipe, points)
+    pooled = find(recipe, {"all": [run for runs in points.values() for run in runs]})
     row = {"noise": noise, "number": number, "joint": _right(joint), "pooled": _right(pooled)}
-    row |= {point: _right(method.find({point: runs})) for point, runs in points.items()}
+    row |= {point: _right(find(recipe, {point: runs})) for point, runs in points.items()}
     return row | (_errors(joint) if row["joint"] else dict.fromkeys(ERRORS, np.nan))
 
 
@@ -125,10 +107,10 @@ NOISES = (0.0, 0.05, 0.1)
 # fewer windows than terms in a record this short. Five candidates of each size: the rows are
 # weighted under the whole library, where a wrong support can lead its size by a hair; the
 # criterion weighs them again under the candidate.
-METHOD = Method(
+METHOD = Recipe(
     WeightedWeak(Weak(test_functions=Bumps(half_width_s=1.5), split=RandomSplit(0.0))),
     BestSubset(n_best=5),
-    EBIC(),
+    selection=EBIC(),
     depth=5,
 )
 

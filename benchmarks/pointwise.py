@@ -30,6 +30,7 @@ from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.blocks import blocks_of
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
 from ep2sindy.machine.parallel import Serial
 from ep2sindy.regression.differential import Differential
@@ -46,10 +47,12 @@ BLOCK_POINTS = 128
 SEARCH = PointSearch(
     states=["n_i", "n_n"],
     library=named_terms(list(UNITS), TERMS),
-    formulation=Differential(),
-    search=BestSubset(max_terms=5),
-    bootstraps=Bootstraps(n=32, n_culled=0),
-    selection=Knee(),
+    recipe=Recipe(
+        formulation=Differential(),
+        search=BestSubset(max_terms=5),
+        bootstraps=Bootstraps(n=32, n_culled=0),
+        selection=Knee(),
+    ),
 )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from sklearn.metrics import adjusted_rand_score
 
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import Regimes, regimes
 from ep2sindy.machine.parallel import Loky
 from ep2sindy.regression.differential import Differential
@@ -37,10 +38,12 @@ def found(truth: RegionField, rule: Selection, *, noise: float, seed: int) -> Re
     search = PointSearch(
         states=STATES,
         library=truth.library,
-        formulation=Differential(),
-        search=BestSubset(max_terms=5),
-        bootstraps=Bootstraps(n=32, n_culled=0, block=35),
-        selection=rule,
+        recipe=Recipe(
+            formulation=Differential(),
+            search=BestSubset(max_terms=5),
+            bootstraps=Bootstraps(n=32, n_culled=0, block=35),
+            selection=rule,
+        ),
         seed=seed,
     )
     field = truth.noisy(noise, rng=rng).field

@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.discover import discover as discover
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
     from ep2sindy.discovery.pointwise import pointwise as pointwise
+    from ep2sindy.discovery.recipe import Recipe as Recipe
     from ep2sindy.discovery.regimes import Regimes as Regimes
     from ep2sindy.discovery.regimes import regimes as regimes
     from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
@@ -98,7 +99,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay
     from ep2sindy.signals.spectrum import dominant_frequency as dominant_frequency
     from ep2sindy.signals.spectrum import power_spectrum as power_spectrum
-    from ep2sindy.studies.benchmark import SearchVariant as SearchVariant
     from ep2sindy.studies.parametric.points import Refining as Refining
     from ep2sindy.studies.parametric.quantities import Quantity as Quantity
     from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap as TimeBootstrap
@@ -143,6 +143,7 @@ _FACE = {
     "discovery.control_law": "ControlLaw control_law",
     "discovery.discover": "Discovery discover",
     "discovery.pointwise": "PointSearch pointwise",
+    "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",
     "discovery.shared_support": "JointDiscovery discover_jointly",
     "library.library": "Library polynomial named_terms",
@@ -178,7 +179,6 @@ _FACE = {
     "signals.kalman": "KalmanSmoother",
     "signals.smoothers": "SavitzkyGolay NoSmoothing",
     "signals.spectrum": "power_spectrum dominant_frequency",
-    "studies.benchmark": "SearchVariant",
     "studies.parametric.points": "Refining",
     "studies.parametric.quantities": "Quantity",
     "studies.parametric.time_bootstrap": "TimeBootstrap",

@@ -16,6 +16,7 @@ import xarray as xr
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.report.folder import RunFolder
@@ -96,6 +97,12 @@ def _check_positive(numbers: Mapping[str, object]) -> None:
     for key, value in numbers.items():
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"{key} must be a positive number, or null for all: {value!r} came")
+
+
+def recipe_of(config: DictConfig) -> Recipe:
+    """How equations are searched for."""
+    groups = ("formulation", "search", "bootstraps", "selection")
+    return Recipe(**{name: instantiate(config[name]) for name in groups}, depth=config.depth)
 
 
 def prepared_steps(config: DictConfig) -> list[Callable[[xr.Dataset], xr.Dataset]]:

@@ -26,6 +26,7 @@ from experiments.build import (
     inputs_of,
     library_of,
     open_prepared_field,
+    recipe_of,
     selection_of,
     started_run,
 )
@@ -57,11 +58,8 @@ def run(config: DictConfig) -> Path:
         check_durations(config)
         # Everything but the data is built first: a misspelt key must not cost a simulation.
         settings: dict[str, Any] = {
-            "formulation": instantiate(config.formulation),
-            "search": instantiate(config.search),
-            "bootstraps": instantiate(config.bootstraps),
+            "recipe": recipe_of(config),
             "rollout_s": config.rollout_s,
-            "depth": config.depth,
             "rng": np.random.default_rng(config.seed),
         }
         to_trajectory = instantiate(config.trajectory, _convert_="all")
@@ -83,7 +81,7 @@ def run(config: DictConfig) -> Path:
         results = compare_libraries(data, cases, **settings)
         outcome = Outcome(config.experiment, data, results)
         print_outcome(screen, outcome)
-        figures = _figures(outcome, settings["formulation"].smoother, config.figures)
+        figures = _figures(outcome, settings["recipe"].formulation.smoother, config.figures)
         _write(folder, config, outcome, figures)
     return folder.path
 

@@ -14,6 +14,7 @@ from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.integrated import Integrated
 from ep2sindy.report.page import figure_html, page_html, table_html
 from ep2sindy.report.screen import Screen
+from ep2sindy.selection.rule import selected
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.libraries import LibraryResult, candidate_text, front_table
 
@@ -113,7 +114,8 @@ def _rich_front(result: LibraryResult, state: str) -> Table:
             style="bold green" if row["selected"] else None,
         )
     terms = result.discovery.model.terms(state)
-    if terms != result.discovery.chosen[state].coef_by_term:
+    front, score = result.discovery.fronts[state], result.discovery.scores[state]
+    if terms != selected(front, score).coef_by_term:
         table.add_row("", "", "", "", f"weighted: {equation_text(state, terms)}", style="green")
     if state in result.refitted:
         published = equation_text(state, result.case.published[state])

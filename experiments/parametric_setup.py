@@ -11,11 +11,12 @@ from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import ConstantStateError
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.studies.parametric.oscillation import OSCILLATING, STEADY, PointData, point_label
-from ep2sindy.studies.parametric.points import Case, Searching, Study
+from ep2sindy.studies.parametric.points import Case, Study
 from experiments.build import (
     check_library,
     inputs_of,
     open_prepared_field,
+    recipe_of,
     relations_of,
     terms_of,
 )
@@ -35,16 +36,10 @@ def study_of(config: DictConfig) -> Study:
     return Study(
         library=library,
         cases=_cases(config, library, terms),
-        formulation=instantiate(config.formulation),
         bootstrap=instantiate(config.bootstrap, _target_="ep2sindy.TimeBootstrap"),
         refining=instantiate(config.refining, _target_="ep2sindy.Refining"),
-        searching=Searching(
-            library=_searched_library(config),
-            search=instantiate(config.search),
-            bootstraps=instantiate(config.bootstraps),
-            selection=instantiate(config.selection),
-            depth=config.depth,
-        ),
+        searched=_searched_library(config),
+        recipe=recipe_of(config),
     )
 
 

@@ -27,7 +27,7 @@ from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import LiveScalars, write_tensorboard
 from ep2sindy.thruster.parameters import Thruster
-from experiments.build import open_prepared_field, started_run
+from experiments.build import open_prepared_field, recipe_of, started_run
 from experiments.checks import check_counts, check_lists
 from experiments.pointwise_view import Outcome, page, print_outcome, summary, terms_table
 
@@ -161,9 +161,7 @@ def _hparams(config: DictConfig) -> dict[str, Any]:
 def search_settings(config: DictConfig) -> dict[str, Any]:
     return {
         "states": list(config.states),
-        **{key: instantiate(config[key]) for key in ("formulation", "search", "bootstraps")},
-        "selection": instantiate(config.selection),
-        "depth": config.depth,
+        "recipe": recipe_of(config),
         "least_variation": config.least_variation,
         "seed": config.seed,
     }

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.identified import benchmark_figure, merit_table
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Loky
@@ -14,13 +15,13 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
 from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.benchmark import Finding, SearchVariant, Variant, cells, judged, run_benchmark
+from ep2sindy.studies.benchmark import Finding, Variant, cells, judged, run_benchmark
 from ep2sindy.synthetic.draws import realization
 
 TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
 # Draws random bootstraps and a random split: its outcome hangs on its stream.
-BALASSO = SearchVariant(Differential(), AdaptiveLasso(), Bootstraps(n=4), Knee())
-STLSQ_ = SearchVariant(Differential(), STLSQ(), Bootstraps(n=0), Knee())
+BALASSO = Recipe(Differential(), AdaptiveLasso(), Bootstraps(n=4), Knee())
+STLSQ_ = Recipe(Differential(), STLSQ(), Bootstraps(n=0), Knee())
 
 
 @dataclass

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.regression.differential import Differential
@@ -11,20 +14,13 @@ from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.knees import Knee
 from ep2sindy.synthetic.systems import lotka_volterra
 
-SETTINGS = {
-    "formulation": Differential(),
-    "search": AdaptiveLasso(),
-    "bootstraps": Bootstraps(n=8),
-    "selection": Knee("library"),
-}
+RECIPE = Recipe(Differential(), AdaptiveLasso(), Bootstraps(n=8), Knee("library"))
 
 
 def test_predator_and_prey_are_found_in_noisy_data() -> None:
     system = lotka_volterra()
     run = system.trajectory(noise=0.01, rng=np.random.default_rng(0))
-    found = discover(
-        [run], polynomial(["x", "y"], degree=2), **SETTINGS, rng=np.random.default_rng(1)
-    )
+    found = discover([run], polynomial(["x", "y"], degree=2), RECIPE, seed=1)
     for state in ("x", "y"):
         truth, terms = system.model.terms(state), found.model.terms(state)
         assert set(terms) == set(truth)
@@ -36,9 +32,7 @@ def test_two_trajectories_of_different_length_are_one_problem() -> None:
     system = lotka_volterra()
     first = system.trajectory()
     second = system.trajectory(initial=np.array([0.3, 1.2])).window(0, 400)
-    found = discover(
-        [first, second], polynomial(["x", "y"], degree=2), **SETTINGS, rng=np.random.default_rng(1)
-    )
+    found = discover([first, second], polynomial(["x", "y"], degree=2), RECIPE, seed=1)
     assert found.model.terms("x") == pytest.approx({"x": 2 / 3, "x*y": -1.0}, rel=0.01)
 
 
@@ -47,8 +41,8 @@ def test_rescaling_units_rescales_coefficients_and_nothing_else() -> None:
     scale, tempo = np.array([1e18, 3e-14]), 1e-5
     rescaled = Trajectory(t=run.t * tempo, states=run.states * scale, state_names=["x", "y"])
     library = polynomial(["x", "y"], degree=2)
-    plain = discover([run], library, **SETTINGS, rng=np.random.default_rng(1))
-    other = discover([rescaled], library, **SETTINGS, rng=np.random.default_rng(1))
+    plain = discover([run], library, RECIPE, seed=1)
+    other = discover([rescaled], library, RECIPE, seed=1)
     unit = (scale**library.exponents).prod(axis=1)[:, None]
     assert other.model.coef * unit * tempo / scale == pytest.approx(plain.model.coef, rel=1e-9)
     for state, front in plain.fronts.items():
@@ -60,13 +54,9 @@ def test_rescaling_units_rescales_coefficients_and_nothing_else() -> None:
 
 def test_permuting_the_library_changes_nothing() -> None:
     run = lotka_volterra().trajectory(noise=0.02, rng=np.random.default_rng(0))
-    settings = {**SETTINGS, "search": BestSubset(), "bootstraps": Bootstraps(n=0)}
-    forth = discover(
-        [run], polynomial(["x", "y"], degree=2), **settings, rng=np.random.default_rng(1)
-    )
-    back = discover(
-        [run], polynomial(["y", "x"], degree=2), **settings, rng=np.random.default_rng(1)
-    )
+    recipe = replace(RECIPE, search=BestSubset(), bootstraps=Bootstraps(n=0))
+    forth = discover([run], polynomial(["x", "y"], degree=2), recipe, seed=1)
+    back = discover([run], polynomial(["y", "x"], degree=2), recipe, seed=1)
     for state in ("x", "y"):
         terms = {frozenset(split_factors(t)): c for t, c in forth.model.terms(state).items()}
         permuted = {frozenset(split_factors(t)): c for t, c in back.model.terms(state).items()}
@@ -85,7 +75,5 @@ def test_the_model_may_use_inputs() -> None:
     run = Trajectory(
         t=t, states=x[:, None], state_names=["x"], inputs=u[:, None], input_names=["u"]
     )
-    found = discover(
-        [run], polynomial(["x", "u"], degree=2), **SETTINGS, rng=np.random.default_rng(0)
-    )
+    found = discover([run], polynomial(["x", "u"], degree=2), RECIPE, seed=0)
     assert found.model.terms("x") == pytest.approx({"x": -1.0, "u": 2.0}, rel=2e-3)

@@ -7,6 +7,7 @@ from benchmarks.intervals import held
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.splits import RandomSplit
@@ -184,11 +185,10 @@ def test_a_discovered_model_knows_its_intervals() -> None:
     found = discover(
         noisy_runs(system, 0.05),
         system.model.library,
-        formulation=EVERY_ROW,
-        search=BestSubset(),
-        bootstraps=Bootstraps(n=0),
-        selection=EBIC(),
-        rng=np.random.default_rng(0),
+        Recipe(
+            formulation=EVERY_ROW, search=BestSubset(), bootstraps=Bootstraps(n=0), selection=EBIC()
+        ),
+        seed=np.random.default_rng(0),
     )
     assert set(found.model.terms("x")) == {"x", "x*y"}
     low, high = found.model.intervals("x")["x*y"]

@@ -20,7 +20,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.problem import Iteration
 from experiments import constrained, frontier, ils, libraries, weak, weak_windows
-from experiments.build import check_overrides, open_prepared_field, selection_of
+from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -211,8 +211,8 @@ def test_every_formulation_and_selection_finds_predator_and_prey(
     found = discover(
         [run],
         polynomial(["n_i", "n_n"], degree=2),
-        **{k: instantiate(config[k]) for k in ("formulation", "search", "bootstraps", "selection")},
-        rng=np.random.default_rng(0),
+        recipe_of(config),
+        seed=0,
     )
     # Least exact are the differential form, as above, and boxes of a hundred samples, over which
     # the trapezoidal rule leaves 0.1 %.

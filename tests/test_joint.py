@@ -5,10 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from benchmarks.joint import Method, rates, run_family
+from benchmarks.joint import find, rates, run_family
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.coefficient_law import tied_fit
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.machine.parallel import Serial
@@ -18,7 +19,6 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.weighted_weak import WeightedWeak
-from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
 from ep2sindy.selection.knees import Knee
@@ -26,10 +26,10 @@ from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.synthetic.systems import lotka_volterra
 
-METHOD = Method(
+METHOD = Recipe(
     WeightedWeak(Weak(test_functions=Bumps(half_width_s=1.5), split=RandomSplit(0.0))),
     BestSubset(n_best=5),
-    EBIC(),
+    selection=EBIC(),
     depth=5,
 )
 BEST = BestSubset()
@@ -83,10 +83,8 @@ def searched(
     return discover_jointly(
         {point: [label(point)] for point in rows},
         named_terms(NAMES, NAMES),
-        formulation=Given(rows),
-        search=search,
-        selection=selection,
-        rng=np.random.default_rng(0),
+        Recipe(formulation=Given(rows), search=search, selection=selection),
+        seed=np.random.default_rng(0),
     )
 
 
@@ -98,16 +96,9 @@ def searched(
 def test_one_point_gives_what_discover_does(formulation: Formulation, selection: Selection) -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=np.random.default_rng(0)).window(0, 300)
     library = polynomial(["x", "y"], degree=3)
-    settings = {
-        "formulation": formulation,
-        "search": BestSubset(n_best=3),
-        "selection": selection,
-        "depth": 3,
-    }
-    alone = discover(
-        [run], library, **settings, bootstraps=Bootstraps(n=0), rng=np.random.default_rng(1)
-    )
-    joint = discover_jointly({"A": [run]}, library, **settings, rng=np.random.default_rng(1))
+    recipe = Recipe(formulation, BestSubset(n_best=3), selection=selection, depth=3)
+    alone = discover([run], library, recipe, seed=1)
+    joint = discover_jointly({"A": [run]}, library, recipe, seed=1)
     for state, front in alone.fronts.items():
         assert joint.fronts[state].supports == tuple(c.terms for c in front.candidates)
         assert joint.fronts[state].errors == pytest.approx(front.errors, rel=1e-12)
@@ -118,7 +109,7 @@ def test_one_point_gives_what_discover_does(formulation: Formulation, selection:
 
 
 def test_noise_free_equations_come_back_at_every_point() -> None:
-    found = METHOD.find(realization(0.0, 0))
+    found = find(METHOD, realization(0.0, 0))
     for point, parameters in PARAMETERS.items():
         truth = system_at(parameters).model
         assert found.models[point].coef == pytest.approx(truth.coef, rel=1e-8)
@@ -222,7 +213,7 @@ def test_units_and_amplitude_of_one_point_change_nothing(selection: Selection) -
 def test_order_of_points_changes_nothing() -> None:
     points = dict(list(realization(0.05, 1).items())[:3])
     split = replace(METHOD, formulation=Weak(test_functions=Bumps(half_width_s=0.8)))
-    forth, back = split.find(points), split.find(dict(reversed(points.items())))
+    forth, back = find(split, points), find(split, dict(reversed(points.items())))
     assert forth.chosen == back.chosen
     for point in points:
         assert np.array_equal(forth.models[point].coef, back.models[point].coef)
@@ -236,10 +227,8 @@ def test_points_may_be_sampled_differently() -> None:
             "slow": [slow.trajectory(), slow.trajectory().window(0, 400)],
         },
         polynomial(["x", "y"], degree=3),
-        formulation=WeightedWeak(),
-        search=BestSubset(),
-        selection=EBIC(),
-        rng=np.random.default_rng(0),
+        Recipe(formulation=WeightedWeak(), search=BestSubset(), selection=EBIC()),
+        seed=np.random.default_rng(0),
     )
     assert found.models["fast"].terms("x") == pytest.approx({"x": 2 / 3, "x*y": -1.0}, rel=1e-6)
     assert found.models["slow"].terms("x") == pytest.approx({"x": 2 / 3, "x*y": -0.5}, rel=1e-6)
@@ -319,7 +308,7 @@ def test_units_of_parameters_and_points_do_not_change_a_tied_fit() -> None:
 
 def test_a_law_with_a_term_per_point_is_no_tie() -> None:
     points = dict(list(realization(0.05, 0).items())[:2])
-    found = METHOD.find(points)
+    found = find(METHOD, points)
     at = {point: {"p": float(k)} for k, point in enumerate(points)}
     fit = tied_fit(found, STRAIGHT, parameters=at)
     for point in points:
@@ -334,13 +323,13 @@ def test_a_law_with_a_term_per_point_is_no_tie() -> None:
 
 
 def test_a_study_judges_all_points_jointly_and_each_alone() -> None:
-    method = Method(Differential(split=RandomSplit(0.0)), BestSubset(max_terms=3), EBIC())
+    method = Recipe(Differential(split=RandomSplit(0.0)), BestSubset(max_terms=3))
     outcomes = run_family(method, noises=[0.01], n_realizations=2, workers=Serial(), seed=3)
     table = rates(outcomes)
     assert list(table.columns) == ["joint", "pooled", *PARAMETERS]
     points = realization(0.01, 1, seed=3)
     for name, runs in {"joint": points, **{p: {p: points[p]} for p in points}}.items():
-        right = all(set(c) == set(TRUTH[s]) for s, c in method.find(runs).chosen.items())
+        right = all(set(c) == set(TRUTH[s]) for s, c in find(method, runs).chosen.items())
         assert outcomes[name].tolist()[1] == float(right)
         assert table.loc[0.01, name] == 50.0 * outcomes[name].sum()
     assert outcomes["error_tied"].isna().tolist() == (outcomes["joint"] == 0.0).tolist()
@@ -383,7 +372,7 @@ def test_points_that_do_not_agree_are_refused(
     points: dict[str, list[Trajectory]], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        METHOD.find(points)
+        find(METHOD, points)
 
 
 def test_searches_of_one_problem_are_refused() -> None:
@@ -392,8 +381,8 @@ def test_searches_of_one_problem_are_refused() -> None:
 
 
 def test_a_joint_front_without_depth_is_refused() -> None:
-    with pytest.raises(ValueError, match="depth must be at least 1: 0 came"):
-        replace(METHOD, depth=0).find(pair())
+    with pytest.raises(ValueError, match="depth must be a whole number, one or more: 0 came"):
+        find(replace(METHOD, depth=0), pair())
 
 
 @pytest.mark.parametrize(

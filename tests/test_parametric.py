@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.model.model import SparseModel, coef_matrix
@@ -17,7 +18,6 @@ from ep2sindy.regression.resampling import moving_block_counts
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
-from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.knees import Knee
 from ep2sindy.signals.smoothers import NoSmoothing
@@ -28,7 +28,6 @@ from ep2sindy.studies.parametric.points import (
     Fitted,
     PointResult,
     Refining,
-    Searching,
     Study,
     parametric_study,
 )
@@ -61,12 +60,7 @@ CASES = {
         {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
     ),
 }
-SEARCHING = Searching(
-    library=polynomial(["x", "y", "R", "u"], degree=2, products=["x*y*R"]),
-    search=BestSubset(max_terms=3),
-    bootstraps=Bootstraps(n=0),
-    selection=Knee(n_norm="max_terms"),
-)
+SEARCHED = polynomial(["x", "y", "R", "u"], degree=2, products=["x*y*R"])
 
 
 def study(*, weak: bool = True) -> Study:
@@ -74,10 +68,14 @@ def study(*, weak: bool = True) -> Study:
     return Study(
         library=LIBRARY,
         cases=CASES,
-        formulation=Weak(split=every) if weak else Differential(NoSmoothing(), split=every),
         bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
         refining=Refining(n_windows=10, periods=0.5, max_iter=50),
-        searching=SEARCHING,
+        searched=SEARCHED,
+        recipe=Recipe(
+            Weak(split=every) if weak else Differential(NoSmoothing(), split=every),
+            BestSubset(max_terms=3),
+            selection=Knee(n_norm="max_terms"),
+        ),
     )
 
 
@@ -192,7 +190,7 @@ def test_there_is_no_joint_search_of_one_point_or_without_best_subsets(
     law, rng = polynomial(["V", "m"], degree=1), np.random.default_rng(0)
     alone = [points[0], points[3]], [results[0], results[3]]
     assert searched_jointly(*alone, study(), law, rng=rng) is None
-    lasso = replace(study(), searching=replace(SEARCHING, search=AdaptiveLasso()))
+    lasso = replace(study(), recipe=replace(study().recipe, search=AdaptiveLasso()))
     assert searched_jointly(points, results, lasso, law, rng=rng) is None
 
 
@@ -502,7 +500,8 @@ def test_smoothing_biases_least_squares_and_not_refinements(
     samples_per_period: int, missed: float
 ) -> None:
     run = forced(**TRUTHS[0], dt=1.0 / samples_per_period, periods=20)
-    smoothed = replace(study(), formulation=Differential(split=RandomSplit(0.0)))
+    form = Differential(split=RandomSplit(0.0))
+    smoothed = replace(study(), recipe=replace(study().recipe, formulation=form))
     (result,) = results_of([PointData({"V": 1.0}, run)], smoothed)
     for name, value in TRUTHS[0].items():
         fitted, refined = (result.fits[f"constrained{end}"].estimates for end in ("", "_refined"))

@@ -13,6 +13,7 @@ from ep2sindy.data.zones import point
 from ep2sindy.discovery.blocks import Kept, blocks_of
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
 from ep2sindy.machine.parallel import Dask, Loky, Serial
 from ep2sindy.regression.differential import Differential
@@ -57,8 +58,10 @@ def searching(**changes: object) -> PointSearch:
         "search": BestSubset(max_terms=4),
         "bootstraps": Bootstraps(n=8, n_culled=0, block=10),
         "selection": EBIC(),
-    }
-    return PointSearch(**(settings | changes))
+    } | changes
+    names = ("formulation", "search", "bootstraps", "selection")
+    recipe = Recipe(**{name: settings.pop(name) for name in names})
+    return PointSearch(recipe=recipe, **settings)
 
 
 def bytes_of(result: xr.Dataset) -> dict[str, bytes]:
@@ -99,11 +102,8 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     found = discover(
         [run],
         LIBRARY,
-        formulation=search.formulation,
-        search=search.search,
-        bootstraps=search.bootstraps,
-        selection=search.selection,
-        rng=np.random.default_rng(search.seed),
+        search.recipe,
+        seed=search.seed,
     )
     np.testing.assert_allclose(result["coef"].sel(equation="x"), found.model.coef[:, 0], rtol=1e-12)
     chosen = found.chosen["x"]

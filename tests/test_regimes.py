@@ -6,6 +6,7 @@ import xarray as xr
 from sklearn.metrics import adjusted_rand_score
 
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import Regimes, group_points, regimes
 from ep2sindy.machine.parallel import Serial
 from ep2sindy.regression.differential import Differential
@@ -33,10 +34,12 @@ def studied(size: str, noise: float, *, seed: int = 0, one_equation: bool = Fals
     search = PointSearch(
         states=STATES,
         library=truth.library,
-        formulation=Differential(),
-        search=BestSubset(max_terms=5),
-        bootstraps=Bootstraps(n=8, n_culled=0),
-        selection=EBIC(),
+        recipe=Recipe(
+            formulation=Differential(),
+            search=BestSubset(max_terms=5),
+            bootstraps=Bootstraps(n=8, n_culled=0),
+            selection=EBIC(),
+        ),
         seed=seed,
     )
     noisy = truth.noisy(noise, rng=np.random.default_rng(seed))

@@ -6,6 +6,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.many import MAX_ERROR, DrivenWindows, Ensemble
 from ep2sindy.regression.rows import Regression
@@ -367,11 +368,8 @@ def found_by(
     found = discover(
         [system.trajectory(noise=noise, rng=rng)],
         system.model.library,
-        formulation=Weak(),
-        search=BestSubset(),
-        bootstraps=bootstraps,
-        selection=rule,
-        rng=rng,
+        Recipe(formulation=Weak(), search=BestSubset(), bootstraps=bootstraps, selection=rule),
+        seed=rng,
     )
     return {state: found.model.terms(state) for state in system.model.states}
 

@@ -5,6 +5,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.regression.rows import Regression
@@ -45,11 +46,8 @@ def found_in(run: Trajectory, library: Library, form: Weak = EVERY_ROW) -> Disco
     return discover(
         [run],
         library,
-        formulation=form,
-        search=BestSubset(),
-        bootstraps=Bootstraps(n=0),
-        selection=EBIC(),
-        rng=np.random.default_rng(1),
+        Recipe(formulation=form, search=BestSubset(), bootstraps=Bootstraps(n=0), selection=EBIC()),
+        seed=np.random.default_rng(1),
     )
 
 

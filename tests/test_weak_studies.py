@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.identified import frontier_figure
 from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.regression.differential import Differential
@@ -14,7 +15,6 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.benchmark import SearchVariant
 from ep2sindy.studies.frontier import identification_frontier
 from ep2sindy.studies.weak_forms import Setting, boxes_grid, fit_settings, fitted_terms
 from ep2sindy.studies.weak_windows import (
@@ -178,7 +178,7 @@ def test_errors_of_nothing_are_refused(settings: dict) -> None:
         coefficient_errors(sampled(), **(defaults | settings))
 
 
-VARIANT = SearchVariant(
+VARIANT = Recipe(
     formulation=Differential(smooth_library=False),
     search=BestSubset(max_terms=3),
     bootstraps=Bootstraps(n=0),

@@ -8,23 +8,22 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.last_fit import assemble_model, reweighted
-from ep2sindy.library.library import Library
+from ep2sindy.data.given import Runs, trajectories_of
+from ep2sindy.discovery.last_fit import assemble_model, last_fit
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities
-from ep2sindy.regression.rows import Formulation
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
-from ep2sindy.search.searches import Search
-from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.search.front import Candidate, ParetoFront
 
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """What a search leaves: per state a front, scores and the selected candidate; the model.
+    """What a search leaves: per state a front, scores and the last fit of what was selected.
 
     scores: by state, one per candidate of its front, the lowest selected.
+    chosen: by state, the selected candidate as it stands in the model: where the noise of the
+    samples is followed into the rows, fitted again with weights, with its covariance.
     ambiguities: terms that these data cannot tell apart.
     """
 
@@ -36,51 +35,40 @@ class Discovery:
 
 
 def discover(
-    trajectories: Sequence[Trajectory],
-    library: Library,
+    runs: Runs,
+    library: Library | None = None,
+    recipe: Recipe | None = None,
     *,
-    formulation: Formulation,
-    search: Search,
-    bootstraps: Bootstraps,
-    selection: Selection,
-    depth: int = 1,
-    rng: np.random.Generator,
+    seed: int | np.random.Generator = 0,
 ) -> Discovery:
-    """Find sparse equations for every state of the trajectories.
+    """Find sparse equations for every state of the runs.
 
-    Rows are assembled by `formulation`; `search` proposes supports in every bootstrap; each
-    support is fitted to all training rows, and the `depth` best of every size make the front;
-    `selection` picks one per equation. Where the formulation follows the noise of the samples
-    into the rows, the picked terms are fitted again with weights, and their covariance known.
+    The recipe's formulation assembles rows; its search proposes supports in every bootstrap; each
+    support is fitted to all training rows, and the best of every size make the front; its rule
+    selects one per equation. Where the formulation follows the noise of the samples into the
+    rows, the selected terms are fitted again with weights, and their covariance is known.
+    runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`.
+    library: None means every product of the variables of the first run up to degree 2.
+    recipe: None means Recipe(), the route for noisy data that we know to be best.
     """
-    problems = formulation.assemble(trajectories, library, rng=rng)
-    fronts = [
-        pareto_front(problem, found, depth=depth)
-        for problem in problems
-        for found in pooled_supports(problem, search, bootstraps, rng=rng)
-    ]
-    scores = selection.scores(fronts)
-    chosen = [selected(front, score) for front, score in zip(fronts, scores, strict=True)]
-    model = assemble_model(
-        library,
-        [
-            candidate if front.problem.noisy is None else reweighted(front.problem, candidate)
-            for front, candidate in zip(fronts, chosen, strict=True)
-        ],
-        units=trajectories[0].units,
-        provenance={
-            "formulation": repr(formulation),
-            "search": repr(search),
-            "bootstraps": repr(bootstraps),
-            "selection": repr(selection),
-            "trajectories": ", ".join(run.label for run in trajectories),
-        },
-    )
-    states = [front.equation for front in fronts]
+    trajectories = trajectories_of(runs)
+    library = library or polynomial(trajectories[0].names, degree=2)
+    recipe = recipe or Recipe()
+    equations = recipe.searched(trajectories, library, rng=np.random.default_rng(seed))
+    fronts = {equation.front.equation: equation.front for equation in equations}
+    scores, selected = recipe.choice(list(fronts.values()))
+    chosen = [last_fit(*pair) for pair in zip(fronts.values(), selected, strict=True)]
+    labels = ", ".join(run.label for run in trajectories)
+    problems = dict.fromkeys(front.problem for front in fronts.values())
     return Discovery(
-        fronts=dict(zip(states, fronts, strict=True)),
-        scores=dict(zip(states, scores, strict=True)),
-        chosen=dict(zip(states, chosen, strict=True)),
-        model=model,
+        fronts=fronts,
+        scores=dict(zip(fronts, scores, strict=True)),
+        chosen=dict(zip(fronts, chosen, strict=True)),
+        model=assemble_model(
+            library,
+            chosen,
+            units=trajectories[0].units,
+            provenance=recipe.provenance | {"trajectories": labels},
+        ),
         ambiguities=tuple(dict.fromkeys(a for problem in problems for a in ambiguities(problem))),
     )

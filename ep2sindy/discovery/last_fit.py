@@ -12,7 +12,12 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.search.front import Candidate
+from ep2sindy.search.front import Candidate, ParetoFront
+
+
+def last_fit(front: ParetoFront, candidate: Candidate) -> Candidate:
+    """A selected candidate as it goes into the model: weighted, where the noise is known."""
+    return candidate if front.problem.noisy is None else reweighted(front.problem, candidate)
 
 
 def assemble_model(

@@ -13,15 +13,11 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.blocks import Block, Kept, blocks_of
-from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.discovery.last_fit import last_fit
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
 from ep2sindy.machine.parallel import Workers
-from ep2sindy.regression.rows import Formulation
-from ep2sindy.search.bootstraps import Bootstraps, pooled, resamples
-from ep2sindy.search.front import pareto_front
-from ep2sindy.search.searches import Search
-from ep2sindy.selection.rule import Selection, selected
 
 NO_FIT = "no_fit"
 
@@ -40,11 +36,7 @@ class PointSearch:
 
     states: Sequence[str]
     library: Library
-    formulation: Formulation
-    search: Search
-    bootstraps: Bootstraps
-    selection: Selection
-    depth: int = 1
+    recipe: Recipe
     least_variation: float = 1e-3
     seed: int = 0
 
@@ -54,10 +46,8 @@ class PointSearch:
             raise ValueError(
                 f"least_variation must lie in [0, 1): {self.least_variation} came; it is a share"
             )
-        if self.bootstraps.n < 1:
-            raise ValueError(
-                f"a pointwise study needs bootstraps for its spread: n={self.bootstraps.n} came"
-            )
+        if not (n := self.recipe.bootstraps.n):
+            raise ValueError(f"a pointwise study needs bootstraps for its spread: n={n} came")
 
     @cached_property
     def variables(self) -> tuple[str, ...]:
@@ -146,8 +136,10 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
         for state in search.states
     ]
     sizes = {
-        "draw": search.bootstraps.n, "equation": len(search.states), "term": len(search.library),
-    }  # fmt: skip
+        "draw": search.recipe.bootstraps.n,
+        "equation": len(search.states),
+        "term": len(search.library),
+    }
     values = {
         name: ((*dims, *axes), np.full((*(sizes[d] for d in dims), *shape), np.nan))
         for name, dims in LAYOUT.items()
@@ -250,7 +242,7 @@ def _trajectory(
 
 
 def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
-    sizes = (search.bootstraps.n, len(search.states), len(search.library))
+    sizes = (search.recipe.bootstraps.n, len(search.states), len(search.library))
     first = {"draw": 0, "equation": 1, "term": 2}
     return {name: np.full([sizes[first[d]] for d in dims], np.nan) for name, dims in LAYOUT.items()}
 
@@ -258,27 +250,19 @@ def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
 def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit one trajectory; its spread over the bootstraps."""
     rng = np.random.default_rng(search.seed)
-    problems = search.formulation.assemble([run], search.library, rng=rng)
-    drawn = [resamples(problem, search.bootstraps, rng=rng) for problem in problems]
+    equations = search.recipe.searched([run], search.library, rng=rng)
+    _, selected = search.recipe.choice([equation.front for equation in equations])
     point = _nothing(search)
-    places, fronts, supports, found = [], [], [], []
-    for problem, draws in zip(problems, drawn, strict=True):
-        for k in range(len(problem.equations)):
-            places.append((problem, draws, k))
-            found.append(draws.searched(search.search, k))
-            supports.append(pooled(draws, k, found[-1]))
-            fronts.append(pareto_front(problem, supports[-1], depth=search.depth))
-    for row, (front, score) in enumerate(zip(fronts, search.selection.scores(fronts), strict=True)):
-        problem, draws, k = places[row]
-        chosen = selected(front, score)
-        final = chosen if problem.noisy is None else reweighted(problem, chosen)
+    for row, (equation, chosen) in enumerate(zip(equations, selected, strict=True)):
+        problem = equation.front.problem
         mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
         point["coef"][row] = 0.0
-        point["coef"][row, mask] = final.coef
-        point["inclusion"][row] = supports[row].inclusion[chosen.n_terms]
+        point["coef"][row, mask] = last_fit(equation.front, chosen).coef
+        point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
         point["weight"][row] = _shares(point["coef"][row] * problem.theta_scale)
-        fits = draws.fits(k, found[row], mask)
-        point["coef_draws"][:, row] = fits * problem.target_scale[k] / problem.theta_scale
+        fits = equation.draws.fits(equation.number, equation.found, mask)
+        target_scale = problem.target_scale[equation.number]
+        point["coef_draws"][:, row] = fits * target_scale / problem.theta_scale
         point["weight_draws"][:, row] = _shares(fits)
         point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
         point["n_terms"][row] = chosen.n_terms

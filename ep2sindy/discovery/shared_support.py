@@ -9,14 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
-from ep2sindy.discovery.last_fit import assemble_model, reweighted
+from ep2sindy.discovery.last_fit import assemble_model, last_fit
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
-from ep2sindy.regression.rows import Formulation, Regression
-from ep2sindy.search.front import Candidate, ParetoFront, fit_supports, front_order
-from ep2sindy.search.searches import BestSubset, Search
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.front import ParetoFront, fit_supports, front_order
+from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection
 
@@ -54,49 +55,39 @@ class JointDiscovery:
 def discover_jointly(
     points: Mapping[str, Sequence[Trajectory]],
     library: Library,
+    recipe: Recipe | None = None,
     *,
-    formulation: Formulation,
-    search: Search,
-    selection: Selection,
-    depth: int = 1,
-    rng: np.random.Generator,
+    seed: int | np.random.Generator = 0,
 ) -> JointDiscovery:
     """Find equations whose terms are the same at every operating point, coefficients free.
 
     Each point is assembled on its own, with its own sampling, noise and scale. The search finds
     the supports whose product of residuals over the points is least: a term is in or out
-    everywhere. `selection` scores the fits at each point and the scores are added: for AICc, BIC
-    and EBIC that is the criterion of the joint likelihood, the count of supports paid once. A
-    term may vanish at some points, if it shows at others. One point gives what `discover` does
-    without bootstraps.
+    everywhere. The recipe's rule scores the fits at each point and the scores are added: for AICc,
+    BIC and EBIC that is the criterion of the joint likelihood, the count of supports paid once. A
+    term may vanish at some points, if it shows at others. One point gives what `discover` does.
     points: name -> trajectories. Points are assembled in the order of their names.
-    Raises ValueError for no point, points whose states, variables or units differ, or a search
-    that cannot serve several points.
+    recipe: None means Recipe(). Raises ValueError for a search that cannot serve several points,
+    bootstraps, which a joint search has none of, no point, or points whose states, variables or
+    units differ.
     Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
     """
-    if not isinstance(search, BestSubset):
-        raise ValueError(
-            f"a joint search must weigh all points at once: {search} cannot; use BestSubset"
-        )
+    recipe = recipe or Recipe()
+    search = _joint_search(recipe)
     _check_points(points, library)
-    problems = {
-        point: formulation.assemble(points[point], library, rng=rng) for point in sorted(points)
-    }
+    rng = np.random.default_rng(seed)
+    problems = {p: recipe.formulation.assemble(points[p], library, rng=rng) for p in sorted(points)}
     fronts = {
         equation: _joint_front(
-            {p: parts[k] for p, parts in problems.items()}, equation, search, depth
+            {p: parts[k] for p, parts in problems.items()}, equation, search, recipe.depth
         )
         for k, problem in enumerate(next(iter(problems.values())))
         for equation in problem.equations
     }
-    scores = _summed_scores(list(fronts.values()), selection)
+    scores = _summed_scores(list(fronts.values()), recipe.selection)
     best = {state: int(np.argmin(each)) for state, each in zip(fronts, scores, strict=True)}
-    provenance = {
-        "formulation": repr(formulation),
-        "search": repr(search),
-        "selection": repr(selection),
-        "joint": ", ".join(points),
-    }
+    provenance = recipe.provenance | {"joint": ", ".join(points)}
+    del provenance["bootstraps"]
     return JointDiscovery(
         fronts=fronts,
         scores=dict(zip(fronts, scores, strict=True)),
@@ -107,6 +98,19 @@ def discover_jointly(
             for point in points
         },
     )
+
+
+def _joint_search(recipe: Recipe) -> BestSubset:
+    """The search of a recipe that can weigh all points at once."""
+    if not isinstance(recipe.search, BestSubset):
+        raise ValueError(
+            f"a joint search must weigh all points at once: {recipe.search} cannot; use BestSubset"
+        )
+    if recipe.bootstraps.n:
+        raise ValueError(
+            f"a joint search has no bootstraps: {recipe.bootstraps} came; use Bootstraps(n=0)"
+        )
+    return recipe.search
 
 
 def _models(
@@ -120,7 +124,10 @@ def _models(
     return {
         point: assemble_model(
             library,
-            [_last_fit(front.points[point], best[state]) for state, front in fronts.items()],
+            [
+                last_fit(front.points[point], front.points[point].candidates[best[state]])
+                for state, front in fronts.items()
+            ],
             units=runs[0].units,
             provenance={**provenance, "point": point},
         )
@@ -195,9 +202,3 @@ def _summed_scores(
     rule = selection.shared_by(len(points)) if isinstance(selection, EBIC) else selection
     by_point = [rule.scores([front.points[point] for front in fronts]) for point in points]
     return [np.sum(scores, axis=0) for scores in zip(*by_point, strict=True)]
-
-
-def _last_fit(front: ParetoFront, k: int) -> Candidate:
-    """One support as fitted at one point, with weights where the noise is known."""
-    candidate, problem = front.candidates[k], front.problem
-    return candidate if problem.noisy is None else reweighted(problem, candidate)

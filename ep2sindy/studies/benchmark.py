@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Protocol, runtime_checkable
 
@@ -15,63 +14,19 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.recipe import Finding
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
-from ep2sindy.regression.rows import Formulation
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import pareto_front
-from ep2sindy.search.searches import Search
-from ep2sindy.selection.rule import Selection, selected
 from ep2sindy.synthetic.draws import check_systems, realization
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What a variant makes of one realization.
-
-    kept: state -> the supports on its front. selected: state -> the support of its equation, or
-    None where the variant offers candidates and leaves the choice to the user.
-    """
-
-    kept: Mapping[str, Sequence[frozenset[str]]]
-    selected: Mapping[str, frozenset[str]] | None
 
 
 @runtime_checkable
 class Variant(Protocol):
-    """A complete method: trajectories and a library in, supports out."""
+    """A complete method: trajectories and a library in, supports out; a `Recipe` is one."""
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> Finding: ...
-
-
-@dataclass(frozen=True)
-class SearchVariant:
-    """This package's path from rows to a selected support, without the last fit."""
-
-    formulation: Formulation
-    search: Search
-    bootstraps: Bootstraps
-    selection: Selection
-    depth: int = 1
-
-    def find(
-        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
-    ) -> Finding:
-        fronts = [
-            pareto_front(problem, found, depth=self.depth)
-            for problem in self.formulation.assemble(runs, library, rng=rng)
-            for found in pooled_supports(problem, self.search, self.bootstraps, rng=rng)
-        ]
-        scores = self.selection.scores(fronts)
-        return Finding(
-            kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
-            selected={
-                f.equation: frozenset(selected(f, score).terms)
-                for f, score in zip(fronts, scores, strict=True)
-            },
-        )
 
 
 def run_benchmark(

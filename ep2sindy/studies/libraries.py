@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import compress
 
 import numpy as np
@@ -13,14 +13,12 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.last_fit import assemble_model
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library
 from ep2sindy.model.integrated import Integrated, integrate, samples_in
 from ep2sindy.regression.ambiguity import usable_terms
-from ep2sindy.regression.rows import Formulation
-from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.front import Candidate, ParetoFront, fit_support
-from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import Selection, selected
 
 
@@ -52,32 +50,20 @@ def compare_libraries(
     run: Trajectory,
     cases: Mapping[str, LibraryCase],
     *,
-    formulation: Formulation,
-    search: Search,
-    bootstraps: Bootstraps,
+    recipe: Recipe,
     rollout_s: float | None,
-    depth: int = 1,
     rng: np.random.Generator,
 ) -> dict[str, LibraryResult]:
     """Discover a model with every library and integrate it from the first sample.
 
     Each case draws from its own stream, so that adding a case changes no other.
     rollout_s: how far to integrate; None, or more than there is, means to the data's end.
-    depth: candidates kept per size.
     """
     n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
     results = {}
     for (name, case), stream in zip(cases.items(), rng.spawn(len(cases)), strict=True):
-        discovery = discover(
-            [run],
-            case.library,
-            formulation=formulation,
-            search=search,
-            bootstraps=bootstraps,
-            selection=case.selection,
-            depth=depth,
-            rng=stream,
-        )
+        how = replace(recipe, selection=case.selection)
+        discovery = discover(run, case.library, how, seed=stream)
         refitted = _refitted(discovery, case.published)
         results[name] = LibraryResult(
             case=case,

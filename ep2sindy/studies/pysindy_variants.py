@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float
 from sklearn.exceptions import ConvergenceWarning
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.recipe import Finding
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.studies.benchmark import Finding
 
 Candidates = dict[str, list[tuple[tuple[str, ...], float]]]
 

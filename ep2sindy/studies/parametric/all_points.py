@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ep2sindy.discovery.coefficient_law import TiedFit, tied_fit
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
+from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
 from ep2sindy.studies.parametric.points import SEARCHED, Fitted, PointResult, Study
@@ -43,22 +44,18 @@ def searched_jointly(
     law: terms that coefficients are tied by, over the parameters of the points.
     None, too, for a search that cannot weigh several points: only BestSubset does.
     """
-    how = study.searching
     used = {
         point_label(point.parameters): point
         for point, result in zip(points, results, strict=True)
         if result.fits and point.trajectory is not None
     }
-    if len(used) < 2 or not isinstance(how.search, BestSubset):
+    if len(used) < 2 or not isinstance(study.recipe.search, BestSubset):
         return None
     found = discover_jointly(
         {label: [point.trajectory] for label, point in used.items() if point.trajectory},
-        how.library,
-        formulation=study.formulation,
-        search=how.search,
-        selection=how.selection,
-        depth=how.depth,
-        rng=rng,
+        study.searched,
+        replace(study.recipe, bootstraps=Bootstraps(n=0)),
+        seed=rng,
     )
     tied, reason = None, ""
     try:

@@ -13,6 +13,7 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.model.model import SparseModel
@@ -20,10 +21,7 @@ from ep2sindy.model.scores import r2
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.rows import Formulation, Regression
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import Search
-from ep2sindy.selection.rule import Selection
+from ep2sindy.regression.rows import Regression
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.parametric.oscillation import (
     OSCILLATING,
@@ -72,30 +70,20 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Searching:
-    """How terms are looked for, beside those given."""
-
-    library: Library
-    search: Search
-    bootstraps: Bootstraps
-    selection: Selection
-    depth: int = 1
-
-
-@dataclass(frozen=True, eq=False)
 class Study:
     """What is done at every operating point.
 
-    library: holds the terms of all cases. formulation: makes the rows of fits and searches.
+    library: holds the terms of all cases. searched: the library that terms are looked for in, by
+    the recipe, whose formulation makes the rows of the fits as well.
     Raises ValueError for a quantity whose coefficient a case does not have.
     """
 
     library: Library
     cases: Mapping[str, Case]
-    formulation: Formulation
     bootstrap: TimeBootstrap
     refining: Refining
-    searching: Searching
+    searched: Library
+    recipe: Recipe
 
     def __post_init__(self) -> None:
         for case in self.cases.values():
@@ -153,7 +141,7 @@ def parametric_study(
     Raises ValueError, naming the point, where one lacks a state or a variable, differs in its
     unit, or is too short a record.
     """
-    variables = [*study.library.variables, *study.searching.library.variables]
+    variables = [*study.library.variables, *study.searched.variables]
     check_points(points, list(dict.fromkeys(variables)))
     pieces = zip(points, rng.spawn(len(points)), strict=True)
     yield from workers.run(partial(_fitted_point, study=study), pieces)
@@ -184,7 +172,7 @@ def _point_result(point: PointData, study: Study, *, rng: np.random.Generator) -
         return result
     period_s = 1.0 / result.f_Hz
     rows, *streams, last = rng.spawn(2 * len(study.cases) + 2)
-    problems = study.formulation.assemble([run], study.library, rng=rows)
+    problems = study.recipe.formulation.assemble([run], study.library, rng=rows)
     fits = {}
     for k, (name, case) in enumerate(study.cases.items()):
         fits[name] = _least_squares(run, problems, case, study, period_s, rng=streams[2 * k])
@@ -204,7 +192,7 @@ def _least_squares(
     rng: np.random.Generator,
 ) -> Fitted:
     """The case's fit, its intervals and covariance from rows redrawn in blocks of time."""
-    provenance = {"formulation": repr(study.formulation), "trajectories": run.label}
+    provenance = {"formulation": repr(study.recipe.formulation), "trajectories": run.label}
     model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
     n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
     group_s = (run.t[-1] - run.t[0]) / n_groups
@@ -267,17 +255,7 @@ def _refined(
 
 
 def _searched(run: Trajectory, study: Study, *, rng: np.random.Generator) -> Fitted:
-    how = study.searching
-    found = discover(
-        [run],
-        how.library,
-        formulation=study.formulation,
-        search=how.search,
-        bootstraps=how.bootstraps,
-        selection=how.selection,
-        depth=how.depth,
-        rng=rng,
-    )
+    found = discover(run, study.searched, study.recipe, seed=rng)
     problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
     return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))
 

@@ -1,0 +1,82 @@
+"""What people have in hand, as trajectories: tables and arrays."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from ep2sindy.data.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TIMES = ("time", "t", "time_s", "t_s")  # what a table calls its time, in seconds
+
+Run: TypeAlias = "Trajectory | pd.DataFrame | tuple[np.ndarray, np.ndarray]"
+Runs: TypeAlias = "Run | Sequence[Run]"
+
+
+def trajectories_of(runs: object) -> list[Trajectory]:
+    """One run or a list of them as trajectories.
+
+    A run is a Trajectory; a pandas DataFrame with a column of times in s (`time`, `t`, `time_s`,
+    `t_s`) or an index of that name, its other columns being states; or a tuple (t, x) of times
+    (samples,) and states (samples,) or (samples, n_states), which are then called x, or x0, x1 ...
+    Raises ValueError for anything else, and as Trajectory does.
+    """
+    if isinstance(runs, Sequence) and not isinstance(runs, tuple | str):
+        if not runs:
+            raise ValueError("a discovery needs at least one run: an empty list came")
+        return [_trajectory(run, f" {k} of the list") for k, run in enumerate(runs)]
+    return [_trajectory(runs, "")]
+
+
+def _trajectory(run: object, which: str) -> Trajectory:
+    if isinstance(run, Trajectory):
+        return run
+    pandas = sys.modules.get("pandas")  # who has a table has imported it
+    if pandas is not None and isinstance(run, pandas.DataFrame):
+        return _from_table(run)
+    if isinstance(run, tuple) and len(run) == 2:
+        return _from_arrays(*run)
+    raise ValueError(
+        f"a run must be a Trajectory, a pandas DataFrame with a time column, or a tuple (t, x) of "
+        f"arrays; run{which} is of type {type(run).__name__}; several runs go into a list"
+    )
+
+
+def _from_table(table: pd.DataFrame) -> Trajectory:
+    if table.index.name in TIMES:
+        table = table.reset_index()
+    times = [name for name in table.columns if name in TIMES]
+    if len(times) != 1:
+        raise ValueError(
+            f"a table must have one time column, called one of {list(TIMES)}, in s: its columns "
+            f"are {list(map(str, table.columns))}; rename one with table.rename(columns=...)"
+        )
+    states = [name for name in table.columns if name != times[0]]
+    kinds = {str(name): table[name].dtype for name in (times[0], *states)}
+    wrong = {name: str(kind) for name, kind in kinds.items() if kind.kind not in "iuf"}
+    if wrong:
+        raise ValueError(f"columns of a table must hold real numbers: {wrong} came; drop them")
+    values = table[states].to_numpy(dtype=np.float64)
+    return Trajectory(table[times[0]].to_numpy(dtype=np.float64), values, list(map(str, states)))
+
+
+def _from_arrays(t: object, x: object) -> Trajectory:
+    times, states = np.asarray(t), np.asarray(x)
+    if times.ndim != 1 or states.ndim not in (1, 2) or len(times) != len(states):
+        raise ValueError(
+            "arrays (t, x) must have shapes (samples,) and (samples,) or (samples, n_states): "
+            f"{times.shape} and {states.shape} came"
+        )
+    if times.dtype.kind not in "iuf" or states.dtype.kind not in "iuf":
+        raise ValueError(
+            f"arrays (t, x) must hold real numbers: {times.dtype} and {states.dtype} came"
+        )
+    if states.ndim == 1:
+        return Trajectory(times, states[:, None], ["x"])
+    return Trajectory(times, states, [f"x{k}" for k in range(states.shape[1])])

@@ -1,0 +1,104 @@
+"""The recipe: how equations are searched for, in one value that every discovery takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, resamples
+from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
+from ep2sindy.search.searches import BestSubset, Search
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.rule import Selection, selected
+
+
+@dataclass(frozen=True, eq=False)
+class SearchedEquation:
+    """One equation after the search.
+
+    draws: the bootstraps of its rows. number: its place among the equations of those rows.
+    found: what the search proposed in every draw. supports: the same, pooled. front: their fits.
+    """
+
+    draws: Resamples
+    number: int
+    found: Sequence[Bool[np.ndarray, "_ terms"]]
+    supports: Supports
+    front: ParetoFront
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Supports that a method offers, without the last fit.
+
+    kept: state -> the supports on its front. selected: state -> the support of its equation, or
+    None where the method offers candidates and leaves the choice to the user.
+    """
+
+    kept: Mapping[str, Sequence[frozenset[str]]]
+    selected: Mapping[str, frozenset[str]] | None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Rows, search, bootstraps, the rule that selects, and how many candidates it sees per size.
+
+    The defaults are the route that finds known systems most often in noise (docs/benchmark.md);
+    the thesis's is Recipe(Differential(), AdaptiveLasso(), Bootstraps(), Knee()).
+    depth: candidates kept per size: 3 lets a true support win that noise has put second or third.
+    """
+
+    formulation: Formulation = field(default_factory=WeightedWeak)
+    search: Search = field(default_factory=BestSubset)
+    bootstraps: Bootstraps = field(default_factory=lambda: Bootstraps(n=0))
+    selection: Selection = field(default_factory=EBIC)
+    depth: int = 1
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.depth, int) or self.depth < 1:
+            raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")
+
+    def searched(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> list[SearchedEquation]:
+        """Assemble the rows, search every bootstrap of them, and fit what is found."""
+        equations = []
+        for problem in self.formulation.assemble(runs, library, rng=rng):
+            draws = resamples(problem, self.bootstraps, rng=rng)
+            for k in range(len(problem.equations)):
+                found = draws.searched(self.search, k)
+                supports = pooled(draws, k, found)
+                front = pareto_front(problem, supports, depth=self.depth)
+                equations.append(SearchedEquation(draws, k, found, supports, front))
+        return equations
+
+    def choice(
+        self, fronts: Sequence[ParetoFront]
+    ) -> tuple[list[Float[np.ndarray, " candidates"]], list[Candidate]]:
+        """Scores of the candidates of every front, and the one selected from each."""
+        scores = self.selection.scores(fronts)
+        return scores, [selected(*pair) for pair in zip(fronts, scores, strict=True)]
+
+    def find(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> Finding:
+        """The supports alone: what a benchmark counts."""
+        fronts = [equation.front for equation in self.searched(runs, library, rng=rng)]
+        _, chosen = self.choice(fronts)
+        return Finding(
+            kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
+            selected={c.equation: frozenset(c.terms) for c in chosen},
+        )
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """What a model remembers of how it was found."""
+        names = ("formulation", "search", "bootstraps", "selection")
+        return {name: repr(getattr(self, name)) for name in names}

@@ -1,0 +1,72 @@
+import numpy as np
+import pandas as pd
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.data.given import trajectories_of
+
+T = np.linspace(0.0, 3.0, 31)
+X = np.column_stack([np.exp(-T), np.sin(T)])
+
+
+@pytest.mark.parametrize("time", ["time", "t", "time_s", "t_s"])
+def test_a_table_has_its_time_in_a_column_and_states_in_the_others(time: str) -> None:
+    (run,) = trajectories_of(pd.DataFrame({"a": X[:, 0], time: T, "b": X[:, 1]}))
+    assert run.state_names == ("a", "b")
+    np.testing.assert_array_equal(run.t, T)
+    np.testing.assert_array_equal(run.states, X)
+
+
+def test_a_table_may_have_its_time_as_index() -> None:
+    table = pd.DataFrame(X, columns=["a", "b"], index=pd.Index(T, name="t"))
+    (run,) = trajectories_of(table)
+    np.testing.assert_array_equal(run.t, T)
+    assert run.state_names == ("a", "b")
+
+
+def test_arrays_are_named_x() -> None:
+    assert trajectories_of((T, X))[0].state_names == ("x0", "x1")
+    assert trajectories_of((T, X[:, 0]))[0].state_names == ("x",)
+
+
+def test_a_list_holds_several_runs_of_any_kind() -> None:
+    table = pd.DataFrame({"t": T, "x0": X[:, 0], "x1": X[:, 1]})
+    runs = trajectories_of([ep.Trajectory(T, X, ["x0", "x1"]), (T, X), table])
+    assert [run.state_names for run in runs] == [("x0", "x1")] * 3
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ([], "needs at least one run: an empty list came"),
+        ([T, X], "a run must be a Trajectory, a pandas DataFrame .* run 0 of the list is of type"),
+        (X, "run is of type ndarray; several runs go into a list"),
+        (pd.DataFrame({"x": T}), r"must have one time column, .* its columns are \['x'\]"),
+        (pd.DataFrame({"t": T, "time": T, "x": T}), "must have one time column"),
+        (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': "),
+        ((T, X.T), r"must have shapes .*: \(31,\) and \(2, 31\) came"),
+        ((T, X + 1j), "must hold real numbers: float64 and complex128 came"),
+    ],
+    ids=str,
+)
+def test_what_is_no_run_is_refused(runs: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        trajectories_of(runs)
+
+
+def test_discover_needs_no_more_than_data() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=np.random.default_rng(0))
+    found = ep.discover((run.t, run.states))
+    assert found.model.library.names == ("1", "x0", "x1", "x0^2", "x0*x1", "x1^2")
+    assert set(found.model.terms("x0")) == {"x0", "x0*x1"}
+    assert found.model.covariance is not None
+    for state, chosen in found.chosen.items():
+        assert chosen.coef_by_term == found.model.terms(state)
+
+
+def test_a_seed_and_its_generator_give_the_same() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=np.random.default_rng(0))
+    recipe = ep.Recipe(ep.Differential(), ep.AdaptiveLasso(), ep.Bootstraps(n=4), ep.Knee())
+    one = ep.discover(run, recipe=recipe, seed=3)
+    other = ep.discover(run, recipe=recipe, seed=np.random.default_rng(3))
+    assert np.array_equal(one.model.coef, other.model.coef)
