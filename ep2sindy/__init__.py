@@ -25,7 +25,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.data.prepare import keep_where as keep_where
     from ep2sindy.data.prepare import low_pass as low_pass
     from ep2sindy.data.trajectory import Trajectory as Trajectory
+    from ep2sindy.data.zones import GridPoint as GridPoint
     from ep2sindy.data.zones import Zone as Zone
+    from ep2sindy.data.zones import ZoneAverage as ZoneAverage
     from ep2sindy.data.zones import point as point
     from ep2sindy.data.zones import zone_average as zone_average
     from ep2sindy.discovery.blocks import Kept as Kept
@@ -137,7 +139,7 @@ _FACE = {
     "data.open": "Variable open_field write_field read_field",
     "data.prepare": "crop decimate low_pass derive keep_where",
     "data.trajectory": "Trajectory",
-    "data.zones": "Zone zone_average point",
+    "data.zones": "Zone ZoneAverage GridPoint zone_average point",
     "discovery.blocks": "Kept",
     "discovery.coefficient_law": "TiedFit tied_fit",
     "discovery.control_law": "ControlLaw control_law",

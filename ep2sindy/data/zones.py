@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -122,6 +123,40 @@ def zone_average(
         },
         label=label,
     )
+
+
+@dataclass(frozen=True)
+class ZoneAverage:
+    """`zone_average` with everything chosen but the field: how a config says it."""
+
+    states: Sequence[str]
+    zone: Zone | None = None
+    products: Sequence[str] = ()
+    axisymmetric: bool = True
+
+    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
+        return zone_average(
+            field,
+            self.zone,
+            states=self.states,
+            inputs=inputs,
+            products=self.products,
+            axisymmetric=self.axisymmetric,
+            label=label,
+        )
+
+
+@dataclass(frozen=True)
+class GridPoint:
+    """`point` with everything chosen but the field; it has no products."""
+
+    states: Sequence[str]
+    z: float | None = None
+    r: float | None = None
+    products: ClassVar[tuple[str, ...]] = ()
+
+    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
+        return point(field, z=self.z, r=self.r, states=self.states, inputs=inputs, label=label)
 
 
 def point(

@@ -13,14 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
-from matplotlib.figure import Figure
 
 from ep2sindy.machine.files import replacing, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.provenance import commit, versions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -66,13 +68,15 @@ class RunFolder:
     def write_table(self, name: str, table: pd.DataFrame) -> None:
         self.write_text(f"tables/{name}.csv", table.to_csv(index=False))
 
-    def write_figures(self, figures: Mapping[str, Figure]) -> None:
-        for name, figure in figures.items():
-            for suffix in ("png", "pdf"):
-                # Without a date the same run gives the same file.
-                dated = {"CreationDate": None} if suffix == "pdf" else {}
-                with replacing(self.path / "figures" / f"{name}.{suffix}") as temporary:
-                    figure.savefig(temporary, dpi=150, metadata=dated)
+    def write_figure(self, name: str, figure: Figure) -> Path:
+        """As PNG and PDF; returns where the PNG lies."""
+        for suffix in ("pdf", "png"):
+            # Without a date the same run gives the same file.
+            dated = {"CreationDate": None} if suffix == "pdf" else {}
+            path = self.path / "figures" / f"{name}.{suffix}"
+            with replacing(path) as temporary:
+                figure.savefig(temporary, dpi=150, metadata=dated)
+        return path
 
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> None:
         self.write_json(

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console, RenderableType
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from ep2sindy.library.equations import equation_text
+from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
 
@@ -28,5 +34,51 @@ class Screen:
         """Into run.log alone."""
         self._consoles[1].print(text, highlight=False, markup=False)
 
+    def show(self, sections: Sequence[Section]) -> None:
+        """Every section that has something for the screen."""
+        for section in sections:
+            shown = [each for block in section.blocks for each in rendered(block)]
+            if shown:
+                self.print(f"\n[bold]{escape(section.title)}[/bold]")
+                for each in shown:
+                    self.print(each)
+
     def close(self) -> None:
         self._log.close()
+
+
+def rendered(block: Block) -> Iterator[RenderableType]:
+    """What a terminal shows of a block."""
+    match block:
+        case Text(page_only=False):
+            text = escape(block.text)
+            yield f"[bold red]{text}[/bold red]" if block.warning else text
+        case Equation(on_screen=True):
+            lead = f"{block.lead}: " if block.lead else ""
+            text = escape(f"{lead}{equation_text(block.state, block.terms)}")
+            yield f"[italic]{text}[/italic]" if block.aside else text
+        case Table():
+            yield rich_table(block)
+        case Picture() | Text() | Equation():
+            pass
+
+
+def rich_table(table: Table) -> RichTable:
+    numbers = [kind.kind in "iuf" for kind in table.rows.dtypes]
+    cells = [[cell_text(value) for value in row] for row in table.rows.itertuples(index=False)]
+    lines = [list(map(str, table.rows.columns)), *cells]
+    width = sum(max(len(line[k]) for line in lines) + 3 for k in range(len(lines[0])))
+    rich = RichTable(
+        title=escape(table.title) or None,
+        title_justify="left",
+        caption=escape(table.note) or None,
+        caption_justify="left",
+        show_edge=False,
+        padding=(0, 1) if width <= WIDTH else (0, 0),
+    )
+    for name, is_number in zip(table.rows.columns, numbers, strict=True):
+        rich.add_column(escape(str(name)), justify="right" if is_number else "left")
+    for k, row in enumerate(cells):
+        style = "bold green" if k in table.bold else "italic" if k in table.italic else None
+        rich.add_row(*map(escape, row), style=style, end_section=k in table.breaks)
+    return rich

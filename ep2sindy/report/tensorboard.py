@@ -1,51 +1,71 @@
-"""What TensorBoard shows of a run."""
+"""What TensorBoard shows of a run, written as its own event files: no PyTorch is needed."""
 
 from __future__ import annotations
 
+import struct
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
 
-
-class LiveScalars:
-    """Scalars that TensorBoard shows while the run goes on; use it as a context."""
+class Board:
+    """One run in TensorBoard; opened when something is written, for its import takes a while."""
 
     def __init__(self, folder: Path) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # PyTorch takes seconds to import
+        self._folder = folder
+        self._writer: Any = None
 
-        self._writer = SummaryWriter(folder)
+    def scalars(self, scalars: Mapping[str, float], *, step: int) -> None:
+        """Curves that grow while the run goes on."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
 
-    def write(self, scalars: Mapping[str, float], *, step: int) -> None:
-        for name, value in scalars.items():
-            self._writer.add_scalar(name, value, step)
+        values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()]
+        self._add(Summary(value=values), step=step)
         self._writer.flush()
 
-    def __enter__(self) -> LiveScalars:
-        return self
+    def text(self, name: str, text: str) -> None:
+        """Lines as they are, in a fixed font."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.compat.proto.tensor_pb2 import TensorProto
+        from tensorboard.plugins.text.metadata import create_summary_metadata
 
-    def __exit__(self, *exception: object) -> None:
-        self._writer.close()
+        lines = "\n".join(f"    {line}" for line in text.splitlines())
+        tensor = TensorProto(dtype="DT_STRING", string_val=[lines.encode()])
+        kind = create_summary_metadata(display_name=name, description="")
+        self._add(Summary(value=[Summary.Value(tag=name, metadata=kind, tensor=tensor)]))
 
+    def image(self, name: str, png: Path) -> None:
+        """A figure as it was drawn for the folder."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
 
-def write_tensorboard(
-    folder: Path,
-    *,
-    figures: Mapping[str, Figure],
-    texts: Mapping[str, str],
-    hparams: Mapping[str, Any],
-    metrics: Mapping[str, float],
-) -> None:
-    """Figures, equations, and the metrics of one run beside the settings that led to them.
+        content = png.read_bytes()
+        width, height = struct.unpack(">II", content[16:24])  # of the header, which comes first
+        image = Summary.Image(
+            height=height, width=width, colorspace=4, encoded_image_string=content
+        )
+        self._add(Summary(value=[Summary.Value(tag=name, image=image)]))
 
-    Runs are compared by the keys of hparams and metrics: keep them fixed.
-    """
-    from torch.utils.tensorboard import SummaryWriter  # PyTorch takes seconds to import
+    def settings(self, hparams: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """The metrics beside the settings that led to them; runs are compared by their keys."""
+        from tensorboard.plugins.hparams import summary_v2 as hp
 
-    with SummaryWriter(folder) as writer:
-        for name, figure in figures.items():
-            writer.add_figure(name, figure)
-        for name, text in texts.items():
-            writer.add_text(name, text)
-        writer.add_hparams(dict(hparams), dict(metrics), run_name=".")
+        known = [hp.HParam(name) for name in hparams]
+        columns = [hp.Metric(name) for name in metrics]
+        self._add(hp.hparams_config_pb(known, columns))
+        self._add(hp.hparams_pb(dict(hparams), trial_id=self._folder.parent.name))
+        self.scalars(metrics, step=0)
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def _add(self, summary: Any, *, step: int = 0) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+
+        if self._writer is None:
+            from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+            self._writer = EventFileWriter(str(self._folder))
+        self._writer.add_event(Event(wall_time=time.time(), step=step, summary=summary))

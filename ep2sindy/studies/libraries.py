@@ -1,130 +1,210 @@
-"""Several libraries on the same data: what each finds, and how its model runs."""
+"""Several libraries on the same data, side by side: `+exp=breathing`, `+exp=discover`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.last_fit import assemble_model
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.library.equations import equation_text
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.integrated import Integrated, integrate, samples_in
+from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import usable_terms
-from ep2sindy.search.front import Candidate, ParetoFront, fit_support
-from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.report.document import Captioned, Section
+from ep2sindy.report.run import Run
+from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.studies.kinds import Coefficients, PositiveOrAll
+from ep2sindy.studies.libraries_view import comparison, drawings, front_tables, sections, summary
+from ep2sindy.studies.shown import Shown, rollout_table
+from ep2sindy.studies.source import Source
 
 
 @dataclass(frozen=True)
 class LibraryCase:
-    """One library, the rule that selects from its fronts, and published equations if any.
+    """A polynomial library; variables_if_present are left out where the field lacks them.
 
-    published: state -> term -> SI coefficient; where the library has its terms, and the data can
-    tell them from others, they are fitted as well.
+    n_norm: what a knee takes for this library, if not what the recipe says.
     """
 
-    library: Library
-    selection: Selection
-    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    variables: Sequence[str]
+    degree: int
+    variables_if_present: Sequence[str] = ()
+    products: Sequence[str] = ()
+    n_norm: str | None = None
+
+    def library(self, data: xr.Dataset) -> Library:
+        optional = [name for name in self.variables_if_present if name in data]
+        names = [*self.variables, *optional]
+        return polynomial(names, degree=self.degree, products=list(self.products))
+
+    def recipe(self, recipe: Recipe) -> Recipe:
+        """The recipe that all libraries share, with this one's norm where the rule has one."""
+        if self.n_norm is None or not hasattr(recipe.selection, "n_norm"):
+            return recipe
+        rule: Any = recipe.selection
+        return replace(recipe, selection=replace(rule, n_norm=self.n_norm))
 
 
 @dataclass(frozen=True, eq=False)
 class LibraryResult:
-    """One library's discovery and its selected model; the published terms, fitted to our data."""
+    """One library's discovery and its selected model; the published terms, fitted to our data.
 
-    case: LibraryCase
+    given: the published terms as printed, by state.
+    """
+
+    recipe: Recipe
     discovery: Discovery
     selected: Integrated
+    given: Mapping[str, Mapping[str, float]]
     refitted: Mapping[str, Candidate]
     published: Integrated | None
 
 
-def compare_libraries(
-    run: Trajectory,
-    cases: Mapping[str, LibraryCase],
-    *,
-    recipe: Recipe,
-    rollout_s: float | None,
-    rng: np.random.Generator,
-) -> dict[str, LibraryResult]:
-    """Discover a model with every library and integrate it from the first sample.
+@dataclass(frozen=True)
+class Study:
+    """Discover a model with every library, integrate it from the first sample, compare.
 
-    Each case draws from its own stream, so that adding a case changes no other.
     rollout_s: how far to integrate; None, or more than there is, means to the data's end.
+    thesis: by library, published equations: state -> term -> SI coefficient; where the library
+    has the terms, and the data can tell them from others, they are fitted as well.
     """
-    n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
-    results = {}
-    for (name, case), stream in zip(cases.items(), rng.spawn(len(cases)), strict=True):
-        how = replace(recipe, selection=case.selection)
-        discovery = discover(run, case.library, how, seed=stream)
-        refitted = _refitted(discovery, case.published)
-        results[name] = LibraryResult(
-            case=case,
-            discovery=discovery,
-            selected=integrate(discovery.model, run, n_samples),
-            refitted=refitted,
-            published=_integrate_refitted(discovery, refitted, run, n_samples),
-        )
-    return results
+
+    source: Source
+    recipe: Recipe
+    libraries: Mapping[str, LibraryCase]
+    rollout_s: PositiveOrAll
+    figures: Shown
+    thesis: Mapping[str, Coefficients] = field(default_factory=dict)
+
+    def compute(self, run: Run) -> Outcome:
+        recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
+        opened = self.source.field()
+        libraries = {name: case.library(opened) for name, case in self.libraries.items()}
+        data = self.source.sampled(opened, libraries.values(), run)
+        # Each case draws from its own stream, so that adding a case changes no other.
+        streams = np.random.default_rng(run.seed).spawn(len(libraries))
+        results = {
+            name: result_of(
+                data, library, recipes[name], self.thesis.get(name, {}), self.rollout_s, rng=rng
+            )
+            for (name, library), rng in zip(libraries.items(), streams, strict=True)
+        }
+        return Outcome(self, data, results)
+
+
+def result_of(
+    data: Trajectory,
+    library: Library,
+    recipe: Recipe,
+    published: Mapping[str, Mapping[str, float]],
+    rollout_s: float | None,
+    *,
+    rng: np.random.Generator,
+) -> LibraryResult:
+    """What one library finds, and how its model and the published one run."""
+    n_samples = data.n_samples if rollout_s is None else samples_in(data, rollout_s)
+    found = discover(data, library, recipe, seed=rng)
+    refitted = _refitted(found, published)
+    return LibraryResult(
+        recipe=recipe,
+        discovery=found,
+        selected=integrate(found.model, data, n_samples),
+        given=published,
+        refitted=refitted,
+        published=_integrate_refitted(found, refitted, data, n_samples),
+    )
 
 
 def _refitted(
-    discovery: Discovery, published: Mapping[str, Mapping[str, float]]
+    found: Discovery, published: Mapping[str, Mapping[str, float]]
 ) -> dict[str, Candidate]:
     """Published terms fitted to our rows, where the data can tell them from others."""
-    found = {}
+    fits = {}
     for state, terms in published.items():
-        if state in discovery.fronts:
-            problem = discovery.fronts[state].problem
+        if state in found.fronts:
+            problem = found.fronts[state].problem
             at_hand = set(compress(problem.term_names, usable_terms(problem)))
             if set(terms) <= at_hand:
-                found[state] = fit_support(problem, state, list(terms))
-    return found
+                fits[state] = fit_support(problem, state, list(terms))
+    return fits
 
 
 def _integrate_refitted(
-    discovery: Discovery, refitted: Mapping[str, Candidate], run: Trajectory, n_samples: int
+    found: Discovery, refitted: Mapping[str, Candidate], data: Trajectory, n_samples: int
 ) -> Integrated | None:
-    if set(refitted) != set(run.state_names):
+    if set(refitted) != set(data.state_names):
         return None
     model = assemble_model(
-        discovery.model.library,
-        [refitted[state] for state in run.state_names],
-        units=run.units,
-        provenance={**discovery.model.provenance, "search": "published terms, refitted"},
+        found.model.library,
+        [refitted[state] for state in data.state_names],
+        units=data.units,
+        provenance={**found.model.provenance, "search": "published terms, refitted"},
     )
-    return integrate(model, run, n_samples)
+    return integrate(model, data, n_samples)
 
 
-def front_table(
-    front: ParetoFront, scores: Float[np.ndarray, " candidates"], *, label: str
-) -> pd.DataFrame:
-    """A front as the thesis's Tables I-III: one row per candidate, with its equation.
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What every library found in the same data."""
 
-    scores: one per candidate, the lowest selected, in a column called `label`.
-    """
-    chosen = selected(front, scores)
-    return pd.DataFrame(
-        {
-            "equation": front.equation,
-            "n_terms": [c.n_terms for c in front.candidates],
-            "r2_test": [c.r2_test for c in front.candidates],
-            "r2_train": [c.r2_train for c in front.candidates],
-            label: scores,
-            "share": [c.share for c in front.candidates],
-            "selected": [c is chosen for c in front.candidates],
-            "text": [candidate_text(c) for c in front.candidates],
+    study: Study
+    data: Trajectory
+    results: Mapping[str, LibraryResult]
+
+    @property
+    def integrated(self) -> dict[str, Integrated]:
+        """Selected models by library, then those of published terms."""
+        selected = {name: r.selected for name, r in self.results.items()}
+        published = {
+            f"{name}, thesis's terms": r.published
+            for name, r in self.results.items()
+            if r.published is not None
         }
-    )
+        return selected | published
 
+    def models(self) -> dict[str, SparseModel]:
+        return {name: result.discovery.model for name, result in self.results.items()}
 
-def candidate_text(candidate: Candidate) -> str:
-    """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
-    return equation_text(candidate.equation, candidate.coef_by_term)
+    def tables(self) -> dict[str, pd.DataFrame]:
+        found = {}
+        for name, result in self.results.items():
+            found[f"front_{name}"] = front_tables(result)
+            found[f"ambiguities_{name}"] = pd.DataFrame(
+                [(a.exact, " ".join(a.terms), a.message) for a in result.discovery.ambiguities],
+                columns=["exact", "terms", "message"],
+            )
+        for name, integrated in self.integrated.items():
+            slug = name.replace(", ", "_").replace("'s ", "_").replace(" ", "_")
+            found[f"rollout_{slug}"] = rollout_table(self.data, integrated)
+        return found | {"comparison": comparison(self.data, self.integrated)}
+
+    def figures(self) -> dict[str, Captioned]:
+        return drawings(self.data, self.results, self.study.figures)
+
+    def sections(self) -> list[Section]:
+        return sections(self.data, self.results, self.integrated)
+
+    def summary(self) -> dict[str, Any]:
+        return summary(self.data, self.results)
+
+    def headline(self) -> dict[str, float]:
+        scalars = {}
+        for name, result in self.results.items():
+            first = self.data.state_names[0]
+            scalars[f"{name}/f_kHz"] = 1e-3 * result.selected.frequency_Hz[first]
+            scalars[f"{name}/nrmse"] = result.selected.nrmse
+            for state, chosen in result.discovery.chosen.items():
+                scalars[f"{name}/{state}/r2_test"] = chosen.r2_test
+                scalars[f"{name}/{state}/n_terms"] = float(chosen.n_terms)
+                score = float(result.discovery.scores[state].min())
+                scalars[f"{name}/{state}/{result.recipe.selection.label}"] = score
+        return scalars

@@ -1,0 +1,98 @@
+"""A sweep's index: every job with its overrides, how it ended, its headline figures and folder.
+
+Each job writes a record of its own, so that jobs may run side by side or on a cluster, and the
+index is made anew from all records there are.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+
+from ep2sindy.machine.files import write_text
+
+RECORDS = "jobs"
+
+
+@contextmanager
+def noted_job() -> Iterator[Callable[[Path, Mapping[str, float]], None]]:
+    """In a sweep: say which job begins, and note how it ended; otherwise do nothing.
+
+    What comes is told the run folder and the headline figures of a job that came to its end.
+    """
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        yield lambda folder, headline: None
+        return
+    job, overrides = HydraConfig.get().job.num, list(HydraConfig.get().overrides.task)
+    sweep = Path(HydraConfig.get().sweep.dir)
+    record: dict[str, Any] = {"job": job, "overrides": overrides, "status": "failed"}
+    print(f"job {job}: {' '.join(overrides)}", flush=True)
+
+    def done(folder: Path, headline: Mapping[str, float]) -> None:
+        record.update(status="done", folder=str(folder), headline=dict(headline))
+
+    try:
+        yield done
+    except BaseException as error:
+        record["error"] = f"{error}" or type(error).__name__
+        print(f"job {job} failed: {record['error']}", flush=True)
+        raise
+    finally:
+        write_text(sweep / RECORDS / f"{job}.json", json.dumps(record, indent=2) + "\n")
+        write_index(sweep)
+
+
+def records_of(sweep: Path) -> list[dict[str, Any]]:
+    """What every job noted, in their order."""
+    paths = (sweep / RECORDS).glob("[!.]*.json")  # not what is being written
+    return sorted((json.loads(path.read_text("utf-8")) for path in paths), key=lambda r: r["job"])
+
+
+def write_index(sweep: Path) -> None:
+    """`index.csv` of a sweep's folder: a row per job, a column per headline figure."""
+    import pandas as pd
+
+    rows = [
+        {
+            "job": record["job"],
+            "overrides": " ".join(record["overrides"]),
+            "status": record["status"],
+            **record.get("headline", {}),
+            "folder": record.get("folder", ""),
+            "error": record.get("error", ""),
+        }
+        for record in records_of(sweep)
+    ]
+    table = pd.DataFrame(rows)
+    last = ["folder", "error"]
+    ordered = [*(name for name in table.columns if name not in last), *last]
+    write_text(sweep / "index.csv", table[ordered].to_csv(index=False))
+
+
+def index_text(sweep: Path, *, n_figures: int = 4) -> str:
+    """The index for the terminal: what differs between jobs, and the first headline figures."""
+    from rich.console import Console
+    from rich.table import Table
+
+    records = records_of(sweep)
+    everywhere = set.intersection(*(set(record["overrides"]) for record in records))
+    figures = list(dict.fromkeys(name for r in records for name in r.get("headline", {})))
+    table = Table(title=f"sweep of {len(records)} jobs", title_justify="left", show_edge=False)
+    for name in ("job", "overrides", "status", *figures[:n_figures], "folder or error"):
+        table.add_column(name, overflow="fold")
+    for record in records:
+        headline = record.get("headline", {})
+        varied = [text for text in record["overrides"] if text not in everywhere]
+        values = [f"{headline[k]:.4g}" if k in headline else "-" for k in figures[:n_figures]]
+        where = record.get("folder") or record.get("error", "")
+        table.add_row(str(record["job"]), " ".join(varied), record["status"], *values, where)
+    console = Console(width=120)
+    with console.capture() as captured:
+        console.print(table, markup=False)
+    return f"{captured.get()}{sweep / 'index.csv'}"

@@ -1,0 +1,46 @@
+"""A run: what a study may use while it computes, and what is made of its outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ep2sindy.machine.files import replacing
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.screen import Screen
+from ep2sindy.report.tensorboard import Board
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run of a study: its name and seed, where it writes and what it says on the way.
+
+    settings: the whole config as plain values.
+    """
+
+    title: str
+    seed: int
+    folder: RunFolder
+    screen: Screen
+    board: Board
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def say(self, text: str) -> None:
+        """A line for those who watch, at once: on the screen and in run.log."""
+        self.screen.print(text)
+
+    def write(self, name: str, writer: Callable[[Path], None]) -> None:
+        """A file of the study's own into the run folder, whole or not at all."""
+        with replacing(self.folder.path / name) as temporary:
+            writer(temporary)
+
+    @contextmanager
+    def counted(self, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+        """A progress bar; what comes takes the number of pieces done since it was last called."""
+        from tqdm import tqdm
+
+        with tqdm(total=total, unit=unit, disable=None) as bar:
+            yield lambda n_more: bar.update(n_more) and None

@@ -1,0 +1,73 @@
+"""Kinds of settings: what a number in a config must be, beside its type.
+
+`n_realizations: Count` in a study says it once, for the reader and for the check.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Annotated, Any
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a value must be, in words that follow `must be`, and whether one is."""
+
+    says: str
+    fits: Callable[[Any], bool]
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and isfinite(value)
+
+
+Count = Annotated[
+    int, Kind("a whole number, one or more", lambda value: type(value) is int and value >= 1)
+]
+Share = Annotated[
+    float, Kind("a number between 0 and 1", lambda value: _is_number(value) and 0 < value < 1)
+]
+Positive = Annotated[
+    float, Kind("a positive number", lambda value: _is_number(value) and value > 0)
+]
+PositiveOrAll = Annotated[
+    float | None,
+    Kind(
+        "a positive number, or null for all",
+        lambda value: value is None or (_is_number(value) and value > 0),
+    ),
+]
+
+
+def _each_once(values: Any) -> bool:
+    return isinstance(values, list) and bool(values) and len(set(map(str, values))) == len(values)
+
+
+A_LIST = Kind("a list such as [a,b], each once", _each_once)
+Names = Annotated[Sequence[str], A_LIST]
+Counts = Annotated[
+    Sequence[
+        Annotated[
+            int,
+            Kind("whole numbers, above zero", lambda value: type(value) is int and value > 0),
+        ]
+    ],
+    A_LIST,
+]
+Levels = Annotated[
+    Sequence[
+        Annotated[
+            float, Kind("numbers, zero or more", lambda value: _is_number(value) and value >= 0)
+        ]
+    ],
+    A_LIST,
+]
+Positives = Annotated[
+    Sequence[
+        Annotated[float, Kind("numbers, above zero", lambda value: _is_number(value) and value > 0)]
+    ],
+    A_LIST,
+]
+Coefficients = Mapping[str, Mapping[str, float]]  # state -> term -> SI coefficient

@@ -1,0 +1,244 @@
+"""How the outcome of `libraries` reads: fronts, equations, trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures import series
+from ep2sindy.figures.fronts import front_figure
+from ep2sindy.library.equations import equation_text
+from ep2sindy.model.integrated import Integrated
+from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
+from ep2sindy.search.front import Candidate
+from ep2sindy.selection.rule import selected
+from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.studies.shown import INTEGRATED, Shown
+from ep2sindy.studies.source import data_summary
+
+if TYPE_CHECKING:
+    from ep2sindy.studies.libraries import LibraryResult
+
+CAPTIONS = {
+    "data": "States (start of the record) and their power spectra; the line marks the peak.",
+    "trajectories": "Models integrated from the first sample of the data, over the data.",
+    "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
+    "derivatives": "Derivative of the data, and each right-hand side evaluated on the data.",
+    "phase": "Phase portraits: data (grey behind the models) and integrated models.",
+}
+
+
+def candidate_text(candidate: Candidate) -> str:
+    """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
+    return equation_text(candidate.equation, candidate.coef_by_term)
+
+
+def front_tables(result: LibraryResult) -> pd.DataFrame:
+    """Fronts as the thesis's Tables I-III: one row per candidate, with its equation."""
+    return pd.concat([_front_table(result, state) for state in result.discovery.fronts])
+
+
+def _front_table(result: LibraryResult, state: str) -> pd.DataFrame:
+    front, scores = result.discovery.fronts[state], result.discovery.scores[state]
+    chosen = selected(front, scores)
+    return pd.DataFrame(
+        {
+            "equation": front.equation,
+            "n_terms": [c.n_terms for c in front.candidates],
+            "r2_test": [c.r2_test for c in front.candidates],
+            "r2_train": [c.r2_train for c in front.candidates],
+            result.recipe.selection.label: scores,
+            "share": [c.share for c in front.candidates],
+            "selected": [c is chosen for c in front.candidates],
+            "text": [candidate_text(c) for c in front.candidates],
+        }
+    )
+
+
+def comparison(data: Trajectory, models: Mapping[str, Integrated]) -> pd.DataFrame:
+    """One row per model: frequencies in Hz, trajectory error, and a word on the trajectory."""
+    rows = []
+    for name, model in models.items():
+        row: dict[str, Any] = {"model": name}
+        for state, column in zip(data.state_names, data.states.T, strict=True):
+            row[f"f_data_{state}_Hz"] = dominant_frequency(data.t, column)
+            row[f"f_model_{state}_Hz"] = model.frequency_Hz[state]
+        rows.append(row | {"nrmse": model.nrmse, "verdict": model.verdict})
+    return pd.DataFrame(rows)
+
+
+def sections(
+    data: Trajectory, results: Mapping[str, LibraryResult], models: Mapping[str, Integrated]
+) -> list[Section]:
+    found = [_library_section(name, result) for name, result in results.items()]
+    integrated: list[Block] = [_comparison_table(data, models)]
+    integrated += [Picture(name) for name in CAPTIONS]
+    return [*found, Section("Integrated", integrated)]
+
+
+def _library_section(name: str, result: LibraryResult) -> Section:
+    library, found = result.discovery.model.library, result.discovery
+    blocks: list[Block] = [
+        Text(
+            f"{len(library)} terms in {', '.join(library.variables)}; "
+            f"selection: {result.recipe.selection}"
+        ),
+        *(Text(f"note: {each.message}") for each in found.ambiguities if each.exact),
+    ]
+    n_alike = sum(not each.exact for each in found.ambiguities)
+    if n_alike:
+        blocks.append(
+            Text(f"note: nearly proportional terms: {n_alike}, see tables/ambiguities_{name}.csv")
+        )
+    for state in found.fronts:
+        blocks.append(Equation(state, found.model.terms(state)))
+        if state in result.refitted:
+            blocks.append(Equation(state, result.given[state], lead="thesis", aside=True))
+        blocks.append(_readable_front(result, state))
+    return Section(name, [*blocks, Picture(f"front_{name}")])
+
+
+def _readable_front(result: LibraryResult, state: str) -> Table:
+    """Candidates, the selected one bold; below them the last fit, and what was published."""
+    label = result.recipe.selection.label
+    front, scores = result.discovery.fronts[state], result.discovery.scores[state]
+    held_out = front.problem.test.any()
+    r2, header = ("r2_test", "R2 test") if held_out else ("r2_train", "R2 train")
+    columns = ["terms", header, label, "share", "model"]
+    table = _front_table(result, state)
+    rows = []
+    for row in table.to_dict("records"):
+        numbers = _places(row[r2], 3), _places(row[label], 3), _places(row["share"], 2)
+        mark = "  <- selected" if row["selected"] else ""
+        rows.append((str(row["n_terms"]), *numbers, row["text"] + mark))
+    terms = result.discovery.model.terms(state)
+    if terms != selected(front, scores).coef_by_term:
+        rows.append(("", "", "", "", f"weighted: {equation_text(state, terms)}"))
+    italic = []
+    if state in result.refitted:
+        here = result.refitted[state]
+        score = here.r2_test if held_out else here.r2_train
+        italic = [len(rows), len(rows) + 1]
+        rows.append(("", "", "", "", f"thesis: {equation_text(state, result.given[state])}"))
+        text = f"its terms here: {candidate_text(here)}"
+        rows.append((str(here.n_terms), _places(score, 3), "", "", text))
+    bold = np.flatnonzero(table["selected"]).tolist()
+    return Table(pd.DataFrame(rows, columns=columns), bold=bold, italic=italic)
+
+
+def _places(value: float, n: int) -> str:
+    return "-" if np.isnan(value) else f"{value:.{n}f}"
+
+
+def _comparison_table(data: Trajectory, models: Mapping[str, Integrated]) -> Table:
+    rows = []
+    for row in comparison(data, models).to_dict("records"):
+        for k, state in enumerate(data.state_names):
+            rows.append(
+                {
+                    "model": "" if k else row["model"],
+                    "state": state,
+                    "f data": frequency_text(row[f"f_data_{state}_Hz"]),
+                    "f model": frequency_text(row[f"f_model_{state}_Hz"]),
+                    "nrmse": "" if k else _places(row["nrmse"], 3),
+                    "verdict": "" if k else row["verdict"],
+                }
+            )
+    return Table(pd.DataFrame(rows), title=INTEGRATED)
+
+
+def drawings(
+    data: Trajectory, results: Mapping[str, LibraryResult], shown: Shown
+) -> dict[str, Captioned]:
+    span_s = shown.span_s(data)
+    models = {name: r.discovery.model for name, r in results.items()}
+    rollouts = {name: r.selected.rollout for name, r in results.items()}
+    published = {n: r.published.rollout for n, r in results.items() if r.published is not None}
+    formulation: Any = next(iter(results.values())).recipe.formulation
+    smoother = formulation.smoother
+    drawn = {
+        "data": partial(series.data_figure, data, duration_s=span_s, f_max_Hz=shown.up_to_Hz(data)),
+        "trajectories": partial(series.trajectory_figure, data, rollouts, duration_s=span_s),
+        "derivatives": partial(
+            series.derivative_figure, data, models, smoother=smoother, duration_s=span_s
+        ),
+    }
+    if published:
+        drawn["trajectories_thesis"] = partial(
+            series.trajectory_figure, data, published, duration_s=span_s
+        )
+    if len(data.state_names) > 1:
+        plane = data.state_names[:2]
+        drawn["phase"] = partial(
+            series.phase_figure, data, rollouts, plane=plane, duration_s=span_s
+        )
+    fronts = {
+        f"front_{name}": Captioned(
+            partial(
+                front_figure, r.discovery.fronts, r.discovery.scores, label=r.recipe.selection.label
+            ),
+            "Error against number of terms; the star is selected.",
+        )
+        for name, r in results.items()
+    }
+    return {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()} | fronts
+
+
+def summary(data: Trajectory, results: Mapping[str, LibraryResult]) -> dict[str, Any]:
+    first = data.state_names[0]
+    return {
+        "data": data_summary(data),
+        "models": {
+            name: {
+                "equations": {s: _equation_summary(result, s) for s in result.discovery.fronts},
+                "trajectory": _trajectory_summary(result.selected, first),
+                "thesis_terms": _published_summary(result, first),
+            }
+            for name, result in results.items()
+        },
+    }
+
+
+def _trajectory_summary(integrated: Integrated, state: str) -> dict[str, Any]:
+    return {
+        "f_kHz": 1e-3 * integrated.frequency_Hz[state],
+        "nrmse": integrated.nrmse,
+        "diverged": integrated.rollout.diverged,
+    }
+
+
+def _published_summary(result: LibraryResult, state: str) -> dict[str, Any] | None:
+    """The published terms fitted to our data."""
+    if result.published is None:
+        return None
+    return {
+        "equations": {
+            name: {
+                "terms": result.published.model.terms(name),
+                "r2_test": candidate.r2_test,
+                "text": candidate_text(candidate),
+            }
+            for name, candidate in result.refitted.items()
+        },
+        "trajectory": _trajectory_summary(result.published, state),
+    }
+
+
+def _equation_summary(result: LibraryResult, state: str) -> dict[str, Any]:
+    chosen, scores = result.discovery.chosen[state], result.discovery.scores[state]
+    terms = result.discovery.model.terms(state)
+    return {
+        "terms": terms,
+        "n_terms": chosen.n_terms,
+        "r2_test": chosen.r2_test,
+        "r2_train": chosen.r2_train,
+        result.recipe.selection.label: float(scores.min()),
+        "share": chosen.share,
+        "inclusion": dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True)),
+        "text": equation_text(state, terms),
+    }

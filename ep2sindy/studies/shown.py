@@ -1,0 +1,38 @@
+"""What several studies show alike: figures of runs, and runs as tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.integrated import Integrated
+from ep2sindy.studies.kinds import PositiveOrAll
+
+INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How much figures show: the start of a record, and the low end of spectra."""
+
+    duration_s: PositiveOrAll
+    f_max_Hz: PositiveOrAll
+
+    def span_s(self, data: Trajectory) -> float:
+        return self.duration_s or float(data.t[-1] - data.t[0])
+
+    def up_to_Hz(self, data: Trajectory) -> float:
+        return self.f_max_Hz or 0.5 / data.dt_s
+
+
+def rollout_table(data: Trajectory, integrated: Integrated) -> pd.DataFrame:
+    """Model and data, sample by sample, so that the figure can be drawn again."""
+    rollout, states = integrated.rollout, integrated.model.states
+    samples = data.columns(states)[: len(rollout.t)]
+    columns: dict[str, Any] = {"t_s": rollout.t}
+    for k, state in enumerate(states):
+        columns |= {f"{state}_data": samples[:, k], f"{state}_model": rollout.states[:, k]}
+    return pd.DataFrame(columns)

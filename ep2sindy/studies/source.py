@@ -1,0 +1,110 @@
+"""Where a study's data come from: a field, its preparation, and the trajectory made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import xarray as xr
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
+from ep2sindy.report.run import Run
+from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+
+Step = Callable[[xr.Dataset], xr.Dataset]
+
+
+@runtime_checkable
+class Data(Protocol):
+    """A field that is opened when asked for, since that may be a simulation.
+
+    changed: the same with other settings, by their places, such as `operating_point.voltage`.
+    """
+
+    def open(self) -> xr.Dataset: ...
+
+    def changed(self, places: Mapping[str, Any], more: Mapping[str, Any]) -> Data: ...
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSource:
+    """A field and the steps that prepare it."""
+
+    data: Data
+    prepare: Sequence[Step] = ()
+
+    def field(self) -> xr.Dataset:
+        field = self.data.open()
+        for step in self.prepare:
+            field = step(field)
+        return field
+
+
+@runtime_checkable
+class Sampling(Protocol):
+    """How a field becomes a trajectory; states and products are its own."""
+
+    states: Sequence[str]
+    products: Sequence[str]
+
+    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A field, the steps that prepare it, and how it becomes a trajectory."""
+
+    data: Data
+    prepare: Sequence[Step]
+    trajectory: Sampling
+
+    @property
+    def states(self) -> list[str]:
+        return list(self.trajectory.states)
+
+    def field(self) -> xr.Dataset:
+        return FieldSource(self.data, self.prepare).field()
+
+    def inputs(self, libraries: Iterable[Library]) -> list[str]:
+        """Variables of the libraries that are neither states nor averages of products."""
+        products = [f"<{name.replace(' ', '')}>" for name in self.trajectory.products]
+        known = {*self.states, *products}
+        variables = dict.fromkeys(v for library in libraries for v in library.variables)
+        return [name for name in variables if name not in known]
+
+    def sampled(self, field: xr.Dataset, libraries: Iterable[Library], run: Run) -> Trajectory:
+        """The trajectory that libraries need, and a word on it for those who watch."""
+        data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=run.title)
+        say_data(run, data, field.attrs)
+        return data
+
+
+def say_data(run: Run, data: Trajectory, attributes: Mapping[str, Any]) -> None:
+    if "status" in attributes:  # ours, from a simulation
+        run.say(
+            f"simulation: {attributes['status']}; discharge current "
+            f"{attributes['I_d_mean']:.2f} A, standard deviation {attributes['I_d_std']:.2f} A; "
+            f"mass out/in {attributes['mass_balance']:.4f}"
+        )
+        if attributes["status"] != "oscillating":
+            run.say("[bold red]this case does not sustain its oscillation[/bold red]")
+    frequencies = ", ".join(
+        f"{name} {frequency_text(dominant_frequency(data.t, column))}"
+        for name, column in zip(data.state_names, data.states.T, strict=True)
+    )
+    run.say(
+        f"data: {data.n_samples} samples of {data.dt_s:.4g} s; dominant frequency {frequencies}"
+    )
+
+
+def data_summary(data: Trajectory) -> dict[str, Any]:
+    """What a summary says of a trajectory."""
+    return {
+        "n_samples": data.n_samples,
+        "dt_s": data.dt_s,
+        "f_kHz": 1e-3 * dominant_frequency(data.t, data.states[:, 0]),
+        "variables": list(data.names),
+        "units": dict(data.units),
+    }
