@@ -12,7 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ep2sindy.figures.style import COLOURS, GREY
+from ep2sindy.figures.style import COLOURS, GREY, legend_above
 
 COUNTS = ("on_front", "selected")
 
@@ -61,8 +61,7 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
     axes[0].set_xscale("log")
     axes[0].set_yscale("log")
     axes[0].set_ylabel("sampling rate (Hz)")
-    handles = [Line2D([], [], **marker) for marker in _MARKERS.values()]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    legend_above(figure, [Line2D([], [], **marker) for marker in _MARKERS.values()])
     return figure
 
 

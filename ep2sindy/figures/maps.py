@@ -25,7 +25,7 @@ from ep2sindy.figures.panels import (
     map_figure,
     space_axes,
 )
-from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, unit_text
+from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, unit_text
 from ep2sindy.library.equations import latex_derivative, latex_term, latex_term_name
 from ep2sindy.thruster.parameters import Thruster
 
@@ -74,10 +74,8 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
         )
     finish_panels(axes, coef, outline)
     entries = {"source (+)": SOURCE, "sink (−)": SINK} | ({} if flat else {"not selected": ABSENT})
-    figure.legend(
-        handles=[Patch(color=colour, label=label) for label, colour in entries.items()],
-        loc="outside upper center", ncols=len(entries), frameon=False, fontsize=9,
-    )  # fmt: skip
+    patches = [Patch(color=colour, label=label) for label, colour in entries.items()]
+    legend_above(figure, patches, size=9.0)
     return figure
 
 
