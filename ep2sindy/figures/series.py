@@ -150,7 +150,7 @@ def phase_figure(
     axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
     colours = MORE_COLOURS * n_rows
     for ax, colour, (name, curves) in zip(axes.flat, colours, models.items(), strict=False):
-        ax.plot(*data.y.T, color=GREY, lw=1.8, label="data")
+        ax.plot(*data.y.T, color=GREY, lw=1.4, label="data")
         ax.plot(*curves.y.T, color=colour, lw=1.1)
         ax.plot(*curves.y[:1].T, "o", color=colour, ms=4)
         ax.set_title(name, fontsize=9)

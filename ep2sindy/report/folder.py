@@ -22,6 +22,8 @@ from ep2sindy.machine.files import replacing, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.provenance import commit, versions
 
+DPI = 150
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -67,12 +69,14 @@ class RunFolder:
         self.write_text(f"tables/{name}.csv", table.to_csv(index=False))
 
     def write_figures(self, figures: Mapping[str, Figure]) -> None:
+        """As PNG and PDF of one layout, which the figures keep."""
         for name, figure in figures.items():
+            _freeze_layout(figure)
             for suffix in ("png", "pdf"):
                 # Without a date the same run gives the same file.
                 dated = {"CreationDate": None} if suffix == "pdf" else {}
                 with replacing(self.path / "figures" / f"{name}.{suffix}") as temporary:
-                    figure.savefig(temporary, dpi=150, metadata=dated)
+                    figure.savefig(temporary, dpi=DPI, metadata=dated)
 
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> None:
         self.write_json(
@@ -84,6 +88,15 @@ class RunFolder:
                 "versions": {"python": platform.python_version(), **versions()},
             },
         )
+
+
+def _freeze_layout(figure: Figure) -> None:
+    """Solve the layout once: every saving would solve it again, and draw twice."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        figure.set_dpi(DPI)
+        engine.execute(figure)
+        figure.set_layout_engine(None)  # not "none": that placeholder still draws twice
 
 
 def _without_nan(content: Any) -> Any:
