@@ -143,8 +143,8 @@ def phase_figure(
     models = {
         _ending(n, r): _first(r.t, r.states[:, pair], duration_s) for n, r in rollouts.items()
     }
-    n_columns = min(4, len(models))
-    n_rows = -(-len(models) // n_columns)
+    n_rows = -(-len(models) // 4)
+    n_columns = -(-len(models) // n_rows)
     size = (2.6 * n_columns + 0.6, 2.6 * n_rows + 0.7)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
