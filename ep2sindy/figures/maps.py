@@ -31,15 +31,11 @@ from ep2sindy.thruster.parameters import Thruster
 
 ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
 
-
 GAP = 0.12  # half width of the colour bar's middle, where terms are absent
-
 
 SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
 
-
 MEDIANS = "terms that act, with medians over the regime's points that have them"
-
 
 STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
 

@@ -17,9 +17,7 @@ from ep2sindy.library.equations import latex_name
 # Of the quantities that share a panel: their points, and the lines of their laws.
 MARKERS = ("o", "^", "v", "D", "P", "X")
 
-
 LINES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 3)))
-
 
 APART = 0.016  # between fits at one point, of the axis: error bars must not hide each other
 
