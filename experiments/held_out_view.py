@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.settings import settings_figures, settings_trajectory_figure
+from ep2sindy.figures.series import rollout_figures, trajectory_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.page import figure_html, page_html, table_html
@@ -178,8 +178,8 @@ def figures_of(
     rollouts = {name: j.from_sample.integrated.rollout for name, j in outcome.labelled.items()}
     started = {name: j.from_fit.integrated.rollout for name, j in outcome.labelled.items()}
     return {
-        **settings_figures(held, rollouts, duration_s=shown_s, f_max_Hz=f_max_Hz),
-        "trajectories_started": settings_trajectory_figure(held, started, duration_s=shown_s),
+        **rollout_figures(held, rollouts, duration_s=shown_s, f_max_Hz=f_max_Hz),
+        "trajectories_started": trajectory_figure(held, started, duration_s=shown_s),
     }
 
 

@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from ep2sindy.figures.settings import settings_derivative_figure, settings_figures
+from ep2sindy.figures.series import derivative_figure, rollout_figures
 from ep2sindy.regression.test_functions import Boxes
 from ep2sindy.regression.weak import Weak
 from ep2sindy.report.folder import RunFolder
@@ -102,10 +102,8 @@ def _figures(outcome: Outcome, smoother: Smoother, shown: DictConfig) -> dict[st
     rollouts = {name: f.integrated.rollout for name, f in outcome.labelled.items()}
     duration_s = shown.duration_s or float(run.t[-1] - run.t[0])
     return {
-        **settings_figures(run, rollouts, duration_s=duration_s, f_max_Hz=shown.f_max_Hz),
-        "derivatives": settings_derivative_figure(
-            run, models, smoother=smoother, duration_s=duration_s
-        ),
+        **rollout_figures(run, rollouts, duration_s=duration_s, f_max_Hz=shown.f_max_Hz),
+        "derivatives": derivative_figure(run, models, smoother=smoother, duration_s=duration_s),
     }
 
 

@@ -76,6 +76,19 @@ def test_figures_are_written_as_png_and_pdf(tmp_path: Path) -> None:
     assert names == ["line.pdf", "line.png"]
 
 
+def test_a_written_figure_keeps_its_layout(tmp_path: Path) -> None:
+    figure = Figure(layout="constrained")
+    axes = figure.subplots(1, 2)
+    axes[0].set_ylabel("a label that takes room")
+    before = axes[0].get_position().bounds
+    RunFolder.create(tmp_path, "x", now=NOW).write_figures({"line": figure})
+    solved = axes[0].get_position().bounds
+    assert solved != before
+    axes[0].set_ylabel("another\nthat takes\nmore")
+    figure.draw_without_rendering()
+    assert axes[0].get_position().bounds == solved
+
+
 def test_provenance_names_commit_and_versions(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path, "x", now=NOW)
     folder.write_provenance(seed=3, command=["run", "+exp=x"])

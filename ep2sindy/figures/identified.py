@@ -1,4 +1,4 @@
-"""Figures of the benchmark and the frontier: who finds the equations, and when."""
+"""The benchmark as table and heat map, and the frontier: who finds the equations, and when."""
 
 from __future__ import annotations
 
@@ -12,19 +12,31 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ep2sindy.figures.style import COLOURS, GREY
+from ep2sindy.figures.style import COLOURS, GREY, legend_above
 
-COUNTS = ("on_front", "selected")
-
+COUNTS = ("on_front", "selected")  # of realizations
 
 MERITS = (*COUNTS, "mean_correct_terms")
+
+SYSTEM_LABELS = {
+    "oscillator": "damped oscillator",
+    "lotka_volterra": "Lotka–Volterra",
+    "van_der_pol": "Van der Pol",
+    "lorenz": "Lorenz",
+}
+
+PANELS = {"on_front": "true equations on the front", "selected": "true equations selected"}
+
+# One hue from light to dark: read with any colour vision, and in grey.
+COLOURMAP, DARK = "Blues", 0.7
 
 
 def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.DataFrame:
     """One figure of merit of every variant, with its published row below it where there is one.
 
-    published: as `cells`, without the time. Index (variant, is it published), columns (system,
-    noise), in the order of `cells`; counts become percentages of n.
+    cells: as `studies.benchmark.cells` gives them. published: the same, without the time.
+    Index (variant, is it published), columns (system, noise), in the order of `cells`; counts
+    become percentages of n.
     """
     place, shown = ["system", "noise"], ["variant", "system", "noise", merit, "n"]
     known = published.merge(cells[[*place, "variant"]])
@@ -61,8 +73,7 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
     axes[0].set_xscale("log")
     axes[0].set_yscale("log")
     axes[0].set_ylabel("sampling rate (Hz)")
-    handles = [Line2D([], [], **marker) for marker in _MARKERS.values()]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    legend_above(figure, [Line2D([], [], **marker) for marker in _MARKERS.values()])
     return figure
 
 
@@ -78,26 +89,11 @@ _MARKERS: Mapping[tuple[bool, bool], Mapping[str, Any]] = {
 }  # fmt: skip
 
 
-SYSTEM_LABELS = {
-    "oscillator": "damped oscillator",
-    "lotka_volterra": "Lotka–Volterra",
-    "van_der_pol": "Van der Pol",
-    "lorenz": "Lorenz",
-}
-
-
-PANELS = {"on_front": "true equations on the front", "selected": "true equations selected"}
-
-
-# One hue from light to dark: read with any colour vision, and in grey.
-COLOURMAP, DARK = "Blues", 0.7
-
-
 def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
     """How often every variant finds the true equations, in percent, as numbers on a heat map.
 
-    cells, thesis: as for `ep2sindy.figures.identified.merit_table`; the thesis's rows stand in
-    italics below the variants they are about.
+    cells, thesis: as `merit_table` takes them; the thesis's rows stand in italics below the
+    variants they are about.
     """
     tables = {merit: merit_table(cells, thesis, merit) for merit in PANELS}
     n_rows, n_columns = tables["on_front"].shape

@@ -25,21 +25,17 @@ from ep2sindy.figures.panels import (
     map_figure,
     space_axes,
 )
-from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, unit_text
+from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, unit_text
 from ep2sindy.library.equations import latex_derivative, latex_term, latex_term_name
 from ep2sindy.thruster.parameters import Thruster
 
 ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
 
-
 GAP = 0.12  # half width of the colour bar's middle, where terms are absent
-
 
 SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
 
-
 MEDIANS = "terms that act, with medians over the regime's points that have them"
-
 
 STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
 
@@ -74,10 +70,8 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
         )
     finish_panels(axes, coef, outline)
     entries = {"source (+)": SOURCE, "sink (−)": SINK} | ({} if flat else {"not selected": ABSENT})
-    figure.legend(
-        handles=[Patch(color=colour, label=label) for label, colour in entries.items()],
-        loc="outside upper center", ncols=len(entries), frameon=False, fontsize=9,
-    )  # fmt: skip
+    patches = [Patch(color=colour, label=label) for label, colour in entries.items()]
+    legend_above(figure, patches, size=9.0)
     return figure
 
 

@@ -19,13 +19,10 @@ from ep2sindy.thruster.parameters import Thruster
 
 CM = 100.0  # per m
 
-
 PANEL_WIDTH = 1.9  # inches
-
 
 # Neither has a shade near white, which is a cell without a value.
 SHARES = colormaps["viridis"]
-
 
 COUNTS = ListedColormap(colormaps["Purples"](np.linspace(0.35, 1.0, 256)))
 

@@ -1,132 +1,248 @@
-"""Figures of time series: data, trajectories, derivatives, phase planes."""
+"""Figures of time series: data, and models beside them, each in a row or panel of its own."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.style import COLOURS, DATA, axis_label, framing, legend_above, unit_text
-from ep2sindy.library.equations import latex_derivative
-from ep2sindy.library.units import prefixed, unit_product
+from ep2sindy.figures.style import (
+    COLOURS,
+    DATA,
+    GREY,
+    MORE_COLOURS,
+    axis_label,
+    framing,
+    legend_above,
+    power_unit,
+    slope_label,
+    unit_text,
+)
+from ep2sindy.library.units import prefixed
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text, power_spectrum
 
+SINCE_START = "time since start of integration"
+
+
+@dataclass(frozen=True, eq=False)
+class _Curves:
+    """One curve per state over a shared abscissa, in the axis's own prefix."""
+
+    x: Float[np.ndarray, " points"]
+    y: Float[np.ndarray, "points n_states"]
+
 
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
-    """Every state over the first `duration_s`, and its power spectrum up to `f_max_Hz`."""
+    """A row per state: its first `duration_s`, and its power spectrum up to `f_max_Hz`."""
     n = len(run.state_names)
     figure = Figure(figsize=(9.0, 2.2 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, 2, squeeze=False, sharex="col", width_ratios=[3, 2])
-    shown = run.t - run.t[0] <= duration_s
-    per_s, second = prefixed(duration_s)
-    per_Hz, hertz = prefixed(f_max_Hz)
-    for k, name in enumerate(run.state_names):
-        axes[k, 0].plot(per_s * (run.t[shown] - run.t[0]), run.states[shown, k], color=DATA, lw=1)
-        axes[k, 0].set_ylabel(axis_label(name, run.units[name]))
-        frequency, power = power_spectrum(run.t, run.states[:, k])
-        inside = (frequency > 0) & (frequency <= f_max_Hz)
-        axes[k, 1].semilogy(per_Hz * frequency[inside], power[inside], color=COLOURS[0], lw=0.8)
-        peak = dominant_frequency(run.t, run.states[:, k])
-        label = frequency_text(peak)
-        axes[k, 1].axvline(per_Hz * peak, color=COLOURS[1], lw=1, ls="--", label=label)
-        axes[k, 1].legend(loc="upper right", frameon=False)
-        axes[k, 1].set_ylabel(
-            f"power ({unit_text(unit_product([(run.units[name], 2), ('Hz', -1)]))})"
-        )
-    axes[-1, 0].set_xlabel(f"time ({second}s)")
-    axes[-1, 1].set_xlabel(f"frequency ({hertz}Hz)")
+    states = _first(run.t, run.states, duration_s)
+    spectra = _spectra(run.t, run.states, f_max_Hz)
+    for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
+        row[0].plot(states.x, states.y[:, k], color=DATA, lw=1)
+        row[0].set_ylabel(axis_label(name, run.units[name]))
+        row[1].semilogy(spectra.x, spectra.y[:, k], color=COLOURS[0], lw=0.8)
+        peak_Hz = dominant_frequency(run.t, run.states[:, k])
+        peak = prefixed(f_max_Hz)[0] * peak_Hz
+        row[1].axvline(peak, color=COLOURS[1], lw=1, ls="--", label=frequency_text(peak_Hz))
+        row[1].legend(loc="upper right", frameon=False)
+        row[1].set_ylabel(f"power ({unit_text(power_unit(run.units[name]))})")
+    axes[-1, 0].set_xlabel(_time_label(duration_s))
+    axes[-1, 1].set_xlabel(_frequency_label(f_max_Hz))
     return figure
+
+
+def rollout_figures(
+    run: Trajectory,
+    rollouts: Mapping[str, Rollout],
+    *,
+    duration_s: float,
+    f_max_Hz: float | None,
+) -> dict[str, Figure]:
+    """Trajectories, spectra and, of two states or more, phase portraits.
+
+    f_max_Hz: None goes as far as the samples can tell.
+    """
+    figures = {
+        "trajectories": trajectory_figure(run, rollouts, duration_s=duration_s),
+        "spectra": spectrum_figure(run, rollouts, f_max_Hz=f_max_Hz or 0.5 / run.dt_s),
+    }
+    if len(run.state_names) > 1:
+        plane = run.state_names[:2]
+        figures["phase"] = phase_figure(run, rollouts, plane=plane, duration_s=duration_s)
+    return figures
 
 
 def trajectory_figure(
     run: Trajectory, rollouts: Mapping[str, Rollout], *, duration_s: float
 ) -> Figure:
-    """Models integrated from the data's first sample, over the data."""
-    n = len(run.state_names)
-    figure = Figure(figsize=(9.0, 2.4 * n + 0.6), layout="constrained")
-    axes = figure.subplots(n, 1, squeeze=False, sharex=True)[:, 0]
-    start = min((r.t[0] for r in rollouts.values() if len(r.t)), default=run.t[0])
-    per_s, second = prefixed(duration_s)
-    for k, (ax, name) in enumerate(zip(axes, run.state_names, strict=True)):
-        shown = (run.t >= start) & (run.t <= start + duration_s)
-        ax.plot(
-            per_s * (run.t[shown] - start), run.states[shown, k], color=DATA, lw=1.6, label="data"
-        )
-        for colour, (label, rollout) in zip(COLOURS, rollouts.items(), strict=False):
-            inside = rollout.t <= start + duration_s
-            ending = " (diverged)" if rollout.diverged else ""
-            ax.plot(
-                per_s * (rollout.t[inside] - start),
-                rollout.states[inside, k],
-                color=colour,
-                lw=1.1,
-                ls=(0, (5, 1)),
-                label=label + ending,
-            )
-        ax.set_ylim(framing(run.states[shown, k]))
-        ax.set_ylabel(axis_label(name, run.units[name]))
-    axes[-1].set_xlabel(f"time since start of integration ({second}s)")
-    legend_above(figure, axes[0])
+    """A row per model: its run from the data's first sample (colour) over the data (grey)."""
+    data = _first(run.t, run.states, duration_s)
+    models = {_ending(n, r): _first(r.t, r.states, duration_s) for n, r in rollouts.items()}
+    titles = [axis_label(name, run.units[name]) for name in run.state_names]
+    figure, axes = _rows(data, models, titles=titles, x_label=_time_label(duration_s, SINCE_START))
+    _frame(axes, data, models)
     return figure
 
 
 def derivative_figure(
     run: Trajectory, models: Mapping[str, SparseModel], *, smoother: Smoother, duration_s: float
 ) -> Figure:
-    """Derivative of the data, and each model's right-hand side evaluated on the data."""
-    n = len(run.state_names)
-    figure = Figure(figsize=(9.0, 2.4 * n + 0.6), layout="constrained")
-    axes = figure.subplots(n, 1, squeeze=False, sharex=True)[:, 0]
-    shown = run.t - run.t[0] <= duration_s
-    per_s, second = prefixed(duration_s)
-    t = per_s * (run.t[shown] - run.t[0])
-    slope = smoother.derivative(run.t, run.states)
-    for k, (ax, name) in enumerate(zip(axes, run.state_names, strict=True)):
-        ax.plot(t, slope[shown, k], color=DATA, lw=1.6, label="data")
-        for colour, (label, model) in zip(COLOURS, models.items(), strict=False):
-            predicted = model.derivative(run.columns(model.states), run.columns(model.inputs))
-            column = predicted[shown, model.states.index(name)]
-            ax.plot(t, column, color=colour, lw=1.1, ls=(0, (5, 1)), label=label)
-        slope_unit = unit_product([(run.units[name], 1), ("s", -1)])
-        ax.set_ylabel(f"${latex_derivative(name)}$ ({unit_text(slope_unit)})")
-    axes[-1].set_xlabel(f"time ({second}s)")
-    legend_above(figure, axes[0])
+    """A row per model: its right-hand side on the data (colour), the data's derivative (grey)."""
+    data = _first(run.t, smoother.derivative(run.t, run.states), duration_s)
+    sides = {}
+    for name, model in models.items():
+        slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
+        order = [model.states.index(state) for state in run.state_names]
+        sides[name] = _first(run.t, slopes[:, order], duration_s)
+    titles = [slope_label(name, run.units[name]) for name in run.state_names]
+    figure, axes = _rows(data, sides, titles=titles, x_label=_time_label(duration_s))
+    _frame(axes, data, sides)
+    return figure
+
+
+def spectrum_figure(run: Trajectory, rollouts: Mapping[str, Rollout], *, f_max_Hz: float) -> Figure:
+    """A row per model: power spectra of its run (colour) and of the data as long (grey).
+
+    The dashed line marks the data's dominant frequency; a row says its model's.
+    """
+    n_samples = max(len(rollout.t) for rollout in rollouts.values())
+    data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz)
+    models = {_ending(n, r): _spectra(r.t, r.states, f_max_Hz) for n, r in rollouts.items()}
+    titles = [
+        f"power of {axis_label(name, power_unit(run.units[name]))}" for name in run.state_names
+    ]
+    figure, axes = _rows(data, models, titles=titles, x_label=_frequency_label(f_max_Hz))
+    for k, column in enumerate(axes.T):
+        peak = prefixed(f_max_Hz)[0] * dominant_frequency(run.t, run.states[:, k])
+        column[0].set_yscale("log")
+        power = data.y[:, k]
+        column[0].set_ylim(0.3 * np.percentile(power, 2), 10.0 * power.max())
+        for ax, rollout in zip(column, rollouts.values(), strict=True):
+            ax.axvline(peak, color=DATA, lw=0.8, ls="--")
+            if not rollout.diverged:
+                text = frequency_text(dominant_frequency(rollout.t, rollout.states[:, k]))
+                ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=8)
     return figure
 
 
 def phase_figure(
     run: Trajectory, rollouts: Mapping[str, Rollout], *, plane: Sequence[str], duration_s: float
 ) -> Figure:
-    """Phase portrait in the plane of two states: data beside every model, on equal axes."""
-    x, y = (run.state_names.index(name) for name in plane)
-    figure = Figure(figsize=(3.0 * (len(rollouts) + 1), 3.2), layout="constrained")
-    axes = figure.subplots(1, len(rollouts) + 1, squeeze=False, sharex=True, sharey=True)[0]
-    start = min((r.t[0] for r in rollouts.values() if len(r.t)), default=run.t[0])
-    shown = (run.t >= start) & (run.t <= start + duration_s)
-    _orbit(axes[0], run.states[shown], x, y, DATA, "data")
-    for ax, colour, (label, rollout) in zip(axes[1:], COLOURS, rollouts.items(), strict=False):
-        ax.plot(run.states[shown, x], run.states[shown, y], color="#bbbbbb", lw=0.8)
-        inside = rollout.t <= start + duration_s
-        ending = " (diverged)" if rollout.diverged else ""
-        _orbit(ax, rollout.states[inside], x, y, colour, label + ending)
-    axes[0].set_xlim(framing(run.states[shown, x]))
-    axes[0].set_ylim(framing(run.states[shown, y]))
-    for ax in axes:
+    """A panel per model in the plane of two states: its run (colour) over the data (grey)."""
+    pair = [run.state_names.index(name) for name in plane]
+    data = _first(run.t, run.states[:, pair], duration_s)
+    models = {
+        _ending(n, r): _first(r.t, r.states[:, pair], duration_s) for n, r in rollouts.items()
+    }
+    n_rows = -(-len(models) // 4)
+    n_columns = -(-len(models) // n_rows)
+    size = (2.6 * n_columns + 0.6, 2.6 * n_rows + 0.7)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
+    colours = MORE_COLOURS * n_rows
+    for ax, colour, (name, curves) in zip(axes.flat, colours, models.items(), strict=False):
+        ax.plot(*data.y.T, color=GREY, lw=1.4, label="data")
+        ax.plot(*curves.y.T, color=colour, lw=1.1)
+        ax.plot(*curves.y[:1].T, "o", color=colour, ms=4)
+        ax.set_title(name, fontsize=9)
+    x_limits, y_limits = _limits(data, models)
+    axes[0, 0].set(xlim=x_limits, ylim=y_limits)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(axis_label(plane[1], run.units[plane[1]]))
+    for ax in axes.flat[len(models) :]:
+        ax.remove()
+    for ax in axes.flat[max(0, len(models) - n_columns) : len(models)]:  # none below it
+        ax.tick_params(labelbottom=True)
+        ax.xaxis.get_offset_text().set_visible(True)
         ax.set_xlabel(axis_label(plane[0], run.units[plane[0]]))
-    axes[0].set_ylabel(axis_label(plane[1], run.units[plane[1]]))
+    for ax in axes[1:, 0]:  # the first panel's factor is everyone's
+        ax.yaxis.get_offset_text().set_visible(False)
+    legend_above(figure, axes[0, 0].lines[:1], size=9.0)
     return figure
 
 
-def _orbit(
-    ax: Axes, states: Float[np.ndarray, "samples states"], x: int, y: int, colour: str, label: str
-) -> None:
-    ax.plot(states[:, x], states[:, y], color=colour, lw=1.0)
-    ax.plot(states[:1, x], states[:1, y], "o", color=colour, ms=4)
-    ax.set_title(label, fontsize=10)
+def _rows(
+    data: _Curves, models: Mapping[str, _Curves], *, titles: Sequence[str], x_label: str
+) -> tuple[Figure, np.ndarray]:
+    """A row per model, a column per state; the data in grey behind."""
+    n_rows, n_columns = len(models), len(titles)
+    height = float(np.clip(5.0 / n_rows, 1.05, 2.2))
+    size = (max(10.0, 2.6 * n_columns + 1.0), height * n_rows + 1.2)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey="col")
+    colours = MORE_COLOURS * n_rows
+    for row, colour, (name, curves) in zip(axes, colours, models.items(), strict=False):
+        for k, ax in enumerate(row):
+            # Wider than the model, so that it shows on both sides of one that follows it.
+            ax.plot(data.x, data.y[:, k], color=GREY, lw=2.0, label="data")
+            ax.plot(curves.x, curves.y[:, k], color=colour, lw=1.1)
+            ax.tick_params(labelsize=8)
+            ax.yaxis.get_offset_text().set(size=8)
+        row[0].set_ylabel(
+            name.replace(", ", ",\n"), rotation=0, ha="right", va="center", fontsize=9
+        )
+    for ax in axes[1:].flat:  # columns share their axis, so the first row's factor is everyone's
+        ax.yaxis.get_offset_text().set_visible(False)
+    for column, title in zip(axes.T, titles, strict=True):
+        column[0].set_title(title, fontsize=10)
+        column[-1].set_xlabel(x_label)
+    legend_above(figure, axes[0, 0].lines[:1], size=9.0)
+    return figure, axes
+
+
+def _frame(axes: np.ndarray, data: _Curves, models: Mapping[str, _Curves]) -> None:
+    for ax, limits in zip(axes[0], _limits(data, models), strict=True):
+        ax.set_ylim(limits)
+
+
+def _limits(data: _Curves, models: Mapping[str, _Curves]) -> list[tuple[float, float]]:
+    together = np.concatenate([curves.y for curves in models.values()])
+    return [framing(*pair) for pair in zip(data.y.T, together.T, strict=True)]
+
+
+def _first(
+    t: Float[np.ndarray, " samples"],
+    values: Float[np.ndarray, "samples n_states"],
+    duration_s: float,
+) -> _Curves:
+    """What lies in the first `duration_s`."""
+    since = t - t[:1]
+    shown = since <= duration_s
+    return _Curves(prefixed(duration_s)[0] * since[shown], values[shown])
+
+
+def _spectra(
+    t: Float[np.ndarray, " samples"],
+    states: Float[np.ndarray, "samples n_states"],
+    f_max_Hz: float,
+) -> _Curves:
+    """Power of every state up to `f_max_Hz`; none for a run that stopped at once."""
+    if len(t) < 8:
+        return _Curves(np.empty(0), np.empty((0, states.shape[1])))
+    pairs = [power_spectrum(t, column) for column in states.T]
+    frequency = pairs[0][0]
+    power = np.stack([power for _, power in pairs], axis=1)
+    shown = (frequency > 0.0) & (frequency <= f_max_Hz)
+    drawable = np.maximum(power[shown], np.finfo(float).tiny)  # on a log scale
+    return _Curves(prefixed(f_max_Hz)[0] * frequency[shown], drawable)
+
+
+def _time_label(duration_s: float, what: str = "time") -> str:
+    return f"{what} ({prefixed(duration_s)[1]}s)"
+
+
+def _frequency_label(f_max_Hz: float) -> str:
+    return f"frequency ({prefixed(f_max_Hz)[1]}Hz)"
+
+
+def _ending(name: str, rollout: Rollout) -> str:
+    return f"{name} (diverged)" if rollout.diverged else name

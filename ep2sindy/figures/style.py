@@ -3,44 +3,71 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
-from ep2sindy.library.equations import latex_name
+from ep2sindy.library.equations import latex_derivative, latex_name
+from ep2sindy.library.units import unit_product
 
-DATA = "#222222"
-
+DATA, GREY = "#222222", "#aaaaaa"
 
 # Okabe & Ito 2008: told apart with any colour vision, and in print.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
-
-def framing(values: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    """Limits of twice the data's range: a model that runs away must not shrink the rest."""
-    low, high = float(values.min()), float(values.max())
-    margin = 0.5 * (high - low)
-    return (max(0.0, low - margin) if low >= 0.0 else low - margin), high + margin
+# For panels of their own, whose colours need not be told apart from all others.
+MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
 
 
-def legend_above(figure: Figure, ax: Axes) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+def framing(
+    data: Float[np.ndarray, " samples"], models: Float[np.ndarray, " values"]
+) -> tuple[float, float]:
+    """Limits around data and models, within twice the data's range.
+
+    A model that runs away must not shrink the rest.
+    """
+    low, high = float(data.min()), float(data.max())
+    reach = 0.5 * (high - low)
+    bottom = max(low - reach, float(models.min(initial=low)))
+    top = min(high + reach, float(models.max(initial=high)))
+    margin = 0.05 * (top - bottom)
+    return bottom - margin, top + margin
+
+
+def legend_above(
+    figure: Figure,
+    handles: Sequence[Artist],
+    *,
+    n_columns: int | None = None,
+    size: float | None = None,
+) -> None:
+    """A legend of the labelled artists over all panels, by default in one line."""
+    figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=n_columns or len(handles),
+        frameon=False,
+        fontsize=size,
+    )
 
 
 def axis_label(name: str, unit: str) -> str:
     return f"${latex_name(name)}$ ({unit_text(unit)})"
 
 
+def slope_label(name: str, unit: str) -> str:
+    """Of the derivative in time; unit: of the variable."""
+    return f"${latex_derivative(name)}$ ({unit_text(unit_product([(unit, 1), ('s', -1)]))})"
+
+
+def power_unit(unit: str) -> str:
+    """Of the power density; unit: of the variable."""
+    return unit_product([(unit, 2), ("Hz", -1)])
+
+
 def unit_text(unit: str) -> str:
     """`m^-3 s^-1` as mathtext."""
     return re.sub(r"\^(-?[\d.]+)", r"$^{\1}$", unit)
-
-
-GREY = "#aaaaaa"
-
-
-# Every model has a panel of its own, so these need not be told apart from all others.
-MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")

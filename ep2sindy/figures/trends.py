@@ -11,15 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ep2sindy.discovery.control_law import ControlLaw
-from ep2sindy.figures.style import COLOURS
+from ep2sindy.figures.style import COLOURS, legend_above
 from ep2sindy.library.equations import latex_name
 
 # Of the quantities that share a panel: their points, and the lines of their laws.
 MARKERS = ("o", "^", "v", "D", "P", "X")
 
-
 LINES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 3)))
-
 
 APART = 0.016  # between fits at one point, of the axis: error bars must not hide each other
 
@@ -67,7 +65,7 @@ def trends_figure(
         held = ", ".join(_equals(_label(name, labels), value) for name, value in at.items())
         column[0].set_title(held, fontsize=10)
     entries = _legend(fits, panels, labels, published=len(published) > 0, lines=bool(laws))
-    figure.legend(handles=entries, loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    legend_above(figure, entries, n_columns=5, size=9.0)
     return figure
 
 

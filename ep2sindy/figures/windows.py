@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ep2sindy.figures.style import COLOURS, DATA, GREY
+from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above
 
 
 def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
@@ -43,8 +43,7 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
     axes[1].axhline(1.0, color=GREY, lw=0.8)
     axes[1].set_yscale("log")
     axes[2].set_ylim(bottom=0.0)
-    handles, labels = axes[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False)
+    legend_above(figure, axes[1].get_legend_handles_labels()[0], n_columns=4)
     return figure
 
 
@@ -78,8 +77,7 @@ def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Fi
     axes[0].set_xticks(levels, [f"{level:g}" for level in levels])
     axes[0].set_xticks([], minor=True)
     axes[0].set_ylabel(r"coefficient error $\|\beta - \beta_{true}\| / \|\beta_{true}\|$")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    legend_above(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 

@@ -24,6 +24,8 @@ from ep2sindy.report.provenance import commit, versions
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+DPI = 150
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -69,13 +71,14 @@ class RunFolder:
         self.write_text(f"tables/{name}.csv", table.to_csv(index=False))
 
     def write_figure(self, name: str, figure: Figure) -> Path:
-        """As PNG and PDF; returns where the PNG lies."""
+        """As PNG and PDF of one layout, which the figure keeps; returns where the PNG lies."""
+        _freeze_layout(figure)
         for suffix in ("pdf", "png"):
             # Without a date the same run gives the same file.
             dated = {"CreationDate": None} if suffix == "pdf" else {}
             path = self.path / "figures" / f"{name}.{suffix}"
             with replacing(path) as temporary:
-                figure.savefig(temporary, dpi=150, metadata=dated)
+                figure.savefig(temporary, dpi=DPI, metadata=dated)
         return path
 
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> None:
@@ -88,6 +91,15 @@ class RunFolder:
                 "versions": {"python": platform.python_version(), **versions()},
             },
         )
+
+
+def _freeze_layout(figure: Figure) -> None:
+    """Solve the layout once: every saving would solve it again, and draw twice."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        figure.set_dpi(DPI)
+        engine.execute(figure)
+        figure.set_layout_engine(None)  # not "none": that placeholder still draws twice
 
 
 def _without_nan(content: Any) -> Any:

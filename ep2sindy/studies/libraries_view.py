@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
-    "trajectories": "Models integrated from the first sample of the data, over the data.",
+    "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
     "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
-    "derivatives": "Derivative of the data, and each right-hand side evaluated on the data.",
-    "phase": "Phase portraits: data (grey behind the models) and integrated models.",
+    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
+    "phase": "Phase portraits of the integrated models (colour) over the data (grey).",
 }
 
 
