@@ -8,7 +8,6 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
-import xarray as xr
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -57,28 +56,33 @@ def step_of(node: Any, place: str) -> Step:
 
 
 @dataclass(frozen=True, eq=False)
-class ConfiguredData:
-    """The data group of a config: opened when asked, and changed by place."""
+class Configured:
+    """A node that names a `_target_`, built when asked for: see `Deferred`."""
 
     node: DictConfig
+    place: str
 
-    def open(self) -> xr.Dataset:
+    def build(self) -> Any:
         return instantiated(self.node)
 
-    def changed(self, places: Mapping[str, Any], more: Mapping[str, Any]) -> ConfiguredData:
-        """The same with other values at some places, then `more` merged in.
-
-        Raises ValueError for a place where nothing stands.
-        """
+    def changed(
+        self, places: Mapping[str, Any], more: Mapping[str, Any] | None = None
+    ) -> Configured:
         node = deepcopy(self.node)
+        missing = object()
         for place, value in places.items():
-            if OmegaConf.select(node, place) is None:
-                raise ValueError(f"the data group must have what changes: data.{place} is none")
+            if OmegaConf.select(node, place, default=missing) is missing:
+                raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
             OmegaConf.update(node, place, value)
-        merged = OmegaConf.merge(node, dict(more))
+        merged = OmegaConf.merge(node, dict(more or {}))
         assert isinstance(merged, DictConfig)
-        return ConfiguredData(merged)
+        return Configured(merged, self.place)
 
     def __str__(self) -> str:
-        """All settings, in an order of their own, so that equal data give equal text."""
         return OmegaConf.to_yaml(self.node, resolve=True, sort_keys=True)
+
+
+def deferred(node: Any, place: str) -> Configured:
+    if not isinstance(node, DictConfig) or "_target_" not in node:
+        raise ValueError(f"{place} must name a _target_: {node!r} came")
+    return Configured(node, place)

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy.app.build import ConfiguredData, instance_of, step_of
+from ep2sindy.app.build import deferred, instance_of, step_of
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.studies.kinds import Kind
-from ep2sindy.studies.source import Data, FieldSource, Source, Step
+from ep2sindy.studies.kinds import Deferred, Kind
+from ep2sindy.studies.source import FieldSource, Source, Step
 
 # Keys of conf/config.yaml that every run has.
 COMMON = ("experiment", "study", "seed", "output")
@@ -67,8 +67,8 @@ def value_of(kind: Any, node: Any, place: str) -> Any:
         if isinstance(rule, Kind) and not rule.fits(value):
             raise ValueError(f"{place} must be {rule.says}: {value!r} came")
         return value_of(base, node, place)
-    if kind is Data:
-        return ConfiguredData(node)
+    if kind is Deferred:
+        return deferred(node, place)
     if kind == Step:
         return step_of(node, place)
     if isinstance(node, DictConfig) and "_target_" in node:

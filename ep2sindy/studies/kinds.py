@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,22 @@ class Kind:
 
     says: str
     fits: Callable[[Any], bool]
+
+
+@runtime_checkable
+class Deferred(Protocol):
+    """An object that the config names, built when asked for: data, say, may be a simulation.
+
+    changed: the same with other values at some places, such as `operating_point.voltage`, then
+    `more` merged in; ValueError for a place where nothing stands. str() gives all settings, in an
+    order of its own: equal objects have equal text. It can be sent to another process.
+    """
+
+    def build(self) -> Any: ...
+
+    def changed(
+        self, places: Mapping[str, Any], more: Mapping[str, Any] | None = None
+    ) -> Deferred: ...
 
 
 def _is_number(value: Any) -> bool:

@@ -12,31 +12,20 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.report.run import Run
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.studies.kinds import Deferred
 
 Step = Callable[[xr.Dataset], xr.Dataset]
-
-
-@runtime_checkable
-class Data(Protocol):
-    """A field that is opened when asked for, since that may be a simulation.
-
-    changed: the same with other settings, by their places, such as `operating_point.voltage`.
-    """
-
-    def open(self) -> xr.Dataset: ...
-
-    def changed(self, places: Mapping[str, Any], more: Mapping[str, Any]) -> Data: ...
 
 
 @dataclass(frozen=True, eq=False)
 class FieldSource:
     """A field and the steps that prepare it."""
 
-    data: Data
+    data: Deferred
     prepare: Sequence[Step] = ()
 
     def field(self) -> xr.Dataset:
-        field = self.data.open()
+        field: xr.Dataset = self.data.build()
         for step in self.prepare:
             field = step(field)
         return field
@@ -56,7 +45,7 @@ class Sampling(Protocol):
 class Source:
     """A field, the steps that prepare it, and how it becomes a trajectory."""
 
-    data: Data
+    data: Deferred
     prepare: Sequence[Step]
     trajectory: Sampling
 
