@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import cache
+from typing import TYPE_CHECKING
 
-import pint
+if TYPE_CHECKING:
+    import pint
 
 
 @cache
 def registry() -> pint.UnitRegistry:
-    """The one registry of the package; building one costs a tenth of a second."""
+    """The one registry of the package; importing and building it takes a quarter of a second."""
+    import pint
+
     return pint.UnitRegistry()
 
 
@@ -20,6 +24,8 @@ def _powers(unit: str) -> dict[str, float]:
     """Base symbol -> exponent of one unit string; an unknown unit stays a symbol of its own."""
     if unit in ("", "1"):
         return {}
+    import pint
+
     try:
         parsed = registry().parse_units(unit)
     except (pint.PintError, AttributeError, ValueError, TypeError):

@@ -4,6 +4,8 @@ In every kernel steps: (samples - 1,) are time steps of order one, values: (samp
 The state at a sample is (signal, slope, bend); its third derivative is white noise of density
 `ratio` where the measurement noise has variance one. All columns share one ratio, so the gains,
 which do not depend on the values, are worked out once.
+
+Loops in place of array expressions and slices: those take seconds more to compile.
 """
 
 from typing import NamedTuple
@@ -34,13 +36,12 @@ class Gains(NamedTuple):
 def _parabola(h1, h2):
     """State at the third sample of the parabola through the first three."""
     both = h1 + h2
-    return np.array(
-        [
-            [0.0, 0.0, 1.0],
-            [h2 / (both * h1), -both / (h2 * h1), (both + h2) / (both * h2)],
-            [2.0 / (both * h1), -2.0 / (h2 * h1), 2.0 / (both * h2)],
-        ]
-    )
+    state = np.zeros((3, 3))
+    state[0, 2] = 1.0
+    state[1, 0], state[1, 1] = h2 / (both * h1), -both / (h2 * h1)
+    state[1, 2] = (both + h2) / (both * h2)
+    state[2, 0], state[2, 1], state[2, 2] = 2.0 / (both * h1), -2.0 / (h2 * h1), 2.0 / (both * h2)
+    return state
 
 
 @njit(cache=True)
@@ -59,14 +60,14 @@ def _slope_signal_cov(a, b):
 
 
 @njit(cache=True)
-def _start(steps, ratio):
+def _start(steps, ratio, slope_cov):
     """Begin at the third sample, where three samples first determine the state.
 
     Looking back from there, the signal leaves the state's own parabola as a process of the
     same law; with the measurement noise that is all the three samples can err by. Returns the
-    parabola, the state's covariance as L D L', (3,) and (3,), and the first rows of slope_cov.
+    parabola and the state's covariance as L D L', (3,) and (3,); fills three rows of slope_cov.
     """
-    ages = np.array([steps[0] + steps[1], steps[1], 0.0])
+    ages = (steps[0] + steps[1], steps[1], 0.0)
     parabola = _parabola(steps[0], steps[1])
     # Errors of the first two samples, as two independent ones; the third errs by noise alone.
     first = 1.0 + ratio * _signal_cov(ages[0], ages[0])
@@ -78,14 +79,16 @@ def _start(steps, ratio):
     l10, l20, l21 = parabola[1, 2], parabola[2, 2], (first * a1 * a2 + second * b1 * b2) / d1
     a2, b2 = a2 - l21 * a1, b2 - l21 * b1
     d2 = first * a2 * a2 + second * b2 * b2
-    slope_row = np.array([l10, l10 * l10 + d1, l10 * l20 + l21 * d1])
-    bend_row = np.array([l20, slope_row[2], l20 * l20 + l21 * l21 * d1 + d2])
-    slope_cov = np.empty((3, 3))
+    slope_row = (l10, l10 * l10 + d1, l10 * l20 + l21 * d1)
+    bend_row = (l20, slope_row[2], l20 * l20 + l21 * l21 * d1 + d2)
     for k in range(3):
-        slope_cov[k] = slope_row - ages[k] * bend_row
+        for j in range(3):
+            slope_cov[k, j] = slope_row[j] - ages[k] * bend_row[j]
         for i in range(3):
-            slope_cov[k] += ratio * _slope_signal_cov(ages[k], ages[i]) * parabola[:, i]
-    return parabola, (l10, l20, l21), (1.0, d1, d2), slope_cov
+            shared = ratio * _slope_signal_cov(ages[k], ages[i])
+            for j in range(3):
+                slope_cov[k, j] += shared * parabola[j, i]
+    return parabola, (l10, l20, l21), (1.0, d1, d2)
 
 
 @njit(cache=True)
@@ -125,7 +128,7 @@ def gains(steps, ratio):
     n_samples = len(steps) + 1
     gain, variance = np.zeros((n_samples, 3)), np.ones(n_samples)
     slope_cov = np.empty((n_samples, 3))
-    parabola, lower, diagonal, slope_cov[:3] = _start(steps, ratio)
+    parabola, lower, diagonal = _start(steps, ratio, slope_cov)
     for k in range(3, n_samples):
         lower, (d0, d1, d2) = _predict(steps[k - 1], ratio, lower, diagonal)
         l10, l20, l21 = lower
@@ -180,14 +183,16 @@ def likelihood(steps, values, ratio):
     known = gains(steps, ratio)
     innovation, _ = _filtered(steps, values, known)
     n_samples, n_columns = values.shape
-    total, log_variance = np.zeros(n_columns), 0.0
+    total, noise, log_variance = np.zeros(n_columns), np.empty(n_columns), 0.0
     for k in range(3, n_samples):
         weight = 1.0 / known.variance[k]
         log_variance += np.log(known.variance[k])
         for j in range(n_columns):
             total[j] += weight * innovation[k, j] ** 2
-    noise = np.maximum(total / (n_samples - 3), ROUNDING)
-    return -0.5 * ((n_samples - 3) * np.log(noise) + log_variance), noise
+    for j in range(n_columns):
+        noise[j] = max(total[j] / (n_samples - 3), ROUNDING)
+        total[j] = -0.5 * ((n_samples - 3) * np.log(noise[j]) + log_variance)
+    return total, noise
 
 
 @njit(cache=True)
@@ -249,9 +254,9 @@ def leverage(steps, ratio):
         n22 += h * n12 + half * n02 + h * b12 + half * a02
         n12, n11 = b12 + h * a02, n11 + h * n01 + h * a01
         n01, n02 = a01, a02
-    later = np.array([[n00, n01, n02], [n01, n11, n12], [n02, n12, n22]])
+    later = ((n00, n01, n02), (n01, n11, n12), (n02, n12, n22))
     for k in range(3):
         for a in range(3):
             for b in range(3):
-                diagonal[k] -= known.parabola[a, k] * later[a, b] * known.parabola[b, k]
+                diagonal[k] -= known.parabola[a, k] * later[a][b] * known.parabola[b, k]
     return diagonal

@@ -8,7 +8,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.signal import savgol_filter
 
 from ep2sindy.signals.spectrum import is_uniform
 
@@ -81,6 +80,8 @@ class SavitzkyGolay:
                 "shorten the window or join more data"
             )
         if is_uniform(t):
+            from scipy.signal import savgol_filter  # half a second that a weak form does not need
+
             return savgol_filter(values, self.window, self.order, axis=0, mode="interp")
         return self._smooth_unequal(t, values)
 

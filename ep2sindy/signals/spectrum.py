@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import make_interp_spline
-from scipy.signal import periodogram
 
 from ep2sindy.library.units import prefixed
 
@@ -26,7 +24,11 @@ def power_spectrum(
     t: (samples,) in s; unequal steps are first resampled to their mean (cubic).
     Returns frequencies in Hz and power in u^2/Hz.
     """
+    from scipy.signal import periodogram  # half a second that a search does not need
+
     if not is_uniform(t):
+        from scipy.interpolate import make_interp_spline
+
         uniform = np.linspace(t[0], t[-1], len(t))
         x = make_interp_spline(t, x, k=min(3, len(t) - 1))(uniform)
     rate_Hz = (len(t) - 1) / (t[-1] - t[0])
