@@ -10,7 +10,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from scipy.io import savemat
 
-from ep2sindy.data.open import Variable, conversion, open_field, read_field, same_unit, write_field
+from ep2sindy.data.conversion import conversion, same_unit
+from ep2sindy.data.open import Variable, open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
 from ep2sindy.data.zones import Zone, zone_average
 

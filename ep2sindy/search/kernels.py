@@ -169,6 +169,14 @@ def _least_residual(matrices, first, size, smallest, scratch):
 
 
 @njit(cache=True)
+def _empty_ranking(depth, n_best, n_terms):
+    """Residuals and supports of the best of every size: so far the one without terms."""
+    best = np.full((depth + 1, n_best), np.inf)
+    best[0, 0] = 0.0
+    return best, np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
+
+
+@njit(cache=True)
 def _offer(residual, chosen, n_chosen, best, best_masks):
     """Keep a subset among the best of its size, sorted by residual."""
     rank = best.shape[1]
@@ -183,6 +191,33 @@ def _offer(residual, chosen, n_chosen, best, best_masks):
     best_masks[n_chosen, rank] = False
     for i in range(n_chosen):
         best_masks[n_chosen, rank, chosen[i]] = True
+
+
+@njit(cache=True)
+def _root(xx, xy, yy, depth):
+    """Gram matrices of columns and target, with room for `depth` steps down, and what is zero."""
+    n_problems, n_terms = xy.shape
+    size = n_terms + 1
+    levels = np.zeros((depth + 1, n_problems, size, size))
+    levels[0, :, :n_terms, :n_terms] = xx
+    levels[0, :, :n_terms, n_terms], levels[0, :, n_terms, :n_terms] = xy, xy
+    levels[0, :, n_terms, n_terms] = yy
+    smallest = np.empty((n_problems, size))
+    for p in range(n_problems):
+        smallest[p, :n_terms] = DEPENDENT * np.diag(xx[p])
+        smallest[p, n_terms] = ROUNDING * yy[p] if yy[p] > 0.0 else 1.0
+    return levels, smallest
+
+
+@njit(inline="always")  # a call would cost the search 5 %
+def _eliminate(levels, level, j, smallest):
+    """Choose column j: the next level holds what it leaves of the columns after it."""
+    for p in range(len(smallest)):
+        here, below = levels[level, p], levels[level + 1, p]
+        if here[j, j] > smallest[p, j]:
+            _sweep(here, below, j, levels.shape[2])
+        else:
+            below[j + 1 :, j + 1 :] = here[j + 1 :, j + 1 :]
 
 
 @njit(cache=True)
@@ -202,18 +237,9 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
     n_problems, n_terms = xy.shape
     size = n_terms + 1
     depth = min(max_terms, n_terms)
-    levels = np.zeros((depth + 1, n_problems, size, size))
-    levels[0, :, :n_terms, :n_terms] = xx
-    levels[0, :, :n_terms, n_terms], levels[0, :, n_terms, :n_terms] = xy, xy
-    levels[0, :, n_terms, n_terms] = yy
-    smallest = np.empty((n_problems, size))
-    for p in range(n_problems):
-        smallest[p, :n_terms] = DEPENDENT * np.diag(xx[p])
-        smallest[p, n_terms] = ROUNDING * yy[p] if yy[p] > 0.0 else 1.0
+    levels, smallest = _root(xx, xy, yy, depth)
     scratch = np.empty((size, size))
-    best = np.full((depth + 1, n_best), np.inf)
-    best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
-    best[0, 0] = 0.0
+    best, best_masks = _empty_ranking(depth, n_best, n_terms)
     chosen = np.zeros(depth + 1, dtype=np.int64)
     following = np.zeros(depth + 1, dtype=np.int64)
     level = 0
@@ -236,12 +262,7 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
         _offer(residual, chosen, level + 1, best, best_masks)
         if level + 1 == depth or j + 1 == n_terms:
             continue
-        for p in range(n_problems):
-            here, below = levels[level, p], levels[level + 1, p]
-            if here[j, j] > smallest[p, j]:
-                _sweep(here, below, j, size)
-            else:
-                below[j + 1 :, j + 1 :] = here[j + 1 :, j + 1 :]
+        _eliminate(levels, level, j, smallest)
         worth_bounding = n_terms - j > 6 and depth - level > 2
         if worth_bounding and best[level + 2, n_best - 1] <= _least_residual(
             levels[level + 1], j + 1, size, smallest, scratch
