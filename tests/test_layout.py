@@ -33,6 +33,7 @@ HEAVY = {
     "hydra": ("app",),
     "omegaconf": ("app",),
     "matplotlib": ("figures", "report", "studies", "app"),
+    "h5py": (),
     "pandas": ("data", "thruster", "synthetic", "discovery", "figures", "report", "studies", "app"),
     "xarray": ("data", "thruster", "synthetic", "discovery", "figures", "studies", "app"),
 }

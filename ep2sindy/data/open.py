@@ -17,14 +17,9 @@ import xarray as xr
 
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.fields import DIMS, check_field, mask_outside
-from ep2sindy.data.readers import (
-    UNDECODED,
-    Source,
-    damage_named,
-    open_source,
-    read_netcdf,
-    reader_of,
-)
+from ep2sindy.data.readers.netcdf import NETCDF
+from ep2sindy.data.readers.registry import open_source, reader_of
+from ep2sindy.data.readers.source import UNDECODED, Source, damage_named
 from ep2sindy.machine.files import replacing
 
 
@@ -212,7 +207,7 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
 
 def read_field(path: str | Path) -> xr.Dataset:
     """Open what `write_field` wrote; values are read when asked for."""
-    if reader_of(Path(path)) is not read_netcdf:
+    if reader_of(Path(path)) is not NETCDF:
         raise ValueError(f"a written field is NetCDF: {path} is not; open others with open_field")
     with damage_named(Path(path)):
         field = xr.open_dataset(path, engine="h5netcdf", **UNDECODED)
