@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
+from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import check_time, read_only
 from ep2sindy.signals.kernels import leverage, likelihood, smoothed
 
@@ -72,7 +73,7 @@ class KalmanSmoother:
         """
         steps, step_s = _unit_steps(t, values)
         spread = np.ptp(values, axis=0)
-        scaled = (values - values[0]) / np.where(spread > 0.0, spread, 1.0)
+        scaled = (values - values[0]) / zero_to_one(spread)
         signal, slope, signal_std = np.empty((3, *values.shape))
         noise_std, log10_ratio = np.empty((2, values.shape[1]))
         for j in range(values.shape[1]):
