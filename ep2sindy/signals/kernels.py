@@ -222,36 +222,3 @@ def smoothed(steps, values, ratio):
                 slope[k, j] += known.slope_cov[k, a] * later[a, j]
                 signal[k, j] += known.parabola[a, k] * later[a, j]
     return signal, slope
-
-
-@njit(cache=True)
-def leverage(steps, ratio):
-    """Diagonal (samples,) of the smoother as a matrix: variance of the signal given all samples."""
-    known = gains(steps, ratio)
-    n_samples = len(steps) + 1
-    diagonal = np.ones(n_samples)
-    n00 = n01 = n02 = n11 = n12 = n22 = 0.0  # variance of `later` in `smoothed`
-    for k in range(n_samples - 1, 2, -1):
-        h = steps[k - 1]
-        half = 0.5 * h * h
-        g0, g1, g2 = known.gain[k, 0], known.gain[k, 1], known.gain[k, 2]
-        w0 = n00 * g0 + n01 * g1 + n02 * g2
-        w1 = n01 * g0 + n11 * g1 + n12 * g2
-        w2 = n02 * g0 + n12 * g1 + n22 * g2
-        noise = 1.0 / known.variance[k] + g0 * w0 + g1 * w1 + g2 * w2
-        diagonal[k] -= noise
-        n00 += noise - 2.0 * w0
-        n01 -= w1
-        n02 -= w2
-        # F' N F.
-        a01, a02 = n01 + h * n00, n02 + h * n01 + half * n00
-        b12 = n12 + h * n11 + half * n01
-        n22 += h * n12 + half * n02 + h * b12 + half * a02
-        n12, n11 = b12 + h * a02, n11 + h * n01 + h * a01
-        n01, n02 = a01, a02
-    later = np.array([[n00, n01, n02], [n01, n11, n12], [n02, n12, n22]])
-    for k in range(3):
-        for a in range(3):
-            for b in range(3):
-                diagonal[k] -= known.parabola[a, k] * later[a, b] * known.parabola[b, k]
-    return diagonal
