@@ -106,9 +106,8 @@ def plain_way(problem: Regression, *, once: bool = False) -> None:
     once: fit none twice, which takes a thought.
     """
     rng = np.random.default_rng(0)
-    n_terms = len(problem.library)
-    theta, targets = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms:]
-    for target in targets.T:
+    theta = problem.train_theta
+    for target in map(problem.train_target, range(len(problem.equations))):
         supports = []
         for _ in range(SEARCH.bootstraps.n):
             size = int(rng.uniform(0.2, 0.8) * len(theta))

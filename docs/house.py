@@ -14,7 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ep2sindy"
 DRAWING = ROOT / "docs" / "house.svg"
-WIDTH, GAP, LINE, COLUMNS = 1080, 46, 15, 3
+WIDTH, GAP, LINE = 1080, 40, 15
 
 
 def rooms() -> dict[str, list[str]]:
@@ -73,13 +73,15 @@ def drawing() -> str:
     boxes: dict[str, tuple[float, float, float, float]] = {}
     y = 20.0
     for floor in reversed(floors(below)):
-        width = min(330.0, (WIDTH - 20.0) / len(floor) - 20.0)
+        width = min(640.0, (WIDTH - 20.0) / len(floor) - 20.0)
         tall = max(_height(inside[room], width) for room in floor)
         left = (WIDTH - len(floor) * (width + 20.0) + 20.0) / 2
         for k, room in enumerate(floor):
             boxes[room] = (left + k * (width + 20.0), y, width, tall)
         y += tall + GAP
-    lines = [_arrow(boxes[a], boxes[b]) for a, there in direct(below).items() for b in sorted(there)]
+    lines = [
+        _arrow(boxes[a], boxes[b]) for a, there in direct(below).items() for b in sorted(there)
+    ]
     return "\n".join(
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{y:.0f}" '
@@ -119,9 +121,7 @@ def _box(room: str, modules: list[str], box: tuple[float, float, float, float]) 
     )
 
 
-def _arrow(
-    start: tuple[float, float, float, float], end: tuple[float, float, float, float]
-) -> str:
+def _arrow(start: tuple[float, float, float, float], end: tuple[float, float, float, float]) -> str:
     x0, y0 = start[0] + start[2] / 2, start[1] + start[3]
     x1, y1 = end[0] + end[2] / 2, end[1] - 2.0
     bend = (y1 - y0) / 2

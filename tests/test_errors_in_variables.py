@@ -42,7 +42,7 @@ def mask_and_coef(problem: Regression, candidate: Candidate) -> tuple[np.ndarray
     """A candidate as whitened_rows takes it."""
     mask = np.isin(problem.term_names, candidate.terms)
     coef = np.zeros(len(mask))
-    scale = problem.target_scale[0] / problem.theta_scale
+    scale = problem.coef_scale(0)
     coef[mask] = candidate.coef / scale[mask]
     return mask, coef
 

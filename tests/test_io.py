@@ -10,8 +10,11 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from scipy.io import savemat
 
-from ep2sindy.data.open import Variable, conversion, open_field, read_field, same_unit, write_field
+from ep2sindy.data.conversion import conversion, same_unit
+from ep2sindy.data.open import Variable, open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
+from ep2sindy.data.readers.registry import READERS, reader_of
+from ep2sindy.data.readers.source import look_at
 from ep2sindy.data.zones import Zone, zone_average
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -352,6 +355,49 @@ def test_a_mapping_that_does_not_fit_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         open_field(npz(tmp_path, **arrays), **{**SETTINGS, **settings})
+
+
+def write_userblock(path: Path) -> None:
+    """HDF5 after a block of the user's own."""
+    with h5py.File(path, "w", userblock_size=2048) as file:
+        file["ni"] = N_I
+
+
+def write_text(path: Path) -> None:
+    path.write_text("t, Id\n0, 1\n")
+
+
+KINDS = {
+    **WRITERS,
+    "classic.cdf": write_netcdf3,
+    "field.nc4": write_netcdf4,
+    "field.dat": write_hdf5,
+    "block.h5": write_userblock,
+    "probe.csv": write_text,
+    "thruster.json": write_text,
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_order_of_readers_decides_nothing(tmp_path: Path, name: str) -> None:
+    KINDS[name](tmp_path / name)
+    claims = sorted(reader.claim(look_at(tmp_path / name)) for reader in READERS)
+    assert claims[-1] > claims[-2]
+    assert reader_of(tmp_path / name) is reader_of(tmp_path / name, READERS[::-1])
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -> None:
+    KINDS[name](tmp_path / name)
+    is_hdf5 = name != "field.zarr" and h5py.is_hdf5(tmp_path / name)
+    assert (look_at(tmp_path / name).form == "hdf5") is is_hdf5
+
+
+def test_what_is_no_known_kind_hears_all_of_them(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_text("text")
+    kinds = r"NetCDF, HDF5, MATLAB \(v5, v7.3\) or npz, or end in .csv, .json or .zarr: "
+    with pytest.raises(ValueError, match=f"a file must be {kinds}"):
+        open_field(tmp_path / "a.xyz", **SETTINGS)
 
 
 def test_a_missing_file_is_named_in_full(tmp_path: Path) -> None:

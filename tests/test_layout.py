@@ -33,9 +33,12 @@ HEAVY = {
     "hydra": ("app",),
     "omegaconf": ("app",),
     "matplotlib": ("figures", "report", "studies", "app"),
+    "h5py": (),
     "pandas": ("data", "thruster", "synthetic", "discovery", "figures", "report", "studies", "app"),
     "xarray": ("data", "thruster", "synthetic", "discovery", "figures", "studies", "app"),
 }
+# Functions over 50 lines, waiting to be shortened: none should be here for long.
+
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
 
@@ -131,8 +134,8 @@ def test_every_room_is_on_the_list() -> None:
 @pytest.mark.parametrize("module", PATHS)
 def test_files_and_functions_stay_short(module: str) -> None:
     source = PATHS[module].read_text(encoding="utf-8")
-    assert len(source.splitlines()) <= 310, f"{module} holds more than 310 lines"
+    assert len(source.splitlines()) <= 300, f"{module} holds more than 300 lines"
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.FunctionDef):
             n_lines = (node.end_lineno or node.lineno) - node.lineno + 1
-            assert n_lines <= 70, f"{module}.{node.name} takes {n_lines} lines"
+            assert n_lines <= 50, f"{module}.{node.name} takes {n_lines} lines"

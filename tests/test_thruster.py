@@ -8,7 +8,7 @@ import pytest
 from ep2sindy.thruster import kernels
 from ep2sindy.thruster.closures import SheathWall, TabulatedRates, XenonFits, ionization_rate
 from ep2sindy.thruster.discretization import build_model, closure_table, initial_state
-from ep2sindy.thruster.landmark import landmark_thruster, read_rate_table
+from ep2sindy.thruster.landmark import landmark_thruster, read_landmark_rates
 from ep2sindy.thruster.parameters import (
     OPERATING_POINTS,
     AnomalousTransport,
@@ -181,7 +181,7 @@ def test_rate_table_with_a_missing_column_is_refused(tmp_path):
     path = tmp_path / "rates.csv"
     path.write_text("energy,ionization,loss\n1,1e-20,1e-19\n2,1e-18\n")
     with pytest.raises(ValueError, match="every row must hold three numbers"):
-        read_rate_table(path)
+        read_landmark_rates(path)
 
 
 def test_six_operating_points():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.operating_points import COEFFICIENTS, CURRENTS, coefficient_ratios
-from ep2sindy.thruster.landmark import LANDMARK_POINT, landmark_thruster, read_rate_table
+from ep2sindy.thruster.landmark import LANDMARK_POINT, landmark_thruster, read_landmark_rates
 from ep2sindy.thruster.parameters import OPERATING_POINTS, Thruster
 from ep2sindy.thruster.simulate import simulate
 
@@ -64,7 +64,7 @@ def test_most_zone_coefficients_meet_the_reference_code():
 
 @needs_table
 def test_landmark_case_2_is_steady_at_the_benchmark_current():
-    thruster = landmark_thruster(2, read_rate_table(RATE_TABLE))
+    thruster = landmark_thruster(2, read_landmark_rates(RATE_TABLE))
     run = simulate(thruster, LANDMARK_POINT, duration_s=2e-3, progress=False)
     assert run.attrs["I_d_mean"] == pytest.approx(8.09, rel=0.01)
     assert run.attrs["I_d_std"] < 0.1
@@ -72,7 +72,7 @@ def test_landmark_case_2_is_steady_at_the_benchmark_current():
 
 @needs_table
 def test_landmark_case_3_oscillates_as_the_benchmark():
-    thruster = landmark_thruster(3, read_rate_table(RATE_TABLE))
+    thruster = landmark_thruster(3, read_landmark_rates(RATE_TABLE))
     run = simulate(thruster, LANDMARK_POINT, duration_s=4e-3, progress=False)
     assert run.attrs["status"] == "oscillating"
     assert run.attrs["I_d_mean"] == pytest.approx(7.89, rel=0.02)

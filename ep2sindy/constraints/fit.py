@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import lsq_linear
 
 from ep2sindy.constraints.relations import ROUNDING, Constraint, place_of
+from ep2sindy.data.scales import column_norms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
@@ -123,17 +124,12 @@ class WeightedEquation:
         self, coef: Float[np.ndarray, " own"]
     ) -> tuple[Float[np.ndarray, "rows own"], Float[np.ndarray, " rows"]]:
         """Terms and target, whose residuals have variance 1 if these are the coefficients."""
-        scale = _scale(self.problem, self.number, self.terms)
+        scale = self.problem.coef_scale(self.number)[self.terms]
         if self.problem.noisy is not None:
             white = _whitened(self.problem, self.terms, coef / scale, n_steps=0)
             return white.theta[:, self.terms] / scale, white.target
-        rows = self.problem.train_rows / self.std
-        return rows[:, self.terms] / scale, rows[:, len(self.problem.library) + self.number]
-
-
-def _scale(problem: Regression, number: int, terms: np.ndarray) -> np.ndarray:
-    """From coefficients of scaled columns to SI."""
-    return problem.target_scale[number] / problem.theta_scale[terms]
+        theta = self.problem.train_theta[:, self.terms] / self.std
+        return theta / scale, self.problem.train_target(self.number) / self.std
 
 
 def _whitened(
@@ -165,8 +161,7 @@ def weighted_equations(
 def _fitted_alone(
     problem: Regression, number: int, at: np.ndarray, terms: np.ndarray
 ) -> WeightedEquation:
-    theta = problem.train_rows[:, terms]
-    target = problem.train_rows[:, len(problem.library) + number]
+    theta, target = problem.train_theta[:, terms], problem.train_target(number)
     start = np.linalg.lstsq(theta, target, rcond=None)[0]
     variance = np.square(target - theta @ start).sum() / max(len(target) - len(terms), 1)
     least = LEAST_RESIDUAL**2 * np.square(target).mean()
@@ -179,7 +174,7 @@ def _fitted_alone(
         number=number,
         at=at,
         terms=terms,
-        start=start * _scale(problem, number, terms),
+        start=start * problem.coef_scale(number)[terms],
         std=float(np.sqrt(max(variance, least))) or 1.0,
     )
 
@@ -215,8 +210,7 @@ def _least_squares(
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"], float]:
     """Coefficients, a root of their covariance for rows of variance 1, that variance."""
     n = theta.shape[1]
-    norms, size = np.linalg.norm(theta, axis=0), np.linalg.norm(target) or 1.0
-    norms[norms == 0.0] = 1.0
+    norms, size = column_norms(theta), np.linalg.norm(target) or 1.0
     columns = np.column_stack([theta / norms, target / size])
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))
     upper = triangle[:n, :n]

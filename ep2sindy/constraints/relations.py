@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.library import Library
+from ep2sindy.library.names import PRODUCT, VARIABLE
 
 ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
 
@@ -18,18 +19,12 @@ ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w)"
 
 
-_VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*)"
-
-
-_FACTOR = rf"{_VARIABLE}(?:\^\d+)?"
-
-
-_TERM = rf"(?:1(?![\w.])|{_FACTOR}(?:\s*\*\s*{_FACTOR})*)"
+_TERM = rf"(?:1(?![\w.])|{PRODUCT})"
 
 
 _ADDEND = re.compile(
     rf"\s*(?P<sign>[+-]?)\s*(?:(?:(?P<factor>[+-]?{_NUMBER})\s*\*\s*)?"
-    rf"(?P<state>{_VARIABLE})\s*:\s*(?P<term>{_TERM})|(?P<number>[+-]?{_NUMBER}))\s*"
+    rf"(?P<state>{VARIABLE})\s*:\s*(?P<term>{_TERM})|(?P<number>[+-]?{_NUMBER}))\s*"
 )
 
 

@@ -1,13 +1,11 @@
 """Open files of many kinds as fields, and write fields as NetCDF.
 
 One mapping says where each quantity sits in the file, in which unit and dimension order;
-values become SI here and nowhere else.
+values become SI on the way in and nowhere else.
 """
 
 from __future__ import annotations
 
-import re
-import tokenize
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -15,44 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pint
 import xarray as xr
 
-from ep2sindy.data.fields import COORDINATE_UNITS, DIMS, check_field, mask_outside
-from ep2sindy.data.readers import (
-    UNDECODED,
-    Source,
-    damage_named,
-    open_source,
-    read_netcdf,
-    reader_of,
-)
-from ep2sindy.library.units import registry, unit_product
+from ep2sindy.data.conversion import to_si
+from ep2sindy.data.fields import DIMS, check_field, mask_outside
+from ep2sindy.data.readers.netcdf import NETCDF
+from ep2sindy.data.readers.registry import open_source, reader_of
+from ep2sindy.data.readers.source import UNDECODED, Source, damage_named
 from ep2sindy.machine.files import replacing
-
-# What our usual names mean: a unit of another kind is a mistake in the mapping.
-KNOWN_UNITS = {
-    "n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s",
-    "I_d": "A", "V_d": "V",
-}  # fmt: skip
-
-
-NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
-
-
-# Names that end so keep this unit; all others are SI.
-SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
-
-
-# What pint raises on text that is no unit.
-UNIT_ERRORS = (
-    pint.PintError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    ArithmeticError,
-    tokenize.TokenError,
-)
 
 
 @dataclass(frozen=True)
@@ -228,68 +196,6 @@ def _place(
     return named.transpose(*[d for d in DIMS if d in dims])
 
 
-def to_si(array: xr.DataArray, ours: str, unit: str) -> xr.DataArray:
-    """Convert to SI, or to the unit of the name's suffix; a unit that fits already costs nothing.
-
-    Raises ValueError for an unknown unit, one that the suffix cannot hold, or one that
-    contradicts the file's own attribute.
-    """
-    factor, offset, target = conversion(ours, unit)
-    stated = str(array.attrs.get("units", ""))
-    if stated not in ("", "1") and not same_unit(unit, stated):
-        raise ValueError(
-            f"the unit of {ours} must agree with the file: the mapping says {unit!r}, the file "
-            f"{stated!r}; set it to what the numbers count"
-        )
-    if (factor, offset) != (1.0, 0.0):
-        array = array * factor + offset
-    return array.drop_attrs().assign_attrs(units=target)
-
-
-def conversion(ours: str, unit: str) -> tuple[float, float, str]:
-    """Factor, offset and target unit that take numbers in `unit` to the unit our name means."""
-    suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
-    target = (COORDINATE_UNITS | KNOWN_UNITS).get(ours) or next(suffixes, None)
-    try:
-        given = _ruler(unit)
-        ruler = given.to(target) if target else given.to_base_units()
-    except UNIT_ERRORS as error:
-        raise ValueError(
-            f"the unit of {ours} must be one that converts to {target or 'SI'}: {unit!r} came "
-            f"({error}); write for example 'cm^-3', '1e19 m^-3', 'km/s'"
-        ) from None
-    zero, one, two = (float(value) for value in ruler.magnitude)
-    powers = ruler.dimensionality.values()
-    if not np.isclose(two - one, one - zero, atol=0.0) or any(power % 1 for power in powers):
-        raise ValueError(
-            f"the unit of {ours} must be a multiple of SI units: {unit!r} is not; write a gauss "
-            "as '1e-4 T', and no decibels"
-        )
-    factor = float(f"{one - zero:.15g}")  # cm^-3 is 1e6 m^-3, not 999999.9999999999
-    if target is None:
-        unchanged = np.array_equal(given.magnitude, ruler.magnitude)
-        plain = str(given.units if unchanged else ruler.units)
-        named = (u for u in NAMED_UNITS if registry().Quantity(1, u).check(ruler.dimensionality))
-        target = next(named, plain)
-    return factor, zero, unit_product([(target, 1)])
-
-
-def same_unit(unit: str, stated: str) -> bool:
-    """Whether both texts mean one unit; a text that is no unit says nothing against."""
-    try:
-        a, b = _ruler(unit).to_base_units(), _ruler(stated).to_base_units()
-    except UNIT_ERRORS:
-        return True
-    return a.check(b.dimensionality) and np.allclose(a.magnitude, b.magnitude, rtol=1e-9, atol=0.0)
-
-
-def _ruler(unit: str) -> Any:
-    """0, 1 and 2 of a unit, which show its factor, its offset and whether it is linear."""
-    plain = re.sub(r"\b([A-Za-zµ]+)(-?\d+)\b", r"\1^\2", unit)  # netCDF writes m-3 for m^-3
-    one: Any = registry().Quantity(plain)
-    return registry().Quantity(np.arange(3.0) * one.magnitude, one.units)
-
-
 def write_field(field: xr.Dataset, path: str | Path) -> None:
     """Write a field as NetCDF; the final name appears only when the file is whole."""
     check_field(field)
@@ -301,7 +207,7 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
 
 def read_field(path: str | Path) -> xr.Dataset:
     """Open what `write_field` wrote; values are read when asked for."""
-    if reader_of(Path(path)) is not read_netcdf:
+    if reader_of(Path(path)) is not NETCDF:
         raise ValueError(f"a written field is NetCDF: {path} is not; open others with open_field")
     with damage_named(Path(path)):
         field = xr.open_dataset(path, engine="h5netcdf", **UNDECODED)

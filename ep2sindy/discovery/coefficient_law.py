@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.stats import f as f_distribution
 
+from ep2sindy.data.scales import column_norms
 from ep2sindy.discovery.shared_support import JointDiscovery, JointFront
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel, coef_matrix
@@ -131,8 +132,7 @@ def _check_law(
             f"a law of {len(law)} terms needs as many points: {len(values)} came; use a law of "
             "fewer terms"
         )
-    norms = np.linalg.norm(values, axis=0)
-    if np.linalg.matrix_rank(values / np.where(norms > 0.0, norms, 1.0)) < len(law):
+    if np.linalg.matrix_rank(values / column_norms(values)) < len(law):
         same = [v for v in law.variables if len({p[v] for p in parameters.values()}) == 1]
         raise ValueError(
             f"the points must tell the terms {list(law.names)} of the law apart: "
@@ -151,8 +151,8 @@ def _tied(
     }
     design = np.concatenate([np.kron(fit.theta, law_at[p][None]) for p, fit in fits.items()])
     target = np.concatenate([fit.target for fit in fits.values()])
-    norms = np.linalg.norm(design, axis=0)
-    columns = design / np.where(norms > 0.0, norms, 1.0)
+    norms = column_norms(design)
+    columns = design / norms
     solution, _, rank, _ = np.linalg.lstsq(columns, target)
     if rank < len(norms):
         raise ValueError(
@@ -198,12 +198,8 @@ class _FreeFit:
     def of(front: ParetoFront, k: int, terms: Sequence[str]) -> _FreeFit:
         problem, candidate = front.problem, front.candidates[k]
         equation = problem.equations.index(front.equation)
-        scale = problem.target_scale[equation] / problem.theta_scale
-        n_library = len(problem.library)
-        theta, target = (
-            problem.train_rows[:, :n_library],
-            problem.train_rows[:, n_library + equation],
-        )
+        scale = problem.coef_scale(equation)
+        theta, target = problem.train_theta, problem.train_target(equation)
         if problem.noisy is not None:
             coef = coef_matrix(problem.library, [candidate.coef_by_term])[:, 0] / scale
             mask = np.isin(problem.term_names, candidate.terms)
@@ -227,8 +223,7 @@ def _r2(front: ParetoFront, coef: Mapping[str, float]) -> float:
     """R2 of SI coefficients on the training rows of one point."""
     problem = front.problem
     equation = problem.equations.index(front.equation)
-    scale = problem.target_scale[equation] / problem.theta_scale
+    scale = problem.coef_scale(equation)
     scaled = coef_matrix(problem.library, [coef])[:, 0] / scale
-    rows, n_library = problem.train_rows, len(problem.library)
-    truth, prediction = rows[:, n_library + equation], scaled @ rows[:, :n_library].T
+    truth, prediction = problem.train_target(equation), scaled @ problem.train_theta.T
     return float(r2(truth=truth, prediction=prediction[None])[0])

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.scales import column_norms
 from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
@@ -144,18 +145,12 @@ def _predicted(
 
 
 def _least_squares(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    scale = _norms(columns)
+    scale = column_norms(columns)
     return np.linalg.lstsq(columns / scale, values, rcond=None)[0] / scale
 
 
 def _scaled(columns: np.ndarray) -> np.ndarray:
-    return columns / _norms(columns)
-
-
-def _norms(columns: np.ndarray) -> np.ndarray:
-    norms = np.linalg.norm(columns, axis=0)
-    norms[norms == 0.0] = 1.0
-    return norms
+    return columns / column_norms(columns)
 
 
 def _rms(errors: np.ndarray) -> float:

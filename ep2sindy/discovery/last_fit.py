@@ -45,7 +45,7 @@ def reweighted(problem: Regression, candidate: Candidate, *, n_steps: int = 8) -
     Returns it with new coefficients and their covariance, in SI; its scores stay.
     """
     terms = np.isin(problem.term_names, candidate.terms)
-    scale = problem.target_scale[0] / problem.theta_scale
+    scale = problem.coef_scale(0)
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]

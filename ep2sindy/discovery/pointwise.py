@@ -11,6 +11,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
+from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.blocks import Block, Kept, blocks_of
 from ep2sindy.discovery.last_fit import last_fit
@@ -222,7 +223,7 @@ def _status(values: Float[np.ndarray, "variables samples"], search: PointSearch)
         return STATUSES.index("missing_samples")
     states = values[: len(search.states)]
     largest = np.abs(states).max(axis=1, keepdims=True)
-    scaled = states / np.where(largest > 0.0, largest, 1.0)
+    scaled = states / zero_to_one(largest)
     still = scaled.std(axis=1) <= search.least_variation * np.sqrt(np.square(scaled).mean(axis=1))
     return STATUSES.index("too_little_variation") if still.any() else 0
 
@@ -261,8 +262,7 @@ def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
         point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
         point["weight"][row] = _shares(point["coef"][row] * problem.theta_scale)
         fits = equation.draws.fits(equation.number, equation.found, mask)
-        target_scale = problem.target_scale[equation.number]
-        point["coef_draws"][:, row] = fits * target_scale / problem.theta_scale
+        point["coef_draws"][:, row] = problem.coef_SI(fits, equation.number)
         point["weight_draws"][:, row] = _shares(fits)
         point["r2_train"][row], point["r2_test"][row] = chosen.r2_train, chosen.r2_test
         point["n_terms"][row] = chosen.n_terms

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import re
 
-# A factor is a variable, or the average of a product in < >, and maybe a whole power.
-_FACTOR = r"(<[^<>]+>|[^\W\d]\w*)(?:\^(\d+))?"
+# The grammar of terms, for expressions without groups of their own.
+VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*)"  # or the average of a product, in < >
 
 
-_TERM = re.compile(rf"\s*{_FACTOR}(?:\s*\*\s*{_FACTOR})*\s*")
+_FACTOR = rf"{VARIABLE}(?:\^\d+)?"
+
+
+PRODUCT = rf"{_FACTOR}(?:\s*\*\s*{_FACTOR})*"
+
+
+_TERM = re.compile(rf"\s*{PRODUCT}\s*")
+
+
+_PARTS = re.compile(rf"({VARIABLE})(?:\^(\d+))?")
 
 
 def split_factors(name: str) -> list[tuple[str, int]]:
@@ -18,4 +27,4 @@ def split_factors(name: str) -> list[tuple[str, int]]:
             f"a term is variables joined by *, with whole powers: {name!r} came; write it like "
             "'n_i^2*n_n'"
         )
-    return [(variable, int(power or 1)) for variable, power in re.findall(_FACTOR, name)]
+    return [(variable, int(power or 1)) for variable, power in _PARTS.findall(name)]

@@ -12,6 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.model.runge_kutta import rk4_step
 
 # Steps of the integration per sample. One would do for the truth of every noise-free system of
 # `systems`: its error stays below 1e-9 variances; the second is for sparser samples.
@@ -125,18 +126,13 @@ class Ensemble:
             for k in range(n_samples):
                 moved = x
                 for step in range(k * N_SUBSTEPS, (k + 1) * N_SUBSTEPS):
-                    moved = self._rk4_step(moved, windows.drive[:, step], windows.steps_s[step])
+                    drive = windows.drive[:, step]
+                    at = (drive[:, 0], drive[:, 1], drive[:, 2])
+                    moved = rk4_step(self._derivative, moved, at, windows.steps_s[step])
                 bounded &= (np.abs(moved - centre) <= BLOW_UP * spread).all(axis=0)
                 x = np.where(bounded, moved, x)
                 total += np.square((x - windows.truth[:, k, None]) / spread).mean(axis=0)
         return np.where(bounded, np.minimum(total / n_samples, MAX_ERROR), MAX_ERROR)
-
-    def _rk4_step(self, x: np.ndarray, drive: np.ndarray, step_s: np.ndarray) -> np.ndarray:
-        k1 = self._derivative(x, drive[:, 0])
-        k2 = self._derivative(x + 0.5 * step_s * k1, drive[:, 1])
-        k3 = self._derivative(x + 0.5 * step_s * k2, drive[:, 1])
-        k4 = self._derivative(x + step_s * k3, drive[:, 2])
-        return x + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
     def _derivative(self, x: np.ndarray, drive: np.ndarray) -> np.ndarray:
         """x and the result: (states, models, windows). drive: (inputs, windows)."""

@@ -18,7 +18,7 @@ from ep2sindy.refinement.judge import FLAT
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.gradient_descent import trajectories as integrate
 from ep2sindy.refinement.ode import ODE, unconstrained
-from ep2sindy.refinement.problem import Fit, Iteration, Problem
+from ep2sindy.refinement.problem import Fit, Iteration, Problem, recorder
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 
@@ -113,32 +113,42 @@ def refine_with_correction(
         window=window,
         rng=rng,
     )
-    known = ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=constraint).to(device)
-    term = _Scaled(deepcopy(correction), _typical_rate(known, batch)).to(device, torch.float64)
-    _check_shape(term, known, device)
-    ode = ODE(
-        model, scale=batch.scale, step_s=batch.step_s, constraint=constraint, correction=term
-    ).to(device)
-    history: list[Iteration] = []
-
-    def observe(iteration: Iteration) -> None:
-        history.append(iteration)
-        if callback is not None:
-            callback(iteration)
-
+    known, ode = _known_and_whole(model, correction, batch, constraint, device)
+    history, observe = recorder(callback)
     problem = Problem((ode,), (batch,), free_start, n_reweights, observe)
     method = GradientDescent(max_iter=60, tolerance=1e-3, patience=5) if method is None else method
-    nodes, window_loss, status = _judged(problem, method.fit(problem), method.n_substeps)
-    trained = status != "non_finite"
+    fit = method.fit(problem)
     relations = unconstrained(model) if constraint is None else constraint
+    return _result(
+        model, correction, known, problem, fit, relations, history, n_substeps=method.n_substeps
+    )
+
+
+def _result(
+    model: SparseModel,
+    correction: nn.Module,
+    known: ODE,
+    problem: Problem,
+    fit: Fit,
+    constraint: Constraint,
+    history: Sequence[Iteration],
+    *,
+    n_substeps: int,
+) -> Corrected:
+    """Back to SI; what was given where the fit did not stay finite."""
+    (ode,), (batch,) = problem.odes, problem.batches
+    nodes, window_loss, status = _judged(problem, fit, n_substeps)
+    trained = status != "non_finite"
     coef = (ode if trained else known).coef.detach().cpu().numpy()
+    term = ode.correction
+    assert isinstance(term, _Scaled)
     state_scale = batch.scale[: len(model.states)]
     return Corrected(
-        model=with_coef(model, relations, coef)[0],
+        model=with_coef(model, constraint, coef)[0],
         correction=(term.inner if trained else deepcopy(correction)).to("cpu", torch.float64),
         scale=batch.scale,
         rate=float(term.rate) * state_scale / batch.step_s,
-        loss_before=_loss_from_data(known, problem, method.n_substeps),
+        loss_before=_loss_from_data(known, problem, n_substeps),
         loss=float(window_loss.mean()) if trained else float("inf"),
         window_loss=window_loss,
         status=status,
@@ -146,6 +156,26 @@ def refine_with_correction(
         batch=batch,
         trajectories=nodes * state_scale,
     )
+
+
+def _known_and_whole(
+    model: SparseModel,
+    correction: nn.Module,
+    batch: WindowBatch,
+    constraint: Constraint | None,
+    device: str,
+) -> tuple[ODE, ODE]:
+    """The known part alone, and with a copy of the correction, of order one, added to it."""
+
+    def ode(term: nn.Module | None) -> ODE:
+        return ODE(
+            model, scale=batch.scale, step_s=batch.step_s, constraint=constraint, correction=term
+        ).to(device)
+
+    known = ode(None)
+    term = _Scaled(deepcopy(correction), _typical_rate(known, batch)).to(device, torch.float64)
+    _check_shape(term, known, device)
+    return known, ode(term)
 
 
 class _Scaled(nn.Module):

@@ -8,10 +8,11 @@ scalings, the right-hand side.
 """
 
 import numpy as np
-from numba import njit
+
+from ep2sindy.machine.compilation import compiled
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@compiled(fastmath={"reassoc", "contract"})
 def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
     """R of a QR decomposition by Householder reflections; columns: (columns, rows), destroyed."""
     n_columns = len(columns)
@@ -38,7 +39,7 @@ def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
             out[i, j] = columns[j, i]
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@compiled(fastmath={"reassoc", "contract"})
 def _advance(
     maps: np.ndarray, nodes: np.ndarray, p: int, w: int, k: int, x: np.ndarray, new: np.ndarray
 ) -> None:
@@ -57,7 +58,7 @@ def _advance(
     x[:] = new
 
 
-@njit(cache=True)
+@compiled
 def condense(
     maps: np.ndarray,
     nodes: np.ndarray,
@@ -103,7 +104,7 @@ def condense(
     return out
 
 
-@njit(cache=True)
+@compiled
 def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
     """Best change of each block's free start, given that of the scalings (points, p).
 
@@ -125,7 +126,7 @@ def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
     return out
 
 
-@njit(cache=True)
+@compiled
 def propagate(
     maps: np.ndarray, nodes: np.ndarray, start: np.ndarray, change: np.ndarray, block: int
 ) -> np.ndarray:

@@ -34,6 +34,20 @@ class Iteration:
     defect: float
 
 
+def recorder(
+    callback: Callable[[Iteration], None] | None,
+) -> tuple[list[Iteration], Callable[[Iteration], None]]:
+    """A list that fills as a fit goes, and who fills it; `callback` sees the same."""
+    history: list[Iteration] = []
+
+    def observe(iteration: Iteration) -> None:
+        history.append(iteration)
+        if callback is not None:
+            callback(iteration)
+
+    return history, observe
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Models of the same states, a batch of windows for each, on one device.

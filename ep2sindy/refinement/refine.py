@@ -15,7 +15,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import Verdict, judge
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import ODE, unconstrained
-from ep2sindy.refinement.problem import Fit, Iteration, Method, Problem
+from ep2sindy.refinement.problem import Fit, Iteration, Method, Problem, recorder
 from ep2sindy.refinement.windows import WindowBatch, cut_windows, dominant_window
 
 
@@ -176,13 +176,7 @@ def _refined(
         ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=constraint).to(device)
         for model, batch in zip(models, batches, strict=True)
     ]
-    history: list[Iteration] = []
-
-    def observe(iteration: Iteration) -> None:
-        history.append(iteration)
-        if callback is not None:
-            callback(iteration)
-
+    history, observe = recorder(callback)
     problem = Problem(
         odes=tuple(odes),
         batches=tuple(batches),

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
+from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
@@ -75,8 +76,8 @@ def cut_windows(
     values = [trajectory.columns([*states, *inputs]) for trajectory in trajectories]
     joined = np.concatenate(values)
     n = len(states)
-    scale = np.append(joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0)))
-    scale[scale == 0.0] = 1.0
+    spread, rms = joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0))
+    scale = zero_to_one(np.append(spread, rms))
     step_s = float(np.mean(np.concatenate([np.diff(each.t) for each in trajectories])))
     index, start = _places([len(v) for v in values], n_windows, window, rng)
     cubics = [

@@ -5,7 +5,8 @@ support.
 """
 
 import numpy as np
-from numba import njit
+
+from ep2sindy.machine.compilation import compiled
 
 # A column counts as dependent on others when what they leave of its square falls below this.
 DEPENDENT = 1e-11
@@ -15,7 +16,7 @@ DEPENDENT = 1e-11
 ROUNDING = 1e-15
 
 
-@njit(cache=True)
+@compiled
 def solve(xx, rhs, active, n_active, out):
     """Solve xx[active][:, active] out = rhs[active] by Cholesky; False if columns depend."""
     lower = np.empty((n_active, n_active))
@@ -43,7 +44,7 @@ def solve(xx, rhs, active, n_active, out):
     return True
 
 
-@njit(cache=True)
+@compiled
 def independent_terms(xx):
     """Mask of a maximal independent set, earlier terms first."""
     n_terms = len(xx)
@@ -67,7 +68,7 @@ def independent_terms(xx):
     return mask
 
 
-@njit(cache=True)
+@compiled
 def solve_masks(xx, rhs, masks):
     """Solve xx coef = rhs on each support; NaN where its columns depend on each other.
 
@@ -76,10 +77,17 @@ def solve_masks(xx, rhs, masks):
     n_masks, n_terms = masks.shape
     coef = np.zeros((n_masks, n_terms))
     solution = np.empty(n_terms)
-    for m in range(n_masks):
-        active = np.flatnonzero(masks[m])
-        if solve(xx, rhs[m], active, len(active), solution):
-            coef[m, active] = solution[: len(active)]
+    active = np.empty(n_terms, dtype=np.int64)
+    for m in range(n_masks):  # loops: fancy indices would take seconds more to compile
+        n_active = 0
+        for j in range(n_terms):
+            if masks[m, j]:
+                active[n_active] = j
+                n_active += 1
+        if solve(xx, rhs[m], active, n_active, solution):
+            for i in range(n_active):
+                coef[m, active[i]] = solution[i]
         else:
-            coef[m] = np.nan
+            for j in range(n_terms):
+                coef[m, j] = np.nan
     return coef

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
+from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, read_only
 from ep2sindy.library.library import Library
 
@@ -111,6 +112,30 @@ class Regression:
     def test_rows(self) -> Float[np.ndarray, "test columns"]:
         return self._scaled(self.test)
 
+    @property
+    def train_theta(self) -> Float[np.ndarray, "train terms"]:
+        return self.train_rows[:, : len(self.library)]
+
+    @property
+    def test_theta(self) -> Float[np.ndarray, "test terms"]:
+        return self.test_rows[:, : len(self.library)]
+
+    def train_target(self, equation: int) -> Float[np.ndarray, " train"]:
+        return self.train_rows[:, len(self.library) + equation]
+
+    def test_target(self, equation: int) -> Float[np.ndarray, " test"]:
+        return self.test_rows[:, len(self.library) + equation]
+
+    def coef_scale(self, equation: int) -> Float[np.ndarray, " terms"]:
+        """What takes coefficients of scaled columns to SI."""
+        return self.target_scale[equation] / self.theta_scale
+
+    def coef_SI(
+        self, coef: Float[np.ndarray, "*draws terms"], equation: int
+    ) -> Float[np.ndarray, "*draws terms"]:
+        """Coefficients of scaled columns in SI; apart from rounding, times `coef_scale`."""
+        return coef * self.target_scale[equation] / self.theta_scale
+
     @cached_property
     def train_gram(self) -> Grams:
         return self._grams((self.train_rows.T @ self.train_rows)[None])
@@ -157,12 +182,9 @@ class Regression:
 def _column_norms(values: np.ndarray) -> np.ndarray:
     """L2 norms without overflow at densities to high powers."""
     columns = np.abs(values.T, order="C")  # each in one stretch of memory
-    largest = columns.max(axis=1)
-    largest[largest == 0.0] = 1.0
+    largest = zero_to_one(columns.max(axis=1))
     columns /= largest[:, None]
-    norms = largest * np.sqrt(np.einsum("cr,cr->c", columns, columns))
-    norms[norms == 0.0] = 1.0
-    return norms
+    return zero_to_one(largest * np.sqrt(np.einsum("cr,cr->c", columns, columns)))
 
 
 @runtime_checkable

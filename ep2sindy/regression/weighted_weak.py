@@ -54,11 +54,10 @@ class WeightedWeak:
             raise ValueError(
                 "weighted rows cannot be held out: set weak.split.test_fraction to 0, or use Weak"
             )
-        n_terms = len(problem.library)
         everything = usable_terms(problem)
-        coef = np.zeros(n_terms)
-        rows = problem.train_rows
-        coef[everything] = np.linalg.lstsq(rows[:, :n_terms][:, everything], rows[:, n_terms])[0]
+        coef = np.zeros(len(problem.library))
+        theta, target = problem.train_theta[:, everything], problem.train_target(0)
+        coef[everything] = np.linalg.lstsq(theta, target)[0]
         white = whitened_rows(problem, everything, coef, n_steps=self.n_steps)
         # White rows are many standard deviations long; back to about the unit of the derivative.
         size = 1.0 / np.linalg.norm(white.target)

@@ -10,6 +10,7 @@ from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csr_array
 
+from ep2sindy.data.scales import column_norms
 from ep2sindy.regression.rows import NoisyRows, Regression
 
 # No sample is moved by more standard deviations of its noise: a wrong model would never end.
@@ -118,8 +119,7 @@ class _Linearised:
         """Coefficients of the chosen terms; the rows at x are instruments for the noisy ones."""
         coef = np.zeros(len(terms))
         theta, drifted = self.theta[:, terms], self.drifted[:, terms]
-        scale = np.linalg.norm(theta, axis=0)
-        scale[scale == 0.0] = 1.0
+        scale = column_norms(theta)
         instruments = theta / scale
         coef[terms] = (
             np.linalg.lstsq(instruments.T @ (drifted / scale), instruments.T @ self.target)[0]

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ep2sindy.data.scales import zero_to_one
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.search.kernels import thresholded_supports
 from ep2sindy.search.searches import AdaptiveLasso
@@ -127,8 +128,8 @@ def _unit_columns(
     values: Float[np.ndarray, "rows columns"],
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " columns"]]:
     """Columns over their L2 norms, and the norms; 1 for a column of zeros."""
-    norms = np.hypot.reduce(np.abs(values), axis=0)  # no overflow at densities to high powers
-    norms[norms == 0.0] = 1.0
+    # Unlike squares, hypot does not overflow at densities to high powers.
+    norms = zero_to_one(np.hypot.reduce(np.abs(values), axis=0))
     return values / norms, norms
 
 

@@ -147,12 +147,11 @@ def front_order(
 
 def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
     """Every support fitted to the training rows and scored on both kinds of rows."""
-    n_terms = len(problem.library)
     equation = problem.equations.index(supports.equation)
     coef = _fit(problem, equation, supports.masks)
-    coef_SI = coef * problem.target_scale[equation] / problem.theta_scale
-    r2_train = _r2(problem.train_rows, n_terms, equation, coef)
-    r2_test = _r2(problem.test_rows, n_terms, equation, coef)
+    coef_SI = problem.coef_SI(coef, equation)
+    r2_train = _r2(problem.train_theta, problem.train_target(equation), coef)
+    r2_test = _r2(problem.test_theta, problem.test_target(equation), coef)
     return [
         Candidate(
             equation=supports.equation,
@@ -191,9 +190,9 @@ def _fit(
     The Gram matrix squares the condition of the rows, so its solution is refined against the
     residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
     """
-    gram, n_terms = problem.train_gram, len(problem.library)
+    gram = problem.train_gram
     xx = gram.xx[0]
-    theta, target = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms + equation]
+    theta, target = problem.train_theta, problem.train_target(equation)
     coef = solve_masks(xx, np.where(masks, gram.xy[0, equation], 0.0), masks)
     for _ in range(2):
         residual = target - coef @ theta.T
@@ -202,12 +201,11 @@ def _fit(
 
 
 def _r2(
-    rows: Float[np.ndarray, "rows columns"],
-    n_terms: int,
-    equation: int,
+    theta: Float[np.ndarray, "rows terms"],
+    target: Float[np.ndarray, " rows"],
     coef: Float[np.ndarray, "supports terms"],
 ) -> Float[np.ndarray, " supports"]:
     """R2 of every support on some rows; NaN where there are none."""
-    if not len(rows):
+    if not len(target):
         return np.full(len(coef), np.nan)
-    return r2(truth=rows[:, n_terms + equation], prediction=coef @ rows[:, :n_terms].T)
+    return r2(truth=target, prediction=coef @ theta.T)

@@ -5,12 +5,12 @@ xy: (terms,) their products with one target; a mask: (terms,) of bool is a suppo
 """
 
 import numpy as np
-from numba import njit
 
+from ep2sindy.machine.compilation import compiled
 from ep2sindy.regression.gram_fits import DEPENDENT, ROUNDING, independent_terms, solve, solve_masks
 
 
-@njit(cache=True)
+@compiled
 def _next_event(coef, slope, correlation, drift, level, active, n_active, barred):
     """First knot as the lasso's penalty falls from `level`: step, term, joins or leaves."""
     step, term, joins = level, -1, False
@@ -32,7 +32,7 @@ def _next_event(coef, slope, correlation, drift, level, active, n_active, barred
     return step, term, joins
 
 
-@njit(cache=True)
+@compiled
 def lasso_supports(xx, xy, max_terms):
     """Every support on the exact lasso path, from the empty one to `max_terms` or all terms.
 
@@ -85,7 +85,7 @@ def lasso_supports(xx, xy, max_terms):
     return masks[:n_masks]
 
 
-@njit(cache=True)
+@compiled
 def _drift(xx, slope, active, n_active):
     """How fast each term's correlation falls along the path."""
     drift = np.zeros(len(xx))
@@ -95,7 +95,7 @@ def _drift(xx, slope, active, n_active):
     return drift
 
 
-@njit(cache=True)
+@compiled
 def adaptive_lasso_supports(xx, xy, gamma, max_terms):
     """Supports on the path of the lasso with penalties |b_ols|^-gamma (Zou 2006).
 
@@ -107,7 +107,7 @@ def adaptive_lasso_supports(xx, xy, gamma, max_terms):
     return lasso_supports(xx * scale.reshape(-1, 1) * scale, xy * scale, max_terms)
 
 
-@njit(cache=True)
+@compiled
 def _leave(active, n_active, term):
     kept = 0
     for i in range(n_active):
@@ -117,7 +117,7 @@ def _leave(active, n_active, term):
     return kept
 
 
-@njit(cache=True)
+@compiled
 def thresholded_supports(xx, xy, thresholds):
     """Sequentially thresholded least squares, iterated to its end, for every threshold."""
     n_terms = len(xy)
@@ -139,7 +139,7 @@ def thresholded_supports(xx, xy, thresholds):
     return masks
 
 
-@njit(cache=True)
+@compiled
 def _sweep(source, target, j, size):
     """Remove from rows and columns after j what column j explains of them."""
     for a in range(j + 1, size):
@@ -149,18 +149,20 @@ def _sweep(source, target, j, size):
             target[b, a] = target[a, b]
 
 
-@njit(cache=True)
+@compiled
 def _joined(total, residual, rounding, n_problems):
     """Carry the product of residuals on by one: as a logarithm, or plainly if it is the only."""
     return residual if n_problems == 1 else total + np.log(max(residual, rounding))
 
 
-@njit(cache=True)
+@compiled
 def _least_residual(matrices, first, size, smallest, scratch):
     """The same when every column from `first` on is used: a bound for a whole subtree."""
     total = 0.0
     for p in range(len(matrices)):
-        scratch[first:size, first:size] = matrices[p, first:size, first:size]
+        for a in range(first, size):  # slices would take seconds more to compile
+            for b in range(first, size):
+                scratch[a, b] = matrices[p, a, b]
         for j in range(first, size - 1):
             if scratch[j, j] > smallest[p, j]:
                 _sweep(scratch, scratch, j, size)
@@ -168,7 +170,7 @@ def _least_residual(matrices, first, size, smallest, scratch):
     return total
 
 
-@njit(cache=True)
+@compiled
 def _offer(residual, chosen, n_chosen, best, best_masks):
     """Keep a subset among the best of its size, sorted by residual."""
     rank = best.shape[1]
@@ -176,16 +178,45 @@ def _offer(residual, chosen, n_chosen, best, best_masks):
         rank -= 1
     if rank == best.shape[1]:
         return
+    n_terms = best_masks.shape[2]
     for r in range(best.shape[1] - 1, rank, -1):
         best[n_chosen, r] = best[n_chosen, r - 1]
-        best_masks[n_chosen, r] = best_masks[n_chosen, r - 1]
+        for j in range(n_terms):
+            best_masks[n_chosen, r, j] = best_masks[n_chosen, r - 1, j]
     best[n_chosen, rank] = residual
-    best_masks[n_chosen, rank] = False
+    for j in range(n_terms):
+        best_masks[n_chosen, rank, j] = False
     for i in range(n_chosen):
         best_masks[n_chosen, rank, chosen[i]] = True
 
 
-@njit(cache=True)
+def _root(xx, xy, yy, depth):
+    """Gram matrices of columns and target, with room for `depth` steps down, and what is zero."""
+    n_problems, n_terms = xy.shape
+    size = n_terms + 1
+    levels = np.zeros((depth + 1, n_problems, size, size))
+    levels[0, :, :n_terms, :n_terms] = xx
+    levels[0, :, :n_terms, n_terms], levels[0, :, n_terms, :n_terms] = xy, xy
+    levels[0, :, n_terms, n_terms] = yy
+    smallest = np.empty((n_problems, size))
+    smallest[:, :n_terms] = DEPENDENT * np.diagonal(xx, axis1=1, axis2=2)
+    smallest[:, n_terms] = np.where(yy > 0.0, ROUNDING * yy, 1.0)
+    return levels, smallest
+
+
+@compiled(inline="always")  # a call would cost the search 5 %
+def _eliminate(levels, level, j, smallest):
+    """Choose column j: the next level holds what it leaves of the columns after it."""
+    for p in range(len(smallest)):
+        here, below = levels[level, p], levels[level + 1, p]
+        if here[j, j] > smallest[p, j]:
+            _sweep(here, below, j, levels.shape[2])
+        else:
+            for a in range(j + 1, levels.shape[2]):
+                for b in range(j + 1, levels.shape[2]):
+                    below[a, b] = here[a, b]
+
+
 def best_subsets(xx, xy, yy, max_terms, n_best):
     """The `n_best` supports of least residual of every size up to max_terms, proven best.
 
@@ -199,21 +230,21 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
     xy: (problems, terms); yy: (problems,).
     Returns (supports, terms) of bool, the empty support first.
     """
-    n_problems, n_terms = xy.shape
-    size = n_terms + 1
-    depth = min(max_terms, n_terms)
-    levels = np.zeros((depth + 1, n_problems, size, size))
-    levels[0, :, :n_terms, :n_terms] = xx
-    levels[0, :, :n_terms, n_terms], levels[0, :, n_terms, :n_terms] = xy, xy
-    levels[0, :, n_terms, n_terms] = yy
-    smallest = np.empty((n_problems, size))
-    for p in range(n_problems):
-        smallest[p, :n_terms] = DEPENDENT * np.diag(xx[p])
-        smallest[p, n_terms] = ROUNDING * yy[p] if yy[p] > 0.0 else 1.0
-    scratch = np.empty((size, size))
+    depth = min(max_terms, xy.shape[1])
+    levels, smallest = _root(xx, xy, yy, depth)
     best = np.full((depth + 1, n_best), np.inf)
-    best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
     best[0, 0] = 0.0
+    best_masks = np.zeros((depth + 1, n_best, xy.shape[1]), dtype=np.bool_)
+    _search(levels, smallest, best, best_masks)
+    return best_masks.reshape(-1, xy.shape[1])[np.isfinite(best.ravel())]
+
+
+@compiled
+def _search(levels, smallest, best, best_masks):
+    """Branch and bound of `best_subsets`, from the Gram matrices of the first level."""
+    n_problems, size = smallest.shape
+    depth, n_best, n_terms = best.shape[0] - 1, best.shape[1], size - 1
+    scratch = np.empty((size, size))
     chosen = np.zeros(depth + 1, dtype=np.int64)
     following = np.zeros(depth + 1, dtype=np.int64)
     level = 0
@@ -236,12 +267,7 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
         _offer(residual, chosen, level + 1, best, best_masks)
         if level + 1 == depth or j + 1 == n_terms:
             continue
-        for p in range(n_problems):
-            here, below = levels[level, p], levels[level + 1, p]
-            if here[j, j] > smallest[p, j]:
-                _sweep(here, below, j, size)
-            else:
-                below[j + 1 :, j + 1 :] = here[j + 1 :, j + 1 :]
+        _eliminate(levels, level, j, smallest)
         worth_bounding = n_terms - j > 6 and depth - level > 2
         if worth_bounding and best[level + 2, n_best - 1] <= _least_residual(
             levels[level + 1], j + 1, size, smallest, scratch
@@ -249,4 +275,3 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
             continue
         following[level + 1] = j + 1
         level += 1
-    return best_masks.reshape(-1, n_terms)[np.isfinite(best.ravel())]

@@ -121,12 +121,12 @@ def _criterion(
     the leader stays.
     """
     problem = front.problem
-    n_rows, n_terms = len(problem.train_rows), len(problem.library)
+    n_rows = len(problem.train_rows)
     n_effective = float(n_rows if coarsening is None else n_rows / (1.0 + n_rows / coarsening))
     penalties = np.array([penalty(c, n_effective) for c in front.candidates])
     masks = np.array([np.isin(problem.term_names, c.terms) for c in front.candidates])
     equation = problem.equations.index(front.equation)
-    theta, target = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms + equation]
+    theta, target = problem.train_theta, problem.train_target(equation)
     leader = -1
     for _ in range(MAX_ROUNDS):
         squares, coef = _fits(theta, target, masks)

@@ -116,7 +116,7 @@ def _block_errors(front: ParetoFront, n_folds: int) -> Float[np.ndarray, "candid
         coef = solve_masks(fit.xx[k], np.where(masks, fit.xy[k, equation], 0.0), masks)
         explained = coef * (2.0 * judge.xy[k, equation] - coef @ judge.xx[k])
         squares[:, k] = judge.yy[k, equation] - explained.sum(axis=1)
-    variance = problem.train_rows[:, len(problem.library) + equation].var()
+    variance = problem.train_target(equation).var()
     errors = np.maximum(squares, 0.0) / judged.sum(axis=1) / variance
     return np.where(np.isfinite(errors), errors, np.inf)
 

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
+from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import check_time, read_only
-from ep2sindy.signals.kernels import leverage, likelihood, smoothed
+from ep2sindy.signals.kernels import likelihood, smoothed
 
 # From a memory of some 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -27,14 +28,13 @@ MIN_SAMPLES = 5
 class KalmanEstimate:
     """What the smoother makes of samples in u, column by column.
 
-    smoothed: in u, with its standard deviation smoothed_std; derivative: in u/s.
+    smoothed: in u; derivative: in u/s.
     noise_std: of the white noise in the samples, in u.
     log10_ratio: of process to measurement noise, with the mean step as the unit of time.
     """
 
     smoothed: Float[np.ndarray, "samples columns"]
     derivative: Float[np.ndarray, "samples columns"]
-    smoothed_std: Float[np.ndarray, "samples columns"]
     noise_std: Float[np.ndarray, " columns"]
     log10_ratio: Float[np.ndarray, " columns"]
 
@@ -72,8 +72,8 @@ class KalmanSmoother:
         """
         steps, step_s = _unit_steps(t, values)
         spread = np.ptp(values, axis=0)
-        scaled = (values - values[0]) / np.where(spread > 0.0, spread, 1.0)
-        signal, slope, signal_std = np.empty((3, *values.shape))
+        scaled = (values - values[0]) / zero_to_one(spread)
+        signal, slope = np.empty((2, *values.shape))
         noise_std, log10_ratio = np.empty((2, values.shape[1]))
         for j in range(values.shape[1]):
             column = np.ascontiguousarray(scaled[:, j])[:, None]
@@ -81,12 +81,9 @@ class KalmanSmoother:
             ratio = 10.0 ** log10_ratio[j]
             signal[:, j : j + 1], slope[:, j : j + 1] = smoothed(steps, column, ratio)
             noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1][0])
-            # Rounding can take a leverage below zero where samples nearly coincide.
-            signal_std[:, j] = noise_std[j] * np.sqrt(np.maximum(leverage(steps, ratio), 0.0))
         return KalmanEstimate(
             smoothed=values[0] + spread * signal,
             derivative=spread * slope / step_s,
-            smoothed_std=spread * signal_std,
             noise_std=spread * noise_std,
             log10_ratio=log10_ratio,
         )
@@ -105,24 +102,6 @@ class KalmanSmoother:
 
     def _ratio(self, steps: np.ndarray, column: np.ndarray) -> float:
         return most_likely_ratio(steps, column) if self.log10_ratio is None else self.log10_ratio
-
-
-def kalman_smooth(
-    t: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, "samples columns"],
-    *,
-    log10_ratio: float,
-) -> Float[np.ndarray, "samples columns"]:
-    """Smooth many columns with one ratio: the product of a symmetric matrix and `values`.
-
-    The matrix depends on t and log10_ratio alone, so this carries noise through the smoother.
-    Raises ValueError for fewer than five samples, or a log10_ratio outside [-14, 4].
-    """
-    _check_ratio(log10_ratio)
-    steps, _ = _unit_steps(t, values)
-    # A locked array would have the kernels compiled once more.
-    values = np.require(values, np.float64, ["C_CONTIGUOUS", "WRITEABLE"])
-    return smoothed(steps, values, 10.0**log10_ratio)[0]
 
 
 def most_likely_ratio(

@@ -11,7 +11,8 @@ Loops in place of array expressions and slices: those take seconds more to compi
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from ep2sindy.machine.compilation import compiled
 
 # Values scaled to unit range carry rounding of this variance: less noise cannot be told apart.
 ROUNDING = np.finfo(np.float64).eps ** 2
@@ -32,7 +33,7 @@ class Gains(NamedTuple):
     slope_cov: np.ndarray
 
 
-@njit(cache=True)
+@compiled
 def _parabola(h1, h2):
     """State at the third sample of the parabola through the first three."""
     both = h1 + h2
@@ -44,14 +45,14 @@ def _parabola(h1, h2):
     return state
 
 
-@njit(cache=True)
+@compiled
 def _signal_cov(a, b):
     """Covariance of a process of unit density, `a` and `b` after it left a known parabola."""
     low, lag = min(a, b), abs(a - b)
     return low**5 / 20.0 + lag * low**4 / 8.0 + lag**2 * low**3 / 12.0
 
 
-@njit(cache=True)
+@compiled
 def _slope_signal_cov(a, b):
     """Derivative of `_signal_cov` by its first argument."""
     if a <= b:
@@ -59,7 +60,7 @@ def _slope_signal_cov(a, b):
     return b**4 / 8.0 + (a - b) * b**3 / 6.0
 
 
-@njit(cache=True)
+@compiled
 def _start(steps, ratio, slope_cov):
     """Begin at the third sample, where three samples first determine the state.
 
@@ -91,7 +92,7 @@ def _start(steps, ratio, slope_cov):
     return parabola, (l10, l20, l21), (1.0, d1, d2)
 
 
-@njit(cache=True)
+@compiled
 def _predict(h, ratio, lower, diagonal):
     """F P F' + Q over a step h, from and to P = L D L', by weighted Gram-Schmidt.
 
@@ -122,7 +123,7 @@ def _predict(h, ratio, lower, diagonal):
     return (l10, l20, l21), (new0, new1, new2)
 
 
-@njit(cache=True)
+@compiled
 def gains(steps, ratio):
     """Run the filter's covariances over all samples."""
     n_samples = len(steps) + 1
@@ -142,7 +143,7 @@ def gains(steps, ratio):
     return Gains(parabola, gain, variance, slope_cov)
 
 
-@njit(cache=True)
+@compiled
 def _filtered(steps, values, known):
     """Innovations, and the slopes as far as the samples up to each one tell."""
     n_samples, n_columns = values.shape
@@ -173,7 +174,7 @@ def _filtered(steps, values, known):
     return innovation, slope
 
 
-@njit(cache=True)
+@compiled
 def likelihood(steps, values, ratio):
     """Log-likelihood (columns,) of the samples after the third, and the noise variance at it.
 
@@ -195,7 +196,7 @@ def likelihood(steps, values, ratio):
     return total, noise
 
 
-@njit(cache=True)
+@compiled
 def smoothed(steps, values, ratio):
     """Signal and slope per unit time, both (samples, columns), given all samples.
 
@@ -227,36 +228,3 @@ def smoothed(steps, values, ratio):
                 slope[k, j] += known.slope_cov[k, a] * later[a, j]
                 signal[k, j] += known.parabola[a, k] * later[a, j]
     return signal, slope
-
-
-@njit(cache=True)
-def leverage(steps, ratio):
-    """Diagonal (samples,) of the smoother as a matrix: variance of the signal given all samples."""
-    known = gains(steps, ratio)
-    n_samples = len(steps) + 1
-    diagonal = np.ones(n_samples)
-    n00 = n01 = n02 = n11 = n12 = n22 = 0.0  # variance of `later` in `smoothed`
-    for k in range(n_samples - 1, 2, -1):
-        h = steps[k - 1]
-        half = 0.5 * h * h
-        g0, g1, g2 = known.gain[k, 0], known.gain[k, 1], known.gain[k, 2]
-        w0 = n00 * g0 + n01 * g1 + n02 * g2
-        w1 = n01 * g0 + n11 * g1 + n12 * g2
-        w2 = n02 * g0 + n12 * g1 + n22 * g2
-        noise = 1.0 / known.variance[k] + g0 * w0 + g1 * w1 + g2 * w2
-        diagonal[k] -= noise
-        n00 += noise - 2.0 * w0
-        n01 -= w1
-        n02 -= w2
-        # F' N F.
-        a01, a02 = n01 + h * n00, n02 + h * n01 + half * n00
-        b12 = n12 + h * n11 + half * n01
-        n22 += h * n12 + half * n02 + h * b12 + half * a02
-        n12, n11 = b12 + h * a02, n11 + h * n01 + h * a01
-        n01, n02 = a01, a02
-    later = ((n00, n01, n02), (n01, n11, n12), (n02, n12, n22))
-    for k in range(3):
-        for a in range(3):
-            for b in range(3):
-                diagonal[k] -= known.parabola[a, k] * later[a][b] * known.parabola[b, k]
-    return diagonal

@@ -19,6 +19,7 @@ from scipy.special import expit
 
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import coef_matrix
+from ep2sindy.model.runge_kutta import rk4_step
 from ep2sindy.thruster.parameters import Thruster
 
 Equations = Mapping[str, Mapping[str, float]]
@@ -184,10 +185,6 @@ def _integrate(
     states = np.empty((n_samples, n_points, len(STATES)))
     states[0] = [4e17, 2.6e18]
     for k in range(n_samples - 1):
-        x, (start, middle, end) = states[k], inputs[2 * k : 2 * k + 3]
-        k1 = slope(x, start)
-        k2 = slope(x + 0.5 * dt_s * k1, middle)
-        k3 = slope(x + 0.5 * dt_s * k2, middle)
-        k4 = slope(x + dt_s * k3, end)
-        states[k + 1] = x + dt_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        start, middle, end = inputs[2 * k : 2 * k + 3]
+        states[k + 1] = rk4_step(slope, states[k], (start, middle, end), dt_s)
     return states

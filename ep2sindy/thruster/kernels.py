@@ -7,8 +7,8 @@ cathode plane; cells 1 .. n are the domain. Face i lies between cells i and i + 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ep2sindy.machine.compilation import compiled
 from ep2sindy.thruster.closures import E_CHARGE, M_ELECTRON
 
 COLDEST_EV = 1.0  # of the ghost cells: a steep end would otherwise turn them negative
@@ -68,7 +68,7 @@ class State(NamedTuple):
     left: np.ndarray  # (1,), atoms that left through the cathode plane, 1/m^2
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def half_slope(left, centre, right):
     """Half the van Leer slope: a*b/(a+b) of the two differences, 0 at an extremum."""
     a = centre - left
@@ -76,7 +76,7 @@ def half_slope(left, centre, right):
     return a * b / (a + b) if a * b > 0.0 else 0.0
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def rusanov(n_l, u_l, n_r, u_r, c2):
     """Rusanov fluxes of ion density and ion flux between two states; c2: sound speed squared."""
     g_l, g_r = n_l * u_l, n_r * u_r
@@ -86,7 +86,7 @@ def rusanov(n_l, u_l, n_r, u_r, c2):
     return flux_n, flux_g
 
 
-@njit(cache=True)
+@compiled
 def face_fluxes(n, g, nn, model, u, f_n, f_g, f_nn):
     """Fluxes of ion density, ion flux and neutrals through faces 0 .. cells.
 
@@ -116,7 +116,7 @@ def face_fluxes(n, g, nn, model, u, f_n, f_g, f_nn):
     f_nn[cells] = model.neutral_speed * nn[cells]
 
 
-@njit(cache=True)
+@compiled
 def heavy_rates(n, g, nn, state, model, w, d_n, d_g, d_nn):
     """Time derivatives of ion density, ion flux and neutral density in every cell."""
     f_n, f_g, f_nn = w[0], w[1], w[2]
@@ -132,7 +132,7 @@ def heavy_rates(n, g, nn, state, model, w, d_n, d_g, d_nn):
         d_nn[i] = (f_nn[i - 1] - f_nn[i]) * inv_dz - born + lost * n[i]
 
 
-@njit(cache=True)
+@compiled
 def heavy_step(state, model, dt, w):
     """One SSP-RK2 (Heun) step of ions and neutrals in a frozen field."""
     n, g, nn = state.n_i, state.flux_i, state.n_n
@@ -150,13 +150,13 @@ def heavy_step(state, model, dt, w):
         nn[i] = 0.5 * (nn[i] + w[9, i] + dt * w[6, i])
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def lookup(table, row, share, column):
     """Linear interpolation between two rows of the closure table."""
     return table[row, column] + share * (table[row + 1, column] - table[row, column])
 
 
-@njit(cache=True)
+@compiled
 def collisions(state, model, nu, mobility, kappa, source):
     """Collision frequency, mobility, conductivity and losses; False where a table ends."""
     n, nn, T, table = state.n_i, state.n_n, state.T_e_eV, model.table
@@ -190,7 +190,7 @@ def collisions(state, model, nu, mobility, kappa, source):
     return True
 
 
-@njit(cache=True)
+@compiled
 def ohm(state, model, nu, mobility, gradient, source):
     """Discharge current, field and drift energy; heats by -n u_e E; returns I_d/(e A)."""
     n, g, T = state.n_i, state.flux_i, state.T_e_eV
@@ -213,7 +213,7 @@ def ohm(state, model, nu, mobility, gradient, source):
     return total
 
 
-@njit(cache=True)
+@compiled
 def heat(state, model, dt, total, kappa, source, c, d):
     """New electron temperature: implicit upwind convection and conduction, explicit sources."""
     n, g, T = state.n_i, state.flux_i, state.T_e_eV
@@ -235,7 +235,7 @@ def heat(state, model, dt, total, kappa, source, c, d):
         state.energy[i] = 1.5 * n[i] * T[i]
 
 
-@njit(cache=True)
+@compiled
 def electron_step(state, model, dt, w):
     """Collisions, discharge current, field and new temperature; False where the run breaks."""
     n, g, nn, T = state.n_i, state.flux_i, state.n_n, state.T_e_eV
@@ -252,7 +252,7 @@ def electron_step(state, model, dt, w):
     return np.isfinite(total)
 
 
-@njit(cache=True)
+@compiled
 def time_step(state, model, left):
     """Equal share of the time left to the next sample that keeps the CFL number."""
     top = 0.0
@@ -262,7 +262,7 @@ def time_step(state, model, left):
     return left / np.ceil(left * fastest / (model.cfl * model.dz))
 
 
-@njit(cache=True)
+@compiled
 def advance(state, model, sample_s, n_i, u, n_n, T_e, R, E, current, thrust, mass_out):
     """Fill the rows of the output arrays, one every `sample_s`; return (rows filled, steps)."""
     cells = state.n_i.size - 2

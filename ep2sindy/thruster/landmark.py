@@ -38,7 +38,7 @@ def landmark_thruster(case: int, rates: TabulatedRates) -> Thruster:
     )
 
 
-def read_rate_table(path: Path) -> TabulatedRates:
+def read_landmark_rates(path: Path) -> TabulatedRates:
     """Read mean energy (eV), ionisation rate (m^3/s) and energy loss (eV m^3/s) from a CSV.
 
     The first line is a header. Raises ValueError for a row without three numbers.

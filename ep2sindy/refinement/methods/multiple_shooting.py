@@ -19,7 +19,6 @@ class MultipleShooting:
     for the scalings with each block's start eliminated by QR. A stage cuts the windows into
     blocks with starts of their own: `first_block` samples, then `growth` times as many, up to
     the whole window. A stage that fails leaves the scalings as they were.
-    adapt_step: halve the time step while its error shows in the scalings.
     limit: largest change of a scaling per iteration, relative to it or to one.
     Converged: the relative change of every scaling is below `tolerance`, the defects too.
     Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7.
@@ -31,7 +30,6 @@ class MultipleShooting:
     tolerance: float = 1e-7
     max_iter: int = 50
     limit: float = 0.5
-    adapt_step: bool = True
 
     def fit(self, problem: Problem) -> Fit:
         n_points = len(problem.data)
@@ -55,7 +53,7 @@ class MultipleShooting:
 
     def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> Fit | None:
         """Some points of a fit again from where they are, with half the time step."""
-        step = fit.step.halved() if self.adapt_step else None
+        step = fit.step.halved()
         if step is None:
             return None
         finished = np.ones_like(fit.finished)

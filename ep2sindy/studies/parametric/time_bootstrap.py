@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.fit import WeightedEquation, weighted_equations
 from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.scales import column_norms
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.resampling import moving_block_counts
 from ep2sindy.regression.rows import Regression
@@ -63,8 +64,7 @@ def resampled_coefficients(
     groups = [e.problem.groups[~e.problem.test] for e in equations]
     numbers = np.unique(np.concatenate(groups))
     _check_blocks(len(numbers), block)
-    scale = np.linalg.norm(np.concatenate(rows), axis=0)
-    scale[scale == 0.0] = 1.0
+    scale = column_norms(np.concatenate(rows))
     sums = np.zeros((len(numbers), len(scale), len(scale)))
     for own, group in zip(rows, groups, strict=True):
         unit = own / scale

@@ -1,0 +1,1 @@
+"""Open files of many kinds: one file per kind, all giving a `Source`."""

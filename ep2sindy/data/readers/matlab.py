@@ -1,0 +1,49 @@
+"""MATLAB files, up to v7 and v7.3."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.readers.hdf5 import names_in_hdf5
+from ep2sindy.data.readers.source import Reader, Source, leaves
+
+V73 = b"MATLAB 7.3"
+
+
+def read_matlab(path: Path) -> Source:
+    """MATLAB of either kind; a struct's field is "data.n_i"."""
+    with path.open("rb") as file:
+        return read_matlab73(path) if file.read(len(V73)) == V73 else read_matlab5(path)
+
+
+def read_matlab73(path: Path) -> Source:
+    """MATLAB v7.3, which is HDF5 with axes reversed; a struct's field is "data.n_i"."""
+    import h5py
+
+    def read(name: str) -> xr.DataArray:
+        with h5py.File(path) as file:
+            return xr.DataArray(file[name.replace(".", "/")][()].T)
+
+    names = [
+        name.replace("/", ".") for name in names_in_hdf5(path) if not name.startswith("#refs#")
+    ]
+    return Source(path, names, read)
+
+
+def read_matlab5(path: Path) -> Source:
+    """MATLAB up to v7; a struct's field is "data.n_i"."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except MatReadError as error:
+        raise ValueError(str(error)) from error
+    arrays = leaves({name: value for name, value in content.items() if not name.startswith("__")})
+    return Source(path, list(arrays), lambda name: xr.DataArray(np.asarray(arrays[name])))
+
+
+MATLAB = Reader("MATLAB (v5, v7.3)", read_matlab, first_bytes=(b"MATLAB 5.0", V73))

@@ -1,0 +1,54 @@
+"""Every kind of file that can be opened, and which of them a file is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ep2sindy.data.readers.csv import CSV
+from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
+from ep2sindy.data.readers.hdf5 import HDF5
+from ep2sindy.data.readers.matlab import MATLAB
+from ep2sindy.data.readers.netcdf import NETCDF
+from ep2sindy.data.readers.npz import NPZ
+from ep2sindy.data.readers.source import Reader, Source, damage_named, look_at
+from ep2sindy.data.readers.zarr import ZARR
+
+# In any order: no two of them claim a file equally.
+READERS = (NETCDF, HDF5, MATLAB, NPZ, CSV, HALLTHRUSTER, ZARR)
+
+
+def open_source(path: Path) -> Source:
+    """Open a file with the reader for its kind."""
+    reader = reader_of(path)
+    with damage_named(path):
+        return reader.open(path)
+
+
+def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
+    """Tell the kind of a file: by its first bytes where they say it, else by its ending.
+
+    Raises ValueError, with the kinds there are, for a file that is missing or of none of them.
+    """
+    if not path.exists():
+        raise ValueError(f"no such file: {path.absolute()}")
+    look = look_at(path)
+    claims = [reader.claim(look) for reader in readers]
+    if any(claims):
+        return readers[claims.index(max(claims))]
+    if look.form == "folder":
+        folders = _listed([e for r in readers if r.form == "folder" for e in r.endings])
+        raise ValueError(
+            f"a file must come, or a folder that ends in {folders}: {path} is a folder"
+        )
+    by_ending = [r for r in readers if r.form in ("other", "folder")]
+    kinds = _listed([r.name for r in readers if r not in by_ending])
+    endings = _listed([ending for r in by_ending for ending in r.endings])
+    raise ValueError(
+        f"a file must be {kinds}, or end in {endings}: "
+        f"{path} begins with {look.head!r}; its ending may be wrong, or its content damaged"
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " or ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

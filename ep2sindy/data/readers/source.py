@@ -1,0 +1,125 @@
+"""What every reader gives, and what readers share."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import xarray as xr
+
+# Time stays a number, whatever its attribute `units` says.
+UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
+
+
+# What the parsing libraries raise on damaged files beyond ValueError and OSError.
+LIBRARY_ERRORS = (zipfile.BadZipFile, zlib.error)
+
+
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file opened: the names it holds, and the array of one name.
+
+    dims_named: whether the arrays' dimension names are the file's own.
+    """
+
+    path: Path
+    names: Sequence[str]
+    read: Callable[[str], xr.DataArray]
+    dims_named: bool = False
+
+
+@dataclass(frozen=True)
+class Look:
+    """What tells a file's kind. head: its first 16 bytes, none of a folder."""
+
+    form: Literal["folder", "hdf5", "other"]
+    head: bytes
+    ending: str
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One kind of file: how it is recognised, and how it is opened.
+
+    first_bytes: beginnings that no other kind has. form, endings: otherwise a folder, HDF5 or any
+    other file with one of these endings; without endings, all of that form which nobody claims by
+    its ending. form None: recognised by its first bytes alone.
+    """
+
+    name: str
+    open: Callable[[Path], Source]
+    first_bytes: tuple[bytes, ...] = ()
+    form: Literal["folder", "hdf5", "other"] | None = None
+    endings: tuple[str, ...] = ()
+
+    def claim(self, look: Look) -> int:
+        """How surely the file is of this kind: 3 by its first bytes, 2 its ending, 1 its form."""
+        if look.head.startswith(self.first_bytes):
+            return 3
+        if look.form != self.form:
+            return 0
+        return 2 * (look.ending in self.endings) if self.endings else 1
+
+
+def look_at(path: Path) -> Look:
+    """Raises OSError for a file that cannot be read."""
+    ending = path.suffix.lower()
+    if path.is_dir():
+        return Look("folder", b"", ending)
+    with path.open("rb") as file:
+        head = file.read(16)
+    return Look("hdf5" if _is_hdf5(path) else "other", head, ending)
+
+
+def _is_hdf5(path: Path) -> bool:
+    """Whether the signature stands at byte 0, 512 or a double of it, after a block of the user's.
+
+    Source: HDF5 file format specification 3.0, II.A.
+    """
+    size, place = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while place + len(HDF5_SIGNATURE) <= size:
+            file.seek(place)
+            if file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE:
+                return True
+            place = max(512, 2 * place)
+    return False
+
+
+@contextmanager
+def damage_named(path: Path) -> Iterator[None]:
+    """Turn what the parsing libraries raise into one error that names the file."""
+    try:
+        yield
+    except (OSError, EOFError, ValueError, LookupError, TypeError, *LIBRARY_ERRORS) as error:
+        raise ValueError(
+            f"{path} cannot be read: {error}; the file may be cut short, or of another kind"
+        ) from error
+
+
+def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
+    """Variables of a dataset whose dimensions the file names."""
+    names = [str(name) for name in dataset.variables]
+    return Source(path, names, lambda name: dataset[name], dims_named=True)
+
+
+def leaves(node: Any, path: str = "") -> dict[str, Any]:
+    """Nested dicts and lists of them as {"a.b.0": value}; a list of numbers is one value."""
+    if isinstance(node, dict):
+        items = list(node.items())
+    elif isinstance(node, list) and any(isinstance(item, dict | list) for item in node):
+        items = list(enumerate(node))
+    else:
+        return {path: node}
+    found: dict[str, Any] = {}
+    for key, item in items:
+        found |= leaves(item, f"{path}.{key}" if path else str(key))
+    return found
