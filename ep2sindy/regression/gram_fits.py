@@ -69,6 +69,17 @@ def independent_terms(xx):
 
 
 @compiled
+def _chosen(masks, m, active):
+    """Fill in the terms of one mask; how many they are."""
+    n_active = 0
+    for j in range(masks.shape[1]):
+        if masks[m, j]:
+            active[n_active] = j
+            n_active += 1
+    return n_active
+
+
+@compiled
 def solve_masks(xx, rhs, masks):
     """Solve xx coef = rhs on each support; NaN where its columns depend on each other.
 
@@ -79,11 +90,7 @@ def solve_masks(xx, rhs, masks):
     solution = np.empty(n_terms)
     active = np.empty(n_terms, dtype=np.int64)
     for m in range(n_masks):  # loops: fancy indices would take seconds more to compile
-        n_active = 0
-        for j in range(n_terms):
-            if masks[m, j]:
-                active[n_active] = j
-                n_active += 1
+        n_active = _chosen(masks, m, active)
         if solve(xx, rhs[m], active, n_active, solution):
             for i in range(n_active):
                 coef[m, active[i]] = solution[i]

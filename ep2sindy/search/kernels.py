@@ -190,17 +190,20 @@ def _offer(residual, chosen, n_chosen, best, best_masks):
         best_masks[n_chosen, rank, chosen[i]] = True
 
 
+@compiled
 def _root(xx, xy, yy, depth):
     """Gram matrices of columns and target, with room for `depth` steps down, and what is zero."""
     n_problems, n_terms = xy.shape
-    size = n_terms + 1
-    levels = np.zeros((depth + 1, n_problems, size, size))
-    levels[0, :, :n_terms, :n_terms] = xx
-    levels[0, :, :n_terms, n_terms], levels[0, :, n_terms, :n_terms] = xy, xy
-    levels[0, :, n_terms, n_terms] = yy
-    smallest = np.empty((n_problems, size))
-    smallest[:, :n_terms] = DEPENDENT * np.diagonal(xx, axis1=1, axis2=2)
-    smallest[:, n_terms] = np.where(yy > 0.0, ROUNDING * yy, 1.0)
+    levels = np.zeros((depth + 1, n_problems, n_terms + 1, n_terms + 1))
+    smallest = np.empty((n_problems, n_terms + 1))
+    for p in range(n_problems):
+        for i in range(n_terms):
+            for j in range(n_terms):
+                levels[0, p, i, j] = xx[p, i, j]
+            levels[0, p, i, n_terms] = levels[0, p, n_terms, i] = xy[p, i]
+            smallest[p, i] = DEPENDENT * xx[p, i, i]
+        levels[0, p, n_terms, n_terms] = yy[p]
+        smallest[p, n_terms] = ROUNDING * yy[p] if yy[p] > 0.0 else 1.0
     return levels, smallest
 
 
@@ -217,6 +220,7 @@ def _eliminate(levels, level, j, smallest):
                     below[a, b] = here[a, b]
 
 
+@compiled
 def best_subsets(xx, xy, yy, max_terms, n_best):
     """The `n_best` supports of least residual of every size up to max_terms, proven best.
 
@@ -230,13 +234,25 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
     xy: (problems, terms); yy: (problems,).
     Returns (supports, terms) of bool, the empty support first.
     """
-    depth = min(max_terms, xy.shape[1])
+    n_terms = xy.shape[1]
+    depth = min(max_terms, n_terms)
     levels, smallest = _root(xx, xy, yy, depth)
-    best = np.full((depth + 1, n_best), np.inf)
+    best = np.empty((depth + 1, n_best))
+    for size in range(depth + 1):
+        for rank in range(n_best):
+            best[size, rank] = np.inf
     best[0, 0] = 0.0
-    best_masks = np.zeros((depth + 1, n_best, xy.shape[1]), dtype=np.bool_)
+    best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
     _search(levels, smallest, best, best_masks)
-    return best_masks.reshape(-1, xy.shape[1])[np.isfinite(best.ravel())]
+    found = np.empty((best.size, n_terms), dtype=np.bool_)
+    n_found = 0
+    for size in range(depth + 1):
+        for rank in range(n_best):
+            if best[size, rank] < np.inf:
+                for j in range(n_terms):
+                    found[n_found, j] = best_masks[size, rank, j]
+                n_found += 1
+    return found[:n_found]
 
 
 @compiled
