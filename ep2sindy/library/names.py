@@ -1,4 +1,4 @@
-"""Names of variables and terms: how they are read, and how they look in LaTeX."""
+"""Names of terms: how they are read."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _TERM = re.compile(rf"\s*{_FACTOR}(?:\s*\*\s*{_FACTOR})*\s*")
 
 
 def split_factors(name: str) -> list[tuple[str, int]]:
-    """Variables and powers of a term: `n_i^2*<n_n*R_ion>` -> (n_i, 2), (<n_n*R_ion>, 1)."""
+    """Factors and powers of a term: `n_i^2*<n_n*R_ion>` -> (n_i, 2), (<n_n*R_ion>, 1)."""
     if not _TERM.fullmatch(name):
         raise ValueError(
             f"a term is variables joined by *, with whole powers: {name!r} came; write it like "
             "'n_i^2*n_n'"
         )
-    return [(variable, int(power or 1)) for variable, power in re.findall(_FACTOR, name)]
+    return [(factor, int(power or 1)) for factor, power in re.findall(_FACTOR, name)]

@@ -93,7 +93,7 @@ class Ensemble:
         """The terms that any model uses, and their coefficients."""
         used = np.abs(self.coef).max(axis=(1, 2)) > 0.0
         used[0] = True  # a library needs a term
-        return Library(self.library.variables, self.library.exponents[used]), self.coef[used]
+        return self.library.take(used), self.coef[used]
 
     def errors(
         self,

@@ -241,12 +241,9 @@ class SparseModel:
         self, window: Trajectory, scale: np.ndarray
     ) -> Callable[[float, np.ndarray], np.ndarray]:
         """The right-hand side for scaled states, with the absent terms left out."""
-        present = self.coef.any(axis=1)
+        present = np.flatnonzero(self.coef.any(axis=1))
         coef = self.coef[present] / scale
-        # One gather and one product per call: index -1 of the padded values is a one.
-        places = np.append(self._gather, -1)
-        factors = places[self.library.factors[present]]
-        padded = np.ones(len(self.states) + len(self.inputs) + 1)
+        values, terms = self.library.at_points([*self.states, *self.inputs], present)
         n = len(self.states)
         drive = None
         if self.inputs:
@@ -254,10 +251,10 @@ class SparseModel:
             drive = make_interp_spline(window.t, inputs, k=min(3, len(inputs) - 1))
 
         def rhs(t: float, y: np.ndarray) -> np.ndarray:
-            padded[:n] = y * scale
+            values[:n] = y * scale
             if drive is not None:
-                padded[n:-1] = drive(t)
-            return padded[factors].prod(axis=1) @ coef
+                values[n:] = drive(t)
+            return terms() @ coef
 
         return rhs
 
