@@ -1,11 +1,15 @@
-"""How equations are written: text, LaTeX, HTML."""
+"""How equations are written: text, LaTeX, HTML, sympy."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from ep2sindy.library.names import split_factors
+
+if TYPE_CHECKING:
+    import sympy
 
 
 def latex_name(variable: str) -> str:
@@ -24,11 +28,12 @@ def latex_derivative(state: str) -> str:
 
 def latex_term_name(name: str) -> str:
     """`n_i^2*n_n` -> `n_{i}^{2} n_{n}`."""
-    if name == "1":
-        return name
-    return " ".join(
-        latex_name(variable) + (f"^{{{power}}}" if power > 1 else "")
-        for variable, power in split_factors(name)
+    return (
+        " ".join(
+            latex_name(factor) + (f"^{{{power}}}" if power > 1 else "")
+            for factor, power in _factors(name)
+        )
+        or name
     )
 
 
@@ -42,13 +47,25 @@ def equation_text(state: str, terms: Mapping[str, float], *, digits: int = 3) ->
     return f"{state}' = {' '.join(parts) or '0'}"
 
 
-def latex_term(name: str, coef: float, digits: int, *, first: bool) -> str:
-    sign = "-" if coef < 0 else "" if first else "+"
-    mantissa, _, exponent = f"{abs(coef):.{digits}g}".partition("e")
-    number = mantissa + (rf" \cdot 10^{{{int(exponent)}}}" if exponent else "")
-    if name == "1":
-        return f"{sign} {number}".strip()
-    return f"{sign} {number} \\, {latex_term_name(name)}".strip()
+def sum_latex(terms: Mapping[str, float], *, digits: int = 3) -> str:
+    r"""The right-hand side of an equation: `- 2.62 \cdot 10^{5} \, n_{i} + ...`."""
+    parts = []
+    for k, (name, coef) in enumerate(terms.items()):
+        sign = "-" if coef < 0 else "+" if k else ""
+        mantissa, exponent = _number(coef, digits)
+        number = mantissa + ("" if exponent is None else rf" \cdot 10^{{{exponent}}}")
+        factors = "" if name == "1" else rf" \, {latex_term_name(name)}"
+        parts.append(f"{sign} {number}{factors}".strip())
+    return " ".join(parts) or "0"
+
+
+def equations_latex(equations: Mapping[str, Mapping[str, float]], *, digits: int = 3) -> str:
+    """An `aligned` block with one equation per line, from terms by state."""
+    lines = (
+        f"{latex_derivative(state)} &= {sum_latex(terms, digits=digits)}"
+        for state, terms in equations.items()
+    )
+    return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
 
 
 def equation_html(state: str, terms: Mapping[str, float], *, digits: int = 3) -> str:
@@ -56,19 +73,41 @@ def equation_html(state: str, terms: Mapping[str, float], *, digits: int = 3) ->
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "&minus;" if coef < 0 else "+" if k else ""
-        mantissa, _, exponent = f"{abs(coef):.{digits}g}".partition("e")
-        number = mantissa + (f"&times;10<sup>{int(exponent)}</sup>" if exponent else "")
-        factors = [] if name == "1" else [_factor_html(v, p) for v, p in split_factors(name)]
+        mantissa, exponent = _number(coef, digits)
+        number = mantissa + ("" if exponent is None else f"&times;10<sup>{exponent}</sup>")
+        factors = [_factor_html(factor, power) for factor, power in _factors(name)]
         parts.append(" ".join([sign, number, *factors]).strip())
     left = f"d{_factor_html(state, 1)}/dt"
     return f"{left} = {' '.join(parts) or '0'}".replace("-", "&minus;")
 
 
-def _factor_html(variable: str, power: int) -> str:
-    if variable.startswith("<"):
-        inner = " ".join(_factor_html(v, p) for v, p in split_factors(variable[1:-1]))
+def sum_sympy(terms: Mapping[str, float]) -> sympy.Expr:
+    """The right-hand side of an equation as a sympy expression, coefficients as floats."""
+    import sympy  # half a second that most runs do not need
+
+    return sympy.Add(
+        *(
+            sympy.Float(coef) * sympy.Mul(*(sympy.Symbol(v) ** p for v, p in _factors(name)))
+            for name, coef in terms.items()
+        )
+    )
+
+
+def _number(coef: float, digits: int) -> tuple[str, int | None]:
+    """Mantissa without its sign, and the power of ten where one is written."""
+    mantissa, _, exponent = f"{abs(coef):.{digits}g}".partition("e")
+    return mantissa, int(exponent) if exponent else None
+
+
+def _factors(name: str) -> list[tuple[str, int]]:
+    return [] if name == "1" else split_factors(name)
+
+
+def _factor_html(factor: str, power: int) -> str:
+    if factor.startswith("<"):
+        inner = " ".join(_factor_html(f, p) for f, p in split_factors(factor[1:-1]))
         text = f"&lang;{inner}&rang;"
     else:
-        stem, _, index = variable.partition("_")
+        stem, _, index = factor.partition("_")
         text = f"<i>{html.escape(stem)}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
     return text + (f"<sup>{power}</sup>" if power > 1 else "")

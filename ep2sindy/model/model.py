@@ -17,14 +17,13 @@ from scipy.interpolate import make_interp_spline
 from scipy.special import ndtri
 
 from ep2sindy.data.trajectory import Trajectory, read_only
-from ep2sindy.library.equations import latex_derivative
+from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.machine.files import write_text
+from ep2sindy.model.rollout import Rollout, ending_text
 
 if TYPE_CHECKING:
     import sympy
-from ep2sindy.library.equations import equation_text, latex_term
-from ep2sindy.model.rollout import Rollout, ending_text
 
 FORMAT = "ep2sindy.SparseModel/1"
 
@@ -159,30 +158,12 @@ class SparseModel:
 
     def sympy(self) -> dict[str, sympy.Expr]:
         """State name -> right-hand side as a sympy expression, coefficients as floats."""
-        import sympy  # half a second that most runs do not need
-
-        symbols = [sympy.Symbol(v) for v in self.library.variables]
-        powers = dict(zip(self.library.names, self.library.exponents.tolist(), strict=True))
-
-        def monomial(name: str) -> sympy.Expr:
-            pairs = zip(symbols, powers[name], strict=True)
-            return sympy.Mul(*(symbol**power for symbol, power in pairs))
-
-        return {
-            s: sympy.Add(*(sympy.Float(c) * monomial(n) for n, c in self.terms(s).items()))
-            for s in self.states
-        }
+        return {state: sum_sympy(self.terms(state)) for state in self.states}
 
     def latex(self, *, digits: int = 3) -> str:
         """An `aligned` block with one equation per line."""
-        lines = []
-        for state in self.states:
-            right = " ".join(
-                latex_term(name, coef, digits, first=k == 0)
-                for k, (name, coef) in enumerate(self.terms(state).items())
-            )
-            lines.append(f"{latex_derivative(state)} &= {right or '0'}")
-        return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
+        terms = {state: self.terms(state) for state in self.states}
+        return equations_latex(terms, digits=digits)
 
     def to_json(self) -> str:
         """Everything in the model; floats in their shortest exact form."""
