@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,20 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from scipy.integrate import solve_ivp
-from scipy.interpolate import make_interp_spline
 from scipy.special import ndtri
 
 from ep2sindy.data.trajectory import Trajectory, read_only
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
-from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.library import Library
 from ep2sindy.machine.files import write_text
-from ep2sindy.model.rollout import Rollout, ending_text
+from ep2sindy.model.rollout import Rollout, rollout
+from ep2sindy.model.storage import model_text, read_model
 
 if TYPE_CHECKING:
     import sympy
-
-FORMAT = "ep2sindy.SparseModel/1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,32 +120,14 @@ class SparseModel:
         all. A state that exceeds `blow_up` times that value ends the run as diverged.
         Raises ValueError for a window outside the trajectory or a missing variable.
         """
-        stop = trajectory.n_samples if n_samples is None else start + n_samples
-        window = trajectory.window(start, stop)
-        data = window.columns(self.states)
-        scale = np.abs(data).max(axis=0)
-
-        def too_large(t: float, y: np.ndarray) -> float:
-            return blow_up - float(np.abs(y).max())
-
-        too_large.terminal = True  # type: ignore[attr-defined]
-        # An overflow on the way to a blow-up is caught by the event, or ends the solver.
-        with np.errstate(over="ignore", invalid="ignore"):
-            solution = solve_ivp(
-                self._scaled_rhs(window, scale),
-                (window.t[0], window.t[-1]),
-                (data[0] if initial is None else initial) / scale,
-                method="DOP853",
-                t_eval=window.t,
-                events=too_large,
-                rtol=rtol,
-                atol=rtol,
-            )
-        return Rollout(
-            t=solution.t,
-            states=solution.y.T * scale,
-            diverged=solution.status != 0,
-            message=ending_text(solution, blow_up),
+        return rollout(
+            self,
+            trajectory,
+            start=start,
+            n_samples=n_samples,
+            initial=initial,
+            blow_up=blow_up,
+            rtol=rtol,
         )
 
     def text(self, *, digits: int = 3) -> str:
@@ -167,38 +145,18 @@ class SparseModel:
 
     def to_json(self) -> str:
         """Everything in the model; floats in their shortest exact form."""
-        content = {
-            "format": FORMAT,
-            "states": list(self.states),
-            "variables": list(self.library.variables),
-            "library": list(self.library.names),
-            "equations": {s: self.terms(s) for s in self.states},
-            "units": dict(self.units),
-            "provenance": dict(self.provenance),
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-        }
-        return json.dumps(content, indent=2, allow_nan=False) + "\n"
+        return model_text(
+            self.library,
+            {state: self.terms(state) for state in self.states},
+            units=self.units,
+            provenance=self.provenance,
+            covariance=self.covariance,
+        )
 
     @staticmethod
     def from_json(text: str) -> SparseModel:
         """Inverse of `to_json`, exact. Raises ValueError for anything else."""
-        try:
-            content = json.loads(text)
-            if content["format"] != FORMAT:
-                raise ValueError(f"format {content['format']!r}")
-            library = named_terms(content["variables"], content["library"])
-            equations = content["equations"]
-            covariance = content.get("covariance")  # files of version 0.1 have none
-            return SparseModel(
-                library=library,
-                states=content["states"],
-                coef=coef_matrix(library, [equations[s] for s in content["states"]]),
-                units=content["units"],
-                provenance=content["provenance"],
-                covariance=None if covariance is None else _square(covariance),
-            )
-        except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
-            raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
+        return read_model(text, model_of)
 
     def save(self, path: str | Path) -> None:
         write_text(Path(path), self.to_json())
@@ -218,27 +176,6 @@ class SparseModel:
         known = [*self.states, *self.inputs]
         return np.array([known.index(v) for v in self.library.variables], dtype=np.int64)
 
-    def _scaled_rhs(
-        self, window: Trajectory, scale: np.ndarray
-    ) -> Callable[[float, np.ndarray], np.ndarray]:
-        """The right-hand side for scaled states, with the absent terms left out."""
-        present = np.flatnonzero(self.coef.any(axis=1))
-        coef = self.coef[present] / scale
-        values, terms = self.library.at_points([*self.states, *self.inputs], present)
-        n = len(self.states)
-        drive = None
-        if self.inputs:
-            inputs = window.columns(self.inputs)
-            drive = make_interp_spline(window.t, inputs, k=min(3, len(inputs) - 1))
-
-        def rhs(t: float, y: np.ndarray) -> np.ndarray:
-            values[:n] = y * scale
-            if drive is not None:
-                values[n:] = drive(t)
-            return terms() @ coef
-
-        return rhs
-
 
 def coef_matrix(
     library: Library, equations: Sequence[Mapping[str, float]]
@@ -251,6 +188,14 @@ def coef_matrix(
     return coef
 
 
-def _square(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "_ _"]:
-    """Rows of a stored matrix, which may be empty."""
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
+def model_of(
+    library: Library,
+    equations: Mapping[str, Mapping[str, float]],
+    *,
+    units: Mapping[str, str],
+    provenance: Mapping[str, str],
+    covariance: Float[np.ndarray, "_ _"] | None,
+) -> SparseModel:
+    """A model from its coefficients by state and term name."""
+    coef = coef_matrix(library, list(equations.values()))
+    return SparseModel(library, list(equations), coef, units, provenance, covariance)
