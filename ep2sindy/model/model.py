@@ -7,18 +7,22 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from ep2sindy.data.trajectory import Trajectory, read_only
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.machine.files import write_text
-from ep2sindy.model.rollout import Rollout, rollout
+from ep2sindy.model.inputs import sampled
+from ep2sindy.model.rollout import Rollout, rollout, simulate
+from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model
+from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:
     import sympy
@@ -129,6 +133,64 @@ class SparseModel:
             blow_up=blow_up,
             rtol=rtol,
         )
+
+    def simulate(
+        self,
+        t: ArrayLike,
+        x0: ArrayLike,
+        inputs: ArrayLike | Mapping[str, Any] | None = None,
+        *,
+        blow_up: float = 1e12,
+        rtol: float = 1e-8,
+    ) -> Rollout:
+        """Integrate freely from the state x0 at t[0], and give the states at the times t.
+
+        t: (samples,) in s, increasing. x0: (n_states,), in SI. inputs: (samples, n_inputs) at t,
+        joined by cubic splines, or by name such samples, a number, or a function of t in s.
+        Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges is one
+        too: marked `diverged`, with a message, it ends where a state exceeds `blow_up` times its
+        start (or, where that is zero, what its first rate makes of it), or the solver gave up.
+        Raises ValueError for a missing or unknown input and for wrong shapes.
+        """
+        return simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol)
+
+    def predict(
+        self, x: ArrayLike | Trajectory, inputs: ArrayLike | Mapping[str, Any] | None = None
+    ) -> Float[np.ndarray, "... n_states"]:
+        """Right-hand side at many samples at once, in SI per second.
+
+        x: (samples, n_states), or one sample (n_states,), or a Trajectory, which brings its own
+        inputs. inputs: of the same number of samples, in the order of `inputs`, or by name.
+        Raises ValueError for a missing or unknown variable and for wrong shapes.
+        """
+        if isinstance(x, Trajectory):
+            if inputs is not None:
+                raise ValueError(
+                    "a Trajectory brings its own inputs: pass its states, or no inputs"
+                )
+            return self.derivative(x.columns(self.states), x.columns(self.inputs))
+        states = np.asarray(x, dtype=np.float64)
+        if states.ndim == 0 or states.shape[-1] != len(self.states):
+            raise ValueError(
+                f"x must have a column for each of {list(self.states)}: shape {states.shape} came"
+            )
+        return self.derivative(states, sampled(self.inputs, inputs, states.shape[:-1]))
+
+    def score(
+        self,
+        run: Trajectory,
+        *,
+        x_dot: Float[np.ndarray, "samples n_states"] | None = None,
+        smoother: Smoother | None = None,
+    ) -> float:
+        """R2 of the derivative over a trajectory, the mean over the states; one is perfect.
+
+        The derivative and the samples at which the right-hand side is taken come from `smoother`,
+        by default SavitzkyGolay(), as in `Differential`; with x_dot, (samples, n_states) in SI
+        and in the order of the model's states, that is the truth, and samples are taken raw.
+        Raises ValueError for a missing variable, a wrong shape or a derivative that is constant.
+        """
+        return derivative_r2(self, run, x_dot=x_dot, smoother=smoother or SavitzkyGolay())
 
     def text(self, *, digits: int = 3) -> str:
         """One line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
-from scipy.interpolate import make_interp_spline
 
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library
+from ep2sindy.model.inputs import Drive, driven, spline
 
 
 @runtime_checkable
@@ -31,18 +32,41 @@ class Equations(Protocol):
     @property
     def coef(self) -> np.ndarray: ...
 
+    @property
+    def units(self) -> Mapping[str, str]: ...
+
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A model integrated over a window of a trajectory.
+    """A model integrated along data or freely, and how that ended.
 
-    t: (samples,) in s, states: (samples, n_states), both cut where a diverged run stopped.
+    t: (samples,) in s, states: (samples, n_states), inputs: (samples, n_inputs), all cut where
+    a diverged run stopped. units: by name, of states and inputs.
     """
 
     t: Float[np.ndarray, " samples"]
     states: Float[np.ndarray, "samples n_states"]
     diverged: bool
     message: str
+    state_names: tuple[str, ...]
+    inputs: Float[np.ndarray, "samples n_inputs"]
+    input_names: tuple[str, ...]
+    units: Mapping[str, str]
+
+    def trajectory(self, *, label: str = "") -> Trajectory:
+        """The samples as data, as far as they go.
+
+        Raises ValueError where there are fewer than two, or where a state never changed.
+        """
+        return Trajectory(
+            t=self.t,
+            states=self.states,
+            state_names=self.state_names,
+            inputs=self.inputs,
+            input_names=self.input_names,
+            units=self.units,
+            label=label,
+        )
 
 
 def rollout(
@@ -65,6 +89,7 @@ def rollout(
         window.t,
         data[0] if initial is None else initial,
         drive=spline(window.t, inputs) if model.inputs else None,
+        samples=inputs,
         scale=np.abs(data).max(axis=0),
         blow_up=blow_up,
         bound="the data's largest value",
@@ -72,11 +97,39 @@ def rollout(
     )
 
 
-def spline(
-    t: Float[np.ndarray, " samples"], inputs: Float[np.ndarray, "samples n_inputs"]
-) -> Callable[[float], np.ndarray]:
-    """Inputs between their samples, by cubics."""
-    return make_interp_spline(t, inputs, k=min(3, len(inputs) - 1))
+def simulate(
+    model: Equations,
+    t: ArrayLike,
+    x0: ArrayLike,
+    inputs: ArrayLike | Mapping[str, Any] | None,
+    *,
+    blow_up: float,
+    rtol: float,
+) -> Rollout:
+    """Integrate freely from one state: see `SparseModel.simulate`."""
+    times = np.asarray(t, dtype=np.float64)
+    check_time(times)
+    start = np.asarray(x0, dtype=np.float64)
+    if start.shape != (len(model.states),) or not np.isfinite(start).all():
+        raise ValueError(
+            f"x0 must give a finite number for each of {list(model.states)}: {start.tolist()} came"
+        )
+    drive, samples = driven(model.inputs, inputs, times)
+    values, terms = model.library.at_points([*model.states, *model.inputs])
+    values[:] = np.append(start, samples[0])
+    # What starts at zero is as large as its first rate makes it; what stays there, one.
+    reach = np.abs(start) + (start == 0.0) * np.abs(terms() @ model.coef) * (times[-1] - times[0])
+    return _integrated(
+        model,
+        times,
+        start,
+        drive=drive,
+        samples=samples,
+        scale=np.where(reach > 0.0, reach, 1.0),
+        blow_up=blow_up,
+        bound="its start",
+        rtol=rtol,
+    )
 
 
 def _integrated(
@@ -84,7 +137,8 @@ def _integrated(
     t: np.ndarray,
     x0: np.ndarray,
     *,
-    drive: Callable[[float], np.ndarray] | None,
+    drive: Drive | None,
+    samples: np.ndarray,
     scale: np.ndarray,
     blow_up: float,
     bound: str,
@@ -113,11 +167,15 @@ def _integrated(
         states=solution.y.T * scale,
         diverged=solution.status != 0,
         message=_ending_text(solution, blow_up, bound),
+        state_names=tuple(model.states),
+        inputs=samples[: len(solution.t)],
+        input_names=tuple(model.inputs),
+        units=model.units,
     )
 
 
 def _scaled_rhs(
-    model: Equations, drive: Callable[[float], np.ndarray] | None, scale: np.ndarray
+    model: Equations, drive: Drive | None, scale: np.ndarray
 ) -> Callable[[float, np.ndarray], np.ndarray]:
     """The right-hand side for scaled states, with the absent terms left out."""
     present = np.flatnonzero(model.coef.any(axis=1))
