@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -11,6 +12,8 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.last_fit import assemble_model, reweighted
 from ep2sindy.library.library import Library
+from ep2sindy.machine.screen import N_LINES, one_screen
+from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities
 from ep2sindy.regression.rows import Formulation
@@ -18,6 +21,8 @@ from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import Selection, selected
+
+MOST_NOTES = 6  # on a screen
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +38,22 @@ class Discovery:
     chosen: Mapping[str, Candidate]
     model: SparseModel = field(repr=False)
     ambiguities: Sequence[Ambiguity]
+
+    def __repr__(self) -> str:
+        notes = [f"note: {a.message}" for a in self.ambiguities][:MOST_NOTES]
+        left = len(self.ambiguities) - len(notes)
+        tail = [*notes, *([f"... {left} more notes"] if left else [])]
+        body = model_lines(self.model, n_lines=N_LINES - 1 - len(tail))
+        return one_screen([self._headline(), *body, *tail])
+
+    def _repr_html_(self) -> str:
+        notes = "".join(f"<li>{html.escape(a.message)}</li>" for a in self.ambiguities)
+        head = f"<div>{html.escape(self._headline())}</div>"
+        return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
+
+    def _headline(self) -> str:
+        rule = self.model.provenance.get("selection", "a rule unknown")
+        return f"Discovery of {len(self.chosen)} equations, chosen by {rule}"
 
 
 def discover(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ep2sindy.library.names import split_factors
 
 if TYPE_CHECKING:
     import sympy
+
+NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 def latex_name(variable: str) -> str:
@@ -39,12 +42,20 @@ def latex_term_name(name: str) -> str:
 
 def equation_text(state: str, terms: Mapping[str, float], *, digits: int = 3) -> str:
     """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
+    return f"{state}' = {' '.join(equation_parts(terms, digits=digits)) or '0'}"
+
+
+def equation_parts(
+    terms: Mapping[str, float], *, digits: int = 3, reach: Mapping[str, float] = NOTHING
+) -> list[str]:
+    """Term by term, as `+ 5.48e-14 n_i n_n`; reach: `+ 5.48e-14 (±2e-16) n_i n_n`, by name."""
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "-" if coef < 0 else "+" if k else ""
+        error = f" (±{reach[name]:.2g})" if name in reach else ""
         factors = "" if name == "1" else " " + name.replace("*", " ")
-        parts.append(f"{sign}{' ' if k else ''}{abs(coef):.{digits}g}{factors}")
-    return f"{state}' = {' '.join(parts) or '0'}"
+        parts.append(f"{sign}{' ' if k else ''}{abs(coef):.{digits}g}{error}{factors}")
+    return parts
 
 
 def sum_latex(terms: Mapping[str, float], *, digits: int = 3) -> str:
@@ -68,13 +79,20 @@ def equations_latex(equations: Mapping[str, Mapping[str, float]], *, digits: int
     return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
 
 
-def equation_html(state: str, terms: Mapping[str, float], *, digits: int = 3) -> str:
-    """One equation with sub- and superscripts: n<sub>i</sub>' = -2.62e5 ... in HTML."""
+def equation_html(
+    state: str,
+    terms: Mapping[str, float],
+    *,
+    digits: int = 3,
+    reach: Mapping[str, float] = NOTHING,
+) -> str:
+    """One equation with sub- and superscripts, in HTML; reach: half an interval, by name."""
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "&minus;" if coef < 0 else "+" if k else ""
-        mantissa, exponent = _number(coef, digits)
-        number = mantissa + ("" if exponent is None else f"&times;10<sup>{exponent}</sup>")
+        number = _number_html(coef, digits)
+        if name in reach:
+            number += f" (&plusmn;{_number_html(reach[name], 2)})"
         factors = [_factor_html(factor, power) for factor, power in _factors(name)]
         parts.append(" ".join([sign, number, *factors]).strip())
     left = f"d{_factor_html(state, 1)}/dt"
@@ -99,13 +117,22 @@ def _number(coef: float, digits: int) -> tuple[str, int | None]:
     return mantissa, int(exponent) if exponent else None
 
 
+def _number_html(coef: float, digits: int) -> str:
+    mantissa, exponent = _number(coef, digits)
+    return mantissa + ("" if exponent is None else f"&times;10<sup>{exponent}</sup>")
+
+
 def _factors(name: str) -> list[tuple[str, int]]:
-    return [] if name == "1" else split_factors(name)
+    """Factors and powers; a name that is no product stands as it is."""
+    try:
+        return [] if name == "1" else split_factors(name)
+    except ValueError:
+        return [(name, 1)]
 
 
 def _factor_html(factor: str, power: int) -> str:
-    if factor.startswith("<"):
-        inner = " ".join(_factor_html(f, p) for f, p in split_factors(factor[1:-1]))
+    if factor.startswith("<") and factor.endswith(">"):
+        inner = " ".join(_factor_html(f, p) for f, p in _factors(factor[1:-1]))
         text = f"&lang;{inner}&rang;"
     else:
         stem, _, index = factor.partition("_")

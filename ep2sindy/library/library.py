@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,6 +14,7 @@ from array_api_compat import array_namespace
 from jaxtyping import Float, Int
 
 from ep2sindy.library.terms import Factor, Term, Variable, product, read_term
+from ep2sindy.machine.screen import N_LINES, cut, html_table, one_screen, wrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,22 @@ class Library:
             factors = np.repeat(columns, powers)
             row[: len(factors)] = factors
         return table
+
+    def __repr__(self) -> str:
+        lines = [f"Library of {len(self)} terms over {', '.join(self.variables)}"]
+        by_degree = list(self._by_degree().items())
+        for k, (degree, names) in enumerate(by_degree):
+            left = N_LINES - len(lines) - (len(by_degree) - k - 1)
+            head = f"{len(names)} of degree {degree}:"
+            lines += wrapped([head, *names], what="terms", n_lines=max(1, min(6, left)))
+        return one_screen(lines)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [str(degree), str(len(names)), html.escape(cut(", ".join(names), 1000))]
+            for degree, names in self._by_degree().items()
+        ]
+        return html_table(["degree", "terms", ""], rows)
 
     def index(self, name: str) -> int:
         """Position of a term; factors may come in any order. Raises ValueError if absent."""
@@ -200,6 +218,12 @@ class Library:
                 for term, weight in parts.items():
                     column[products._places[term]] = weight
         return products, shares
+
+    def _by_degree(self) -> dict[int, list[str]]:
+        found: dict[int, list[str]] = {degree: [] for degree in sorted(set(self.degrees.tolist()))}
+        for name, degree in zip(self.names, self.degrees.tolist(), strict=True):
+            found[degree].append(name)
+        return found
 
     @cached_property
     def _named(self) -> dict[str, int]:

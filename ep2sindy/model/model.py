@@ -18,6 +18,8 @@ from ep2sindy.data.trajectory import Trajectory, read_only
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.machine.files import write_text
+from ep2sindy.machine.screen import N_LINES
+from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.inputs import sampled
 from ep2sindy.model.rollout import Rollout, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
@@ -204,6 +206,21 @@ class SparseModel:
         """An `aligned` block with one equation per line."""
         terms = {state: self.terms(state) for state in self.states}
         return equations_latex(terms, digits=digits)
+
+    def __str__(self) -> str:
+        """Equations with units and, where a covariance is known, 95 % intervals."""
+        return "\n".join(model_lines(self))
+
+    def __repr__(self) -> str:
+        n_terms = int(np.count_nonzero(self.coef))
+        head = f"SparseModel of {len(self.states)} equations, {n_terms} terms"
+        return "\n".join([head, *model_lines(self, n_lines=N_LINES - 1)])
+
+    def _repr_html_(self) -> str:
+        return model_html(self)
+
+    def _repr_latex_(self) -> str:
+        return f"$${self.latex()}$$"
 
     def to_json(self) -> str:
         """Everything in the model; floats in their shortest exact form."""
