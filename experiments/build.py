@@ -18,7 +18,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, named_terms, polynomial
-from ep2sindy.library.names import split_factors
+from ep2sindy.library.terms import variables_of
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.screen import Screen
 
@@ -156,16 +156,11 @@ def terms_of(
         )
     terms = {state: [str(name) for name in given[state]] for state in states}
     factors = [
-        variable
-        for names in terms.values()
-        for name in names
-        if name.strip() != "1"
-        for variable, _ in split_factors(name)
+        variable for names in terms.values() for name in names for variable in variables_of(name)
     ]
     variables = list(dict.fromkeys([*states, *factors]))
     named = reduce(add, (named_terms(variables, names) for names in terms.values()))
-    by_degree = np.argsort(named.exponents.sum(axis=1), kind="stable")
-    return Library(variables, named.exponents[by_degree]), terms
+    return named.take(np.argsort(named.degrees, kind="stable")), terms
 
 
 def relations_of(given: Any, *, key: str) -> list[str]:

@@ -20,7 +20,7 @@ from ep2sindy.discovery.regimes import regimes
 from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regime_map
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.library.names import split_factors
+from ep2sindy.library.terms import variables_of
 from ep2sindy.machine.files import fingerprint, replacing
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.folder import RunFolder
@@ -170,10 +170,7 @@ def search_settings(config: DictConfig) -> dict[str, Any]:
 def library_of(config: DictConfig, field: xr.Dataset) -> Library:
     """The terms of the config, without those of optional variables that the field lacks."""
     lacking = {name for name in config.variables_if_present if name not in field}
-    factors = {
-        name: [variable for variable, _ in split_factors(name)] if name != "1" else []
-        for name in map(str, config.terms)
-    }
+    factors = {name: variables_of(name) for name in map(str, config.terms)}
     terms = [name for name, variables in factors.items() if not lacking & set(variables)]
     used = dict.fromkeys([*config.states, *(v for name in terms for v in factors[name])])
     return named_terms(list(used), terms)

@@ -18,7 +18,6 @@ from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
 
 LEAST_RESIDUAL = 1e-6  # of the target's RMS: no equation weighs more, however exact its fit
 
-
 N_PASSES = 4  # then a fifth moves nothing by 1e-6 of its error, at 20 % noise
 
 

@@ -15,18 +15,14 @@ from ep2sindy.library.names import PRODUCT, VARIABLE
 
 ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
 
-
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w)"
 
-
 _TERM = rf"(?:1(?![\w.])|{PRODUCT})"
-
 
 _ADDEND = re.compile(
     rf"\s*(?P<sign>[+-]?)\s*(?:(?:(?P<factor>[+-]?{_NUMBER})\s*\*\s*)?"
     rf"(?P<state>{VARIABLE})\s*:\s*(?P<term>{_TERM})|(?P<number>[+-]?{_NUMBER}))\s*"
 )
-
 
 _EXAMPLE = "write it like 'n_i: n_i*n_n == -1 * n_n: n_i*n_n'"
 

@@ -19,13 +19,10 @@ KNOWN_UNITS = {
     "I_d": "A", "V_d": "V",
 }  # fmt: skip
 
-
 NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
-
 
 # Names that end so keep this unit; all others are SI.
 SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
-
 
 # What pint raises on text that is no unit.
 UNIT_ERRORS = (

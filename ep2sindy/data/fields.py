@@ -17,9 +17,7 @@ from ep2sindy.data.trajectory import check_time
 
 DIMS = ("time", "z", "r")
 
-
 SPACE = ("z", "r")
-
 
 COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 

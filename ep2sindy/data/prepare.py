@@ -39,7 +39,6 @@ OPERATORS: Mapping[type, Callable] = {
     ast.BitOr: np.logical_or,
 }
 
-
 FUNCTIONS: Mapping[str, Callable] = {"abs": np.abs, "exp": np.exp, "log": np.log, "sqrt": np.sqrt}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,6 +10,8 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
+
+from ep2sindy.machine.screen import html_table, one_screen, text_table
 
 
 def read_only(values: np.ndarray) -> np.ndarray:
@@ -109,6 +112,33 @@ class Trajectory:
             units=self.units,
             label=self.label,
         )
+
+    def __repr__(self) -> str:
+        table = text_table(["", "", "unit", "from", "to"], self._ranges())
+        return one_screen([self._headline(), *table])
+
+    def _repr_html_(self) -> str:
+        rows = [list(map(html.escape, row)) for row in self._ranges()]
+        table = html_table(["", "", "unit", "from", "to"], rows)
+        return f"<div>{html.escape(self._headline())}</div>{table}"
+
+    def _headline(self) -> str:
+        steps = np.diff(self.t)
+        even = np.ptp(steps) <= 1e-6 * self.dt_s
+        step = f"{self.dt_s:.4g}" if even else f"{steps.min():.4g} to {steps.max():.4g}"
+        label = f" {self.label!r}" if self.label else ""
+        return (
+            f"Trajectory{label}: {self.n_samples} samples, t = {self.t[0]:.6g} to "
+            f"{self.t[-1]:.6g} s in steps of {step} s"
+        )
+
+    def _ranges(self) -> list[list[str]]:
+        """Role, name, unit and range of every variable."""
+        roles = ["state"] * len(self.state_names) + ["input"] * len(self.input_names)
+        return [
+            [role, name, self.units[name], f"{column.min():.4g}", f"{column.max():.4g}"]
+            for role, name, column in zip(roles, self.names, self.values.T, strict=True)
+        ]
 
     def _check_shapes(self) -> None:
         for role, values, names in (

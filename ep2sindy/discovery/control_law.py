@@ -16,7 +16,6 @@ from ep2sindy.model.scores import r2
 # A share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
 
-
 # A point with this leverage is the only one that knows some coefficient: without it no law.
 FULL_LEVERAGE = 1.0 - 1e-9
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -12,9 +13,13 @@ from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.discovery.last_fit import assemble_model, last_fit
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.machine.screen import N_LINES, one_screen
+from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities
 from ep2sindy.search.front import Candidate, ParetoFront
+
+MOST_NOTES = 6  # on a screen
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +37,22 @@ class Discovery:
     chosen: Mapping[str, Candidate]
     model: SparseModel = field(repr=False)
     ambiguities: Sequence[Ambiguity]
+
+    def __repr__(self) -> str:
+        notes = [f"note: {a.message}" for a in self.ambiguities][:MOST_NOTES]
+        left = len(self.ambiguities) - len(notes)
+        tail = [*notes, *([f"... {left} more notes"] if left else [])]
+        body = model_lines(self.model, n_lines=N_LINES - 1 - len(tail))
+        return one_screen([self._headline(), *body, *tail])
+
+    def _repr_html_(self) -> str:
+        notes = "".join(f"<li>{html.escape(a.message)}</li>" for a in self.ambiguities)
+        head = f"<div>{html.escape(self._headline())}</div>"
+        return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
+
+    def _headline(self) -> str:
+        rule = self.model.provenance.get("selection", "a rule unknown")
+        return f"Discovery of {len(self.chosen)} equations, chosen by {rule}"
 
 
 def discover(

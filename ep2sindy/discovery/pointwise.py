@@ -22,7 +22,6 @@ from ep2sindy.machine.parallel import Workers
 
 NO_FIT = "no_fit"
 
-
 STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
 
 

@@ -28,9 +28,7 @@ from ep2sindy.data.fields import SPACE
 
 N_STARTS = 20  # of the mixture's iteration, which may end in a poor optimum
 
-
 COARSENING = 100.0  # points after which evidence stops growing
-
 
 UNSURE = 0.5  # a confidence below
 

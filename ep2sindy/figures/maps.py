@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -26,7 +26,7 @@ from ep2sindy.figures.panels import (
     space_axes,
 )
 from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, unit_text
-from ep2sindy.library.equations import latex_derivative, latex_term, latex_term_name
+from ep2sindy.library.equations import latex_derivative, latex_term_name, sum_latex
 from ep2sindy.thruster.parameters import Thruster
 
 ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
@@ -183,17 +183,11 @@ def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
 def _regime_text(regimes: Regimes, regime: int) -> str:
     row = regimes.table[regimes.table["regime"] == regime].iloc[0]
     equations = "\n".join(
-        _equation_latex(state, terms) for state, terms in regimes.equations(regime).items()
+        f"${latex_derivative(state)} = {sum_latex(terms)}$"
+        for state, terms in regimes.equations(regime).items()
     )
     points = f"{row['n_points']} point{'s' if row['n_points'] > 1 else ''}"
     return f"regime {regime}: {points}, confidence {row['confidence']:.2f}\n{equations}"
-
-
-def _equation_latex(state: str, terms: Mapping[str, float]) -> str:
-    right = " ".join(
-        latex_term(name, coef, 3, first=k == 0) for k, (name, coef) in enumerate(terms.items())
-    )
-    return f"${latex_derivative(state)} = {right or '0'}$"
 
 
 def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:

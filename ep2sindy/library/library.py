@@ -1,37 +1,41 @@
-"""The library: candidate terms for the right-hand side, as products of powers of variables."""
+"""The library: candidate terms for the right-hand side, all of them evaluated at once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import html
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from ep2sindy.library.names import split_factors
-from ep2sindy.library.units import unit_product
+from ep2sindy.library.terms import Factor, Term, Variable, product, read_term
+from ep2sindy.machine.screen import N_LINES, cut, html_table, one_screen, wrapped
 
 
 @dataclass(frozen=True, eq=False)
 class Library:
-    """Ordered candidate terms, each a product of powers of `variables`.
+    """Ordered candidate terms, each a product of powers of `variables` and of `functions` of them.
 
-    exponents: (terms, variables), non-negative integers; a row of zeros is the constant.
+    exponents: (terms, variables then functions), non-negative integers; a row of zeros is the
+    constant. functions: the factors that are not variables; none makes every term a monomial.
     Term names read `1`, `n_i`, `n_i*n_n`, `n_i^2`, factors in the order of `variables`.
     Raises ValueError for repeated variables or terms, or no term at all.
     """
 
     variables: Sequence[str]
-    exponents: Int[np.ndarray, "terms variables"]
+    exponents: Int[np.ndarray, "terms factors"]
+    functions: Sequence[Factor] = ()
 
     def __post_init__(self) -> None:
         exponents = np.array(self.exponents, dtype=np.int64)
         exponents.flags.writeable = False
         object.__setattr__(self, "variables", tuple(self.variables))
+        object.__setattr__(self, "functions", tuple(self.functions))
         object.__setattr__(self, "exponents", exponents)
         if len(set(self.variables)) < len(self.variables):
             raise ValueError(f"variables must be unique: {list(self.variables)}")
@@ -50,17 +54,90 @@ class Library:
                 f"libraries to be joined must share their variables: {list(self.variables)} "
                 f"against {list(other.variables)}"
             )
-        new = [row for row in other.exponents if not (self.exponents == row).all(axis=1).any()]
-        return Library(self.variables, np.array([*self.exponents, *new]))
+        return library_of(self.variables, [*self.terms, *other.terms])
+
+    @cached_property
+    def terms(self) -> tuple[Term, ...]:
+        factors = [*map(Variable, self.variables), *self.functions]
+        return tuple(
+            product({f: p for f, p in zip(factors, row, strict=True) if p}, self.variables)
+            for row in self.exponents.tolist()
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        return tuple("*".join(self._factors_of(row)) or "1" for row in self.exponents)
+        return tuple(term.name for term in self.terms)
 
     @cached_property
-    def factors(self) -> Int[np.ndarray, "terms degree"]:
-        """Indices of the variables multiplied in each term, padded with n_variables, meaning 1."""
-        return _factor_table(self.exponents)
+    def degrees(self) -> Int[np.ndarray, " terms"]:
+        """Number of factors of every term."""
+        return self.exponents.sum(axis=1)
+
+    @cached_property
+    def table(self) -> Int[np.ndarray, "terms degree"]:
+        """Which columns each term multiplies, of the variables, a one, then the functions."""
+        n = len(self.variables)
+        columns = np.delete(np.arange(self.exponents.shape[1] + 1), n)
+        table = np.full((len(self), max(1, int(self.degrees.max()))), n)
+        for row, powers in zip(table, self.exponents, strict=True):
+            factors = np.repeat(columns, powers)
+            row[: len(factors)] = factors
+        return table
+
+    def __repr__(self) -> str:
+        lines = [f"Library of {len(self)} terms over {', '.join(self.variables)}"]
+        by_degree = list(self._by_degree().items())
+        for k, (degree, names) in enumerate(by_degree):
+            left = N_LINES - len(lines) - (len(by_degree) - k - 1)
+            head = f"{len(names)} of degree {degree}:"
+            lines += wrapped([head, *names], what="terms", n_lines=max(1, min(6, left)))
+        return one_screen(lines)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [str(degree), str(len(names)), html.escape(cut(", ".join(names), 1000))]
+            for degree, names in self._by_degree().items()
+        ]
+        return html_table(["degree", "terms", ""], rows)
+
+    def index(self, name: str) -> int:
+        """Position of a term; factors may come in any order. Raises ValueError if absent."""
+        if name in self._named:
+            return self._named[name]
+        term = read_term(name, self.variables)
+        if term not in self._places:
+            raise ValueError(f"unknown term {name!r}; this library has {list(self.names)}")
+        return self._places[term]
+
+    def places(self, other: Library) -> list[int]:
+        """Where the terms of another library over these variables stand in this one."""
+        return [self._places[term] for term in other.terms]
+
+    def units(self, units: Mapping[str, str]) -> tuple[str, ...]:
+        """Unit of every term, from the units of the variables."""
+        return tuple(term.unit(units) for term in self.terms)
+
+    def take(self, rows: np.ndarray) -> Library:
+        """Some of the terms, by position or by mask."""
+        return replace(self, exponents=self.exponents[rows])
+
+    def over(self, variables: Sequence[str]) -> Library:
+        """The same terms over other variables, in their order, among them all that are used."""
+        n = len(self.variables)
+        padded = np.pad(self.exponents[:, :n], ((0, 0), (0, 1)))
+        order = [self.variables.index(v) if v in self.variables else -1 for v in variables]
+        exponents = np.concatenate([padded[:, order], self.exponents[:, n:]], axis=1)
+        return Library(variables, exponents, self.functions)
+
+    def scaled(
+        self, scale: Float[np.ndarray, " variables"]
+    ) -> tuple[Library, Float[np.ndarray, " terms"]]:
+        """Terms of variables in units of `scale`, and what gives from each its value in SI."""
+        own = scale[self._arguments].tolist()
+        pairs = [f.scaled(s) for f, s in zip(self.functions, own, strict=True)]
+        numbers = np.append(scale, [number for number, _ in pairs])
+        functions = [function for _, function in pairs]
+        return replace(self, functions=functions), np.prod(numbers**self.exponents, axis=1)
 
     def evaluate(self, values: Any) -> Any:
         """Evaluate every term at every sample.
@@ -68,7 +145,49 @@ class Library:
         values: (..., variables), a NumPy array or a torch tensor, in the order of `variables`.
         Returns (..., terms), of the same kind.
         """
-        return _products(values, self.factors)
+        xp = array_namespace(values)
+        columns = xp.concat([values, xp.ones_like(values[..., :1])], axis=-1)
+        columns = self.with_functions(columns, axis=-1)
+        theta = columns[..., self.table[:, 0]]
+        for factors in self.table.T[1:]:
+            theta = theta * columns[..., factors]
+        return theta
+
+    def with_functions(self, columns: Any, *, axis: int) -> Any:
+        """Columns of the variables and a one, along any axis, followed by those of the functions.
+
+        With these, a term is the product of what its row of `table` names.
+        """
+        if not self.functions:
+            return columns
+        xp = array_namespace(columns)
+        of = [xp.take(columns, xp.asarray([k]), axis=axis) for k in self._arguments]
+        values = [f.value(x) for f, x in zip(self.functions, of, strict=True)]
+        return xp.concat([columns, *values], axis=axis)
+
+    def at_points(
+        self, known: Sequence[str], rows: np.ndarray | None = None
+    ) -> tuple[Float[np.ndarray, " known"], Callable[[], Float[np.ndarray, " rows"]]]:
+        """Terms at one point after another, for solvers: one gather and one product per call.
+
+        Returns an array to be filled with the variables in the order of `known`, and a function
+        that gives the terms (of some rows) where it stands.
+        """
+        n = len(known)
+        columns = np.ones(n + 1 + len(self.functions))
+        places = np.array([*map(list(known).index, self.variables), *range(n, len(columns))])
+        table = places[self.table if rows is None else self.table[rows]]
+        functions = [
+            (n + 1 + k, f, places[v])
+            for k, (f, v) in enumerate(zip(self.functions, self._arguments, strict=True))
+        ]
+
+        def terms() -> np.ndarray:
+            for place, function, argument in functions:
+                columns[place : place + 1] = function.value(columns[argument : argument + 1])
+            return columns[table].prod(axis=1)
+
+        return columns[:n], terms
 
     def jacobian(self, values: Any) -> Any:
         """Derivative of every term by every variable, at every sample.
@@ -76,72 +195,87 @@ class Library:
         values: as for `evaluate`. Returns (variables, ..., terms), of the same kind.
         """
         xp = array_namespace(values)
-        derivatives = []
-        for v in range(len(self.variables)):
-            powers = self.exponents[:, v]
-            lowered = self.exponents.copy()
-            lowered[:, v] = np.maximum(powers - 1, 0)
-            derivatives.append(_products(values, _factor_table(lowered)) * xp.asarray(1.0 * powers))
-        return xp.stack(derivatives)
-
-    def index(self, name: str) -> int:
-        """Position of a term; factors may come in any order. Raises ValueError if absent."""
-        row = term_exponents(name, self.variables)
-        found = np.flatnonzero((self.exponents == row).all(axis=1))
-        if not found.size:
-            raise ValueError(f"unknown term {name!r}; this library has {list(self.names)}")
-        return int(found[0])
-
-    def units(self, units: Mapping[str, str]) -> tuple[str, ...]:
-        """Unit of every term, from the units of the variables."""
-        return tuple(
-            unit_product((units[v], int(p)) for v, p in zip(self.variables, row, strict=True))
-            for row in self.exponents
+        products, addends = self._slopes
+        theta = products.evaluate(values)
+        return xp.stack(
+            [sum(theta[..., k] * xp.asarray(weights) for k, weights in each) for each in addends]
         )
 
-    def _factors_of(self, row: np.ndarray) -> list[str]:
-        return [v if p == 1 else f"{v}^{p}" for v, p in zip(self.variables, row, strict=True) if p]
+    def with_derivatives(
+        self, n: int
+    ) -> tuple[Library, Float[np.ndarray, "terms columns products"]]:
+        """Terms and their derivatives by the first n variables, as sums of distinct products.
+
+        Returns a library of these products, by exponents, and (terms, 1 + n, products): what
+        makes each term, then its derivatives, of them.
+        """
+        slopes = [[{term: 1.0}, *map(term.derivative, self.variables[:n])] for term in self.terms]
+        distinct = dict.fromkeys(t for sums in slopes for parts in sums for t in parts)
+        products = by_exponents(library_of(self.variables, distinct))
+        shares = np.zeros((len(self), 1 + n, len(products)))
+        for row, sums in zip(shares, slopes, strict=True):
+            for column, parts in zip(row, sums, strict=True):
+                for term, weight in parts.items():
+                    column[products._places[term]] = weight
+        return products, shares
+
+    def _by_degree(self) -> dict[int, list[str]]:
+        found: dict[int, list[str]] = {degree: [] for degree in sorted(set(self.degrees.tolist()))}
+        for name, degree in zip(self.names, self.degrees.tolist(), strict=True):
+            found[degree].append(name)
+        return found
+
+    @cached_property
+    def _named(self) -> dict[str, int]:
+        return {name: k for k, name in enumerate(self.names)}
+
+    @cached_property
+    def _places(self) -> dict[Term, int]:
+        return {term: k for k, term in enumerate(self.terms)}
+
+    @cached_property
+    def _arguments(self) -> list[int]:
+        """The variable that each function is one of."""
+        return [self.variables.index(f.variable) for f in self.functions]
+
+    @cached_property
+    def _slopes(self) -> tuple[Library, list[list[tuple[np.ndarray, np.ndarray]]]]:
+        """Products, and by variable the addends of the derivatives: which of them, times what."""
+        products, shares = self.with_derivatives(len(self.variables))
+        addends = []
+        for by_variable in np.moveaxis(shares[:, 1:], 1, 0):
+            present = by_variable != 0.0
+            n_addends = max(1, int(present.sum(axis=1).max()))
+            first = np.argsort(~present, axis=1, kind="stable")[:, :n_addends]
+            weights = np.take_along_axis(by_variable, first, axis=1)
+            addends.append(list(zip(first.T, weights.T, strict=True)))
+        return products, addends
 
 
-def _factor_table(exponents: np.ndarray) -> np.ndarray:
-    """For every row of powers, the indices of its factors, padded with the number of variables."""
-    n_variables = exponents.shape[1]
-    degree = max(1, int(exponents.sum(axis=1).max()))
-    table = np.full((len(exponents), degree), n_variables)
-    for row, powers in zip(table, exponents, strict=True):
-        indices = np.repeat(np.arange(n_variables), powers)
-        row[: len(indices)] = indices
-    return table
+def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
+    """A library of these terms, each once, in this order."""
+    distinct = list(dict.fromkeys(terms))
+    used = (factor for term in distinct for factor, _ in term.factors)
+    factors = list(dict.fromkeys([*map(Variable, variables), *used]))
+    exponents = np.zeros((len(distinct), len(factors)), dtype=np.int64)
+    for row, term in zip(exponents, distinct, strict=True):
+        for factor, power in term.factors:
+            row[factors.index(factor)] = power
+    functions = factors[len(variables) :]
+    return Library(variables, exponents, functions)
 
 
-def _products(values: Any, factors: np.ndarray) -> Any:
-    """Multiply columns of `values` as a factor table says."""
-    xp = array_namespace(values)
-    padded = xp.concat([values, xp.ones_like(values[..., :1])], axis=-1)
-    theta = padded[..., factors[:, 0]]
-    for indices in factors.T[1:]:
-        theta = theta * padded[..., indices]
-    return theta
-
-
-def term_exponents(name: str, variables: Sequence[str]) -> Int[np.ndarray, " variables"]:
-    """Read a term name such as `n_i^2*n_n` into one exponent per variable."""
-    exponents = np.zeros(len(variables), dtype=np.int64)
-    if name.strip() == "1":
-        return exponents
-    for variable, power in split_factors(name):
-        if variable not in variables:
-            raise ValueError(
-                f"unknown variable {variable!r} in term {name!r}; there are {list(variables)}"
-            )
-        exponents[list(variables).index(variable)] += power
-    return exponents
+def by_exponents(library: Library) -> Library:
+    """The same terms in ascending order of their exponents, those of the first variable first."""
+    return library.take(np.lexsort(library.exponents.T[::-1]))
 
 
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
     """A library of exactly these terms, in this order."""
-    exponents = [term_exponents(name, variables) for name in names]
-    return Library(variables, np.array(exponents, dtype=np.int64).reshape(-1, len(variables)))
+    terms = [read_term(name, variables) for name in names]
+    if len(set(terms)) < len(terms):
+        raise ValueError(f"terms must be unique: {[term.name for term in terms]}")
+    return library_of(variables, terms)
 
 
 def polynomial(variables: Sequence[str], *, degree: int, products: Sequence[str] = ()) -> Library:

@@ -1,4 +1,4 @@
-"""Names of variables and terms: how they are read, and how they look in LaTeX."""
+"""Names of terms: how they are read."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ import re
 # The grammar of terms, for expressions without groups of their own.
 VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*)"  # or the average of a product, in < >
 
-
 _FACTOR = rf"{VARIABLE}(?:\^\d+)?"
-
 
 PRODUCT = rf"{_FACTOR}(?:\s*\*\s*{_FACTOR})*"
 
-
 _TERM = re.compile(rf"\s*{PRODUCT}\s*")
-
 
 _PARTS = re.compile(rf"({VARIABLE})(?:\^(\d+))?")
 

@@ -18,14 +18,11 @@ from ep2sindy.model.runge_kutta import rk4_step
 # `systems`: its error stays below 1e-9 variances; the second is for sparser samples.
 N_SUBSTEPS = 2
 
-
 # A window's error at most, in variances: a model that always gives the mean has 1.
 MAX_ERROR = 10.0
 
-
 # A state this many standard deviations from its mean has diverged.
 BLOW_UP = 20.0
-
 
 # Runs that advance together: more, and their terms leave the cache.
 RUN_BLOCK = 2560
@@ -94,7 +91,7 @@ class Ensemble:
         """The terms that any model uses, and their coefficients."""
         used = np.abs(self.coef).max(axis=(1, 2)) > 0.0
         used[0] = True  # a library needs a term
-        return Library(self.library.variables, self.library.exponents[used]), self.coef[used]
+        return self.library.take(used), self.coef[used]
 
     def errors(
         self,

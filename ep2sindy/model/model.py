@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.integrate import solve_ivp
-from scipy.interpolate import make_interp_spline
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from ep2sindy.data.trajectory import Trajectory, read_only
-from ep2sindy.library.equations import latex_derivative
-from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
+from ep2sindy.library.library import Library
 from ep2sindy.machine.files import write_text
+from ep2sindy.machine.screen import N_LINES
+from ep2sindy.model.display import model_html, model_lines
+from ep2sindy.model.inputs import sampled
+from ep2sindy.model.rollout import Rollout, rollout, simulate
+from ep2sindy.model.scores import derivative_r2
+from ep2sindy.model.storage import model_text, read_model
+from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:
     import sympy
-from ep2sindy.library.equations import equation_text, latex_term
-from ep2sindy.model.rollout import Rollout, ending_text
-
-FORMAT = "ep2sindy.SparseModel/1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,33 +126,73 @@ class SparseModel:
         all. A state that exceeds `blow_up` times that value ends the run as diverged.
         Raises ValueError for a window outside the trajectory or a missing variable.
         """
-        stop = trajectory.n_samples if n_samples is None else start + n_samples
-        window = trajectory.window(start, stop)
-        data = window.columns(self.states)
-        scale = np.abs(data).max(axis=0)
-
-        def too_large(t: float, y: np.ndarray) -> float:
-            return blow_up - float(np.abs(y).max())
-
-        too_large.terminal = True  # type: ignore[attr-defined]
-        # An overflow on the way to a blow-up is caught by the event, or ends the solver.
-        with np.errstate(over="ignore", invalid="ignore"):
-            solution = solve_ivp(
-                self._scaled_rhs(window, scale),
-                (window.t[0], window.t[-1]),
-                (data[0] if initial is None else initial) / scale,
-                method="DOP853",
-                t_eval=window.t,
-                events=too_large,
-                rtol=rtol,
-                atol=rtol,
-            )
-        return Rollout(
-            t=solution.t,
-            states=solution.y.T * scale,
-            diverged=solution.status != 0,
-            message=ending_text(solution, blow_up),
+        return rollout(
+            self,
+            trajectory,
+            start=start,
+            n_samples=n_samples,
+            initial=initial,
+            blow_up=blow_up,
+            rtol=rtol,
         )
+
+    def simulate(
+        self,
+        t: ArrayLike,
+        x0: ArrayLike,
+        inputs: ArrayLike | Mapping[str, Any] | None = None,
+        *,
+        blow_up: float = 1e12,
+        rtol: float = 1e-8,
+    ) -> Rollout:
+        """Integrate freely from the state x0 at t[0], and give the states at the times t.
+
+        t: (samples,) in s, increasing. x0: (n_states,), in SI. inputs: (samples, n_inputs) at t,
+        joined by cubic splines, or by name such samples, a number, or a function of t in s.
+        Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges is one
+        too: marked `diverged`, with a message, it ends where a state exceeds `blow_up` times its
+        start (or, where that is zero, what its first rate makes of it), or the solver gave up.
+        Raises ValueError for a missing or unknown input and for wrong shapes.
+        """
+        return simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol)
+
+    def predict(
+        self, x: ArrayLike | Trajectory, inputs: ArrayLike | Mapping[str, Any] | None = None
+    ) -> Float[np.ndarray, "... n_states"]:
+        """Right-hand side at many samples at once, in SI per second.
+
+        x: (samples, n_states), or one sample (n_states,), or a Trajectory, which brings its own
+        inputs. inputs: of the same number of samples, in the order of `inputs`, or by name.
+        Raises ValueError for a missing or unknown variable and for wrong shapes.
+        """
+        if isinstance(x, Trajectory):
+            if inputs is not None:
+                raise ValueError(
+                    "a Trajectory brings its own inputs: pass its states, or no inputs"
+                )
+            return self.derivative(x.columns(self.states), x.columns(self.inputs))
+        states = np.asarray(x, dtype=np.float64)
+        if states.ndim == 0 or states.shape[-1] != len(self.states):
+            raise ValueError(
+                f"x must have a column for each of {list(self.states)}: shape {states.shape} came"
+            )
+        return self.derivative(states, sampled(self.inputs, inputs, states.shape[:-1]))
+
+    def score(
+        self,
+        run: Trajectory,
+        *,
+        x_dot: Float[np.ndarray, "samples n_states"] | None = None,
+        smoother: Smoother | None = None,
+    ) -> float:
+        """R2 of the derivative over a trajectory, the mean over the states; one is perfect.
+
+        The derivative and the samples at which the right-hand side is taken come from `smoother`,
+        by default SavitzkyGolay(), as in `Differential`; with x_dot, (samples, n_states) in SI
+        and in the order of the model's states, that is the truth, and samples are taken raw.
+        Raises ValueError for a missing variable, a wrong shape or a derivative that is constant.
+        """
+        return derivative_r2(self, run, x_dot=x_dot, smoother=smoother or SavitzkyGolay())
 
     def text(self, *, digits: int = 3) -> str:
         """One line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
@@ -159,65 +200,42 @@ class SparseModel:
 
     def sympy(self) -> dict[str, sympy.Expr]:
         """State name -> right-hand side as a sympy expression, coefficients as floats."""
-        import sympy  # half a second that most runs do not need
-
-        symbols = [sympy.Symbol(v) for v in self.library.variables]
-        powers = dict(zip(self.library.names, self.library.exponents.tolist(), strict=True))
-
-        def monomial(name: str) -> sympy.Expr:
-            pairs = zip(symbols, powers[name], strict=True)
-            return sympy.Mul(*(symbol**power for symbol, power in pairs))
-
-        return {
-            s: sympy.Add(*(sympy.Float(c) * monomial(n) for n, c in self.terms(s).items()))
-            for s in self.states
-        }
+        return {state: sum_sympy(self.terms(state)) for state in self.states}
 
     def latex(self, *, digits: int = 3) -> str:
         """An `aligned` block with one equation per line."""
-        lines = []
-        for state in self.states:
-            right = " ".join(
-                latex_term(name, coef, digits, first=k == 0)
-                for k, (name, coef) in enumerate(self.terms(state).items())
-            )
-            lines.append(f"{latex_derivative(state)} &= {right or '0'}")
-        return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
+        terms = {state: self.terms(state) for state in self.states}
+        return equations_latex(terms, digits=digits)
+
+    def __str__(self) -> str:
+        """Equations with units and, where a covariance is known, 95 % intervals."""
+        return "\n".join(model_lines(self))
+
+    def __repr__(self) -> str:
+        n_terms = int(np.count_nonzero(self.coef))
+        head = f"SparseModel of {len(self.states)} equations, {n_terms} terms"
+        return "\n".join([head, *model_lines(self, n_lines=N_LINES - 1)])
+
+    def _repr_html_(self) -> str:
+        return model_html(self)
+
+    def _repr_latex_(self) -> str:
+        return f"$${self.latex()}$$"
 
     def to_json(self) -> str:
         """Everything in the model; floats in their shortest exact form."""
-        content = {
-            "format": FORMAT,
-            "states": list(self.states),
-            "variables": list(self.library.variables),
-            "library": list(self.library.names),
-            "equations": {s: self.terms(s) for s in self.states},
-            "units": dict(self.units),
-            "provenance": dict(self.provenance),
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-        }
-        return json.dumps(content, indent=2, allow_nan=False) + "\n"
+        return model_text(
+            self.library,
+            {state: self.terms(state) for state in self.states},
+            units=self.units,
+            provenance=self.provenance,
+            covariance=self.covariance,
+        )
 
     @staticmethod
     def from_json(text: str) -> SparseModel:
         """Inverse of `to_json`, exact. Raises ValueError for anything else."""
-        try:
-            content = json.loads(text)
-            if content["format"] != FORMAT:
-                raise ValueError(f"format {content['format']!r}")
-            library = named_terms(content["variables"], content["library"])
-            equations = content["equations"]
-            covariance = content.get("covariance")  # files of version 0.1 have none
-            return SparseModel(
-                library=library,
-                states=content["states"],
-                coef=coef_matrix(library, [equations[s] for s in content["states"]]),
-                units=content["units"],
-                provenance=content["provenance"],
-                covariance=None if covariance is None else _square(covariance),
-            )
-        except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
-            raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
+        return read_model(text, model_of)
 
     def save(self, path: str | Path) -> None:
         write_text(Path(path), self.to_json())
@@ -237,30 +255,6 @@ class SparseModel:
         known = [*self.states, *self.inputs]
         return np.array([known.index(v) for v in self.library.variables], dtype=np.int64)
 
-    def _scaled_rhs(
-        self, window: Trajectory, scale: np.ndarray
-    ) -> Callable[[float, np.ndarray], np.ndarray]:
-        """The right-hand side for scaled states, with the absent terms left out."""
-        present = self.coef.any(axis=1)
-        coef = self.coef[present] / scale
-        # One gather and one product per call: index -1 of the padded values is a one.
-        places = np.append(self._gather, -1)
-        factors = places[self.library.factors[present]]
-        padded = np.ones(len(self.states) + len(self.inputs) + 1)
-        n = len(self.states)
-        drive = None
-        if self.inputs:
-            inputs = window.columns(self.inputs)
-            drive = make_interp_spline(window.t, inputs, k=min(3, len(inputs) - 1))
-
-        def rhs(t: float, y: np.ndarray) -> np.ndarray:
-            padded[:n] = y * scale
-            if drive is not None:
-                padded[n:-1] = drive(t)
-            return padded[factors].prod(axis=1) @ coef
-
-        return rhs
-
 
 def coef_matrix(
     library: Library, equations: Sequence[Mapping[str, float]]
@@ -273,6 +267,14 @@ def coef_matrix(
     return coef
 
 
-def _square(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "_ _"]:
-    """Rows of a stored matrix, which may be empty."""
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
+def model_of(
+    library: Library,
+    equations: Mapping[str, Mapping[str, float]],
+    *,
+    units: Mapping[str, str],
+    provenance: Mapping[str, str],
+    covariance: Float[np.ndarray, "_ _"] | None,
+) -> SparseModel:
+    """A model from its coefficients by state and term name."""
+    coef = coef_matrix(library, list(equations.values()))
+    return SparseModel(library, list(equations), coef, units, provenance, covariance)

@@ -1,31 +1,202 @@
-"""A model integrated over a window of a trajectory."""
+"""Models integrated over time: along the data, or freely from one state."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
+
+from ep2sindy.data.trajectory import Trajectory, check_time
+from ep2sindy.library.library import Library
+from ep2sindy.model.inputs import Drive, driven, spline
+
+
+@runtime_checkable
+class Equations(Protocol):
+    """What is integrated, a SparseModel: x' = library(states, inputs) coef."""
+
+    @property
+    def library(self) -> Library: ...
+
+    @property
+    def states(self) -> Sequence[str]: ...
+
+    @property
+    def inputs(self) -> Sequence[str]: ...
+
+    @property
+    def coef(self) -> np.ndarray: ...
+
+    @property
+    def units(self) -> Mapping[str, str]: ...
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A model integrated over a window of a trajectory.
+    """A model integrated along data or freely, and how that ended.
 
-    t: (samples,) in s, states: (samples, n_states), both cut where a diverged run stopped.
+    t: (samples,) in s, states: (samples, n_states), inputs: (samples, n_inputs), all cut where
+    a diverged run stopped. units: by name, of states and inputs.
     """
 
     t: Float[np.ndarray, " samples"]
     states: Float[np.ndarray, "samples n_states"]
     diverged: bool
     message: str
+    state_names: tuple[str, ...]
+    inputs: Float[np.ndarray, "samples n_inputs"]
+    input_names: tuple[str, ...]
+    units: Mapping[str, str]
+
+    def trajectory(self, *, label: str = "") -> Trajectory:
+        """The samples as data, as far as they go.
+
+        Raises ValueError where there are fewer than two, or where a state never changed.
+        """
+        return Trajectory(
+            t=self.t,
+            states=self.states,
+            state_names=self.state_names,
+            inputs=self.inputs,
+            input_names=self.input_names,
+            units=self.units,
+            label=label,
+        )
 
 
-def ending_text(solution: object, blow_up: float) -> str:
+def rollout(
+    model: Equations,
+    trajectory: Trajectory,
+    *,
+    start: int,
+    n_samples: int | None,
+    initial: Float[np.ndarray, " n_states"] | None,
+    blow_up: float,
+    rtol: float,
+) -> Rollout:
+    """Integrate along a trajectory: see `SparseModel.rollout`."""
+    stop = trajectory.n_samples if n_samples is None else start + n_samples
+    window = trajectory.window(start, stop)
+    data = window.columns(model.states)
+    inputs = window.columns(model.inputs)
+    return _integrated(
+        model,
+        window.t,
+        data[0] if initial is None else initial,
+        drive=spline(window.t, inputs) if model.inputs else None,
+        samples=inputs,
+        scale=np.abs(data).max(axis=0),
+        blow_up=blow_up,
+        bound="the data's largest value",
+        rtol=rtol,
+    )
+
+
+def simulate(
+    model: Equations,
+    t: ArrayLike,
+    x0: ArrayLike,
+    inputs: ArrayLike | Mapping[str, Any] | None,
+    *,
+    blow_up: float,
+    rtol: float,
+) -> Rollout:
+    """Integrate freely from one state: see `SparseModel.simulate`."""
+    times = np.asarray(t, dtype=np.float64)
+    check_time(times)
+    start = np.asarray(x0, dtype=np.float64)
+    if start.shape != (len(model.states),) or not np.isfinite(start).all():
+        raise ValueError(
+            f"x0 must give a finite number for each of {list(model.states)}: {start.tolist()} came"
+        )
+    drive, samples = driven(model.inputs, inputs, times)
+    values, terms = model.library.at_points([*model.states, *model.inputs])
+    values[:] = np.append(start, samples[0])
+    # What starts at zero is as large as its first rate makes it; what stays there, one.
+    reach = np.abs(start) + (start == 0.0) * np.abs(terms() @ model.coef) * (times[-1] - times[0])
+    return _integrated(
+        model,
+        times,
+        start,
+        drive=drive,
+        samples=samples,
+        scale=np.where(reach > 0.0, reach, 1.0),
+        blow_up=blow_up,
+        bound="its start",
+        rtol=rtol,
+    )
+
+
+def _integrated(
+    model: Equations,
+    t: np.ndarray,
+    x0: np.ndarray,
+    *,
+    drive: Drive | None,
+    samples: np.ndarray,
+    scale: np.ndarray,
+    blow_up: float,
+    bound: str,
+    rtol: float,
+) -> Rollout:
+    """From x0 over t, in units of `scale`, until a state exceeds `blow_up` of them."""
+
+    def too_large(t: float, y: np.ndarray) -> float:
+        return blow_up - float(np.abs(y).max())
+
+    too_large.terminal = True  # type: ignore[attr-defined]
+    # An overflow on the way to a blow-up is caught by the event, or ends the solver.
+    with np.errstate(over="ignore", invalid="ignore"):
+        solution = solve_ivp(
+            _scaled_rhs(model, drive, scale),
+            (t[0], t[-1]),
+            x0 / scale,
+            method="DOP853",
+            t_eval=t,
+            events=too_large,
+            rtol=rtol,
+            atol=rtol,
+        )
+    return Rollout(
+        t=solution.t,
+        states=solution.y.T * scale,
+        diverged=solution.status != 0,
+        message=_ending_text(solution, blow_up, bound),
+        state_names=tuple(model.states),
+        inputs=samples[: len(solution.t)],
+        input_names=tuple(model.inputs),
+        units=model.units,
+    )
+
+
+def _scaled_rhs(
+    model: Equations, drive: Drive | None, scale: np.ndarray
+) -> Callable[[float, np.ndarray], np.ndarray]:
+    """The right-hand side for scaled states, with the absent terms left out."""
+    present = np.flatnonzero(model.coef.any(axis=1))
+    coef = model.coef[present] / scale
+    values, terms = model.library.at_points([*model.states, *model.inputs], present)
+    n = len(model.states)
+
+    def rhs(t: float, y: np.ndarray) -> np.ndarray:
+        values[:n] = y * scale
+        if drive is not None:
+            values[n:] = drive(t)
+        return terms() @ coef
+
+    return rhs
+
+
+def _ending_text(solution: object, blow_up: float, bound: str) -> str:
     status, t = solution.status, solution.t  # type: ignore[attr-defined]
     last = t[-1] if len(t) else float("nan")
     if status == 0:
         return f"integrated to t = {last:.6g} s"
     if status == 1:
-        return f"a state grew past {blow_up:g} times the data's largest value at t = {last:.6g} s"
+        return f"a state grew past {blow_up:g} times {bound} at t = {last:.6g} s"
     return f"the solver stopped at t = {last:.6g} s: {solution.message}"  # type: ignore[attr-defined]

@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.rollout import Equations
+from ep2sindy.signals.smoothers import Smoother
+
 
 def r2(
     *, truth: Float[np.ndarray, " rows"], prediction: Float[np.ndarray, "models rows"]
@@ -17,3 +21,26 @@ def r2(
             "or check that the state varies"
         )
     return 1.0 - np.square(truth - prediction).sum(axis=1) / total
+
+
+def derivative_r2(
+    model: Equations,
+    run: Trajectory,
+    *,
+    x_dot: Float[np.ndarray, "_ _"] | None,
+    smoother: Smoother,
+) -> float:
+    """Mean over the states of the R2 of their derivatives: see `SparseModel.score`."""
+    values, data = run.columns(model.library.variables), run.columns(model.states)
+    if x_dot is None:
+        values, truth = smoother.smooth(run.t, values), smoother.derivative(run.t, data)
+    else:
+        truth = np.asarray(x_dot, dtype=np.float64)
+        if truth.shape != data.shape:
+            raise ValueError(
+                f"x_dot must have shape {data.shape}, a row per sample and a column for each of "
+                f"{list(model.states)}: {truth.shape} came"
+            )
+    found = model.library.evaluate(values) @ model.coef
+    pairs = zip(truth.T, found.T, strict=True)
+    return float(np.mean([r2(truth=y, prediction=p[None])[0] for y, p in pairs]))

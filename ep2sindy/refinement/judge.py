@@ -17,28 +17,21 @@ from ep2sindy.refinement.windows import WindowBatch
 
 FLAT = 0.95  # share of the loss of a constant from which on a model follows nothing
 
-
 WIDE = 0.5  # standard error, relative to the coefficient: its 95 % interval reaches zero
-
 
 CLOSED = 1e-9  # largest gap, in std, between the steps of one trajectory
 
-
 CLOSING_STEPS = 10  # of Newton's method, until the gaps are
-
 
 # A step counts as fine enough when the bias it leaves in a scaling is below either of these.
 BIAS_PER_ERROR, LEAST_BIAS = 0.1, 1e-4
-
 
 # A fit counts as stationary when one more Gauss-Newton step would gain less than this share of
 # the loss, or move no scaling by more.
 STATIONARY = 1e-3
 
-
 # Independent windows that a sandwich needs, per scaling.
 CLUSTERS = 2.0
-
 
 STATUSES = ("converged", "max_iter", "coarse_step", "unidentifiable", "flat", "non_finite")
 

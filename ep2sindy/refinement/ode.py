@@ -11,7 +11,6 @@ from torch import nn
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.constraints.relations import constraint as build_constraint
-from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 
 
@@ -83,14 +82,9 @@ class ODE(nn.Module):
         rows = [model.library.index(name) for _, name in relations.coefficients]
         used, terms = np.unique(rows, return_inverse=True)
         equations = [model.states.index(state) for state, _ in relations.coefficients]
-        order = [
-            model.library.variables.index(v) if v in model.library.variables else -1
-            for v in self.variables
-        ]
-        padded = np.pad(model.library.exponents[used], ((0, 0), (0, 1)))
-        self.library = Library(self.variables, padded[:, order])
+        self.library, values = model.library.take(used).over(self.variables).scaled(scale)
         # SI coefficient times this is the coefficient in scaled variables and time.
-        unit = step_s * np.prod(scale**self.library.exponents, axis=1)[terms] / scale[equations]
+        unit = step_s * values[terms] / scale[equations]
         for name, value in {
             "free0": coef[np.asarray(relations.free)],
             "C": relations.C,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +12,8 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.machine.screen import N_LINES, one_screen
+from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import Verdict, judge
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
@@ -41,6 +44,20 @@ class Refinement:
     history: tuple[Iteration, ...]
     batch: WindowBatch
     trajectories: Float[np.ndarray, "windows samples n_states"]
+
+    def __repr__(self) -> str:
+        body = model_lines(self.model, n_lines=N_LINES - 1)
+        return one_screen([self._headline(), *body])
+
+    def _repr_html_(self) -> str:
+        return f"<div>{html.escape(self._headline())}</div>{model_html(self.model)}"
+
+    def _headline(self) -> str:
+        n_windows, n_samples = self.trajectories.shape[:2]
+        return (
+            f"Refinement: {self.status}, loss {self.loss:.3g} of a constant's, "
+            f"{n_windows} windows of {n_samples} samples, {len(self.history)} iterations"
+        )
 
 
 def refine(

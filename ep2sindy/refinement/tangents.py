@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, library_of
 from ep2sindy.refinement.ode import ODE, Drive
 
 
@@ -16,12 +16,13 @@ from ep2sindy.refinement.ode import ODE, Drive
 class Augmented:
     """Right-hand sides of many points with their derivatives by state and scaling, in one batch.
 
-    One gather and product gives every distinct monomial; one matmul of them gives the rate, its
-    derivative by the states and its derivative by the scalings, column by column.
-    factors: (degree, monomials); basis: (points, rows, monomials, free); offset: the same without
+    One gather and product gives every distinct product of `library`; one matmul of them gives the
+    rate, its derivative by the states and its derivative by the scalings, column by column.
+    factors: (degree, products); basis: (points, rows, products, free); offset: the same without
     `free`, for rows = n_states * columns.
     """
 
+    library: Library
     factors: torch.Tensor
     basis: torch.Tensor
     offset: torch.Tensor
@@ -37,19 +38,20 @@ class Augmented:
         return 1 + self.n_states + self.n_free
 
     def take(self, points: torch.Tensor) -> Augmented:
-        return Augmented(self.factors, self.basis[points], self.offset[points], self.n_states)
+        return replace(self, basis=self.basis[points], offset=self.offset[points])
 
     def weights(self, scaling: torch.Tensor) -> torch.Tensor:
-        """(points, rows, monomials) of scaling (points, free)."""
+        """(points, rows, products) of scaling (points, free)."""
         return (self.basis @ scaling[:, None, :, None])[..., 0] + self.offset
 
     def fields(self, weights: torch.Tensor, x: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
         """(points, n_states, columns, batch) of x (points, n_states, batch)."""
-        padded = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
-        monomials = padded.index_select(1, self.factors[0])
+        columns = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
+        columns = self.library.with_functions(columns, axis=1)
+        products = columns.index_select(1, self.factors[0])
         for rows in self.factors[1:]:
-            monomials = monomials * padded.index_select(1, rows)
-        return torch.bmm(weights, monomials).view(len(x), self.n_states, -1, x.shape[-1])
+            products = products * columns.index_select(1, rows)
+        return torch.bmm(weights, products).view(len(x), self.n_states, -1, x.shape[-1])
 
     def rhs(
         self, scaling: torch.Tensor, drive: Drive
@@ -89,7 +91,7 @@ class Augmented:
 def augmented(odes: Sequence[ODE]) -> Augmented:
     """Modules of the same variables as one batch of points, on the device of the first.
 
-    Terms may differ: monomials are those that any module needs, and columns of zeros stand for
+    Terms may differ: products are those that any module needs, and columns of zeros stand for
     the scalings that a module has fewer of than the others.
     Raises ValueError for modules that differ in variables, or hold a correction, whose
     derivatives only autograd knows.
@@ -103,42 +105,24 @@ def augmented(odes: Sequence[ODE]) -> Augmented:
             f"{sorted({ode.variables for ode in odes})} came"
         )
     n, n_free = first.n_states, max(len(ode.free0) for ode in odes)
-    terms = np.unique(np.concatenate([ode.library.exponents for ode in odes]), axis=0)
-    exponents, transfer = _monomials(terms, n)
-    place = {row.tobytes(): k for k, row in enumerate(terms)}
-    size = (len(odes), n, 1 + n + n_free, len(exponents))
+    terms = library_of(first.variables, (term for ode in odes for term in ode.library.terms))
+    products, transfer = terms.with_derivatives(n)
+    size = (len(odes), n, 1 + n + n_free, len(products))
     basis, offset = np.zeros((*size, n_free)), np.zeros(size)
     for ode, by_point, fixed_point in zip(odes, basis, offset, strict=True):
         with torch.no_grad():
             by_scaling, fixed = (part.cpu().numpy() for part in ode.linear_parts())
-        spread = transfer[[place[row.tobytes()] for row in ode.library.exponents]]
+        spread = transfer[terms.places(ode.library)]
         own = by_scaling.shape[-1]
         by_point[:, : 1 + n, :, :own] = np.einsum("tcm,tji->jcmi", spread, by_scaling)
         fixed_point[:, : 1 + n] = np.einsum("tcm,tj->jcm", spread, fixed)
         fixed_point[:, 1 + n : 1 + n + own] = np.einsum("tm,tji->jim", spread[:, 0], by_scaling)
     device = first.C.device
-    factors = torch.tensor(Library(first.variables, exponents).factors.T, device=device)
+    factors = torch.tensor(products.table.T, device=device)
     return Augmented(
+        library=products,
         factors=factors.contiguous(),
         basis=torch.tensor(basis, device=device).flatten(1, 2),
         offset=torch.tensor(offset, device=device).flatten(1, 2),
         n_states=n,
     )
-
-
-def _monomials(exponents: np.ndarray, n_states: int) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct monomials of all terms and of their derivatives by the states.
-
-    Returns their exponents, and (terms, 1 + n_states, monomials): each term and its derivatives
-    in these monomials.
-    """
-    lowered = [exponents]
-    for v in range(n_states):
-        row = exponents.copy()
-        row[:, v] = np.maximum(row[:, v] - 1, 0)
-        lowered.append(row)
-    stacked = np.stack(lowered, axis=1)
-    factors = np.ones(stacked.shape[:2])
-    factors[:, 1:] = exponents[:, :n_states]
-    kept = np.unique(stacked[factors != 0.0], axis=0)
-    return kept, (stacked[:, :, None] == kept).all(axis=-1) * factors[..., None]

@@ -15,7 +15,6 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 PERIODS = 1.5  # of the dominant frequency in a window, where nobody says otherwise
 
-
 MIN_SAMPLES = 5  # of a window: fewer say nothing about the dynamics
 
 

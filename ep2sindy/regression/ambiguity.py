@@ -13,7 +13,6 @@ from ep2sindy.regression.rows import Regression
 # One minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
 SAME = 1e-10
 
-
 ALIKE = 1e-3
 
 

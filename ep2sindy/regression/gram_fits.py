@@ -11,7 +11,6 @@ from ep2sindy.machine.compilation import compiled
 # A column counts as dependent on others when what they leave of its square falls below this.
 DEPENDENT = 1e-11
 
-
 # What is left of a target's square below this share of it is rounding.
 ROUNDING = 1e-15
 

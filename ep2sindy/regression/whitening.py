@@ -16,11 +16,9 @@ from ep2sindy.regression.rows import NoisyRows, Regression
 # No sample is moved by more standard deviations of its noise: a wrong model would never end.
 LARGEST_CORRECTION = 4.0
 
-
 # Added to the variance of every row: a share of the mean variance, since rows of overlapping
 # windows are nearly dependent, and the square of what rounding leaves of the target.
 RIDGE = 1e-8
-
 
 ROUNDING = 1e-8
 

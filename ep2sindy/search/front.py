@@ -9,6 +9,8 @@ from itertools import groupby
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.library.equations import equation_html, equation_text
+from ep2sindy.machine.screen import html_table, one_screen, text_table
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.regression.rows import Regression
@@ -74,6 +76,21 @@ class ParetoFront:
     def leading(self) -> Bool[np.ndarray, " candidates"]:
         """Whether a candidate is the best of its size."""
         return np.diff(self.sizes, prepend=-1.0) > 0
+
+    def __repr__(self) -> str:
+        rows = [
+            [str(c.n_terms), f"{_score(c):.6f}", equation_text(self.equation, c.coef_by_term)]
+            for c in self.candidates
+        ]
+        head = f"ParetoFront of {self.equation}, {len(rows)} candidates"
+        return one_screen([head, *text_table(["terms", "R2", "equation"], rows)])
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [str(c.n_terms), f"{_score(c):.6f}", equation_html(self.equation, c.coef_by_term)]
+            for c in self.candidates
+        ]
+        return html_table(["terms", "R2", "equation"], rows)
 
 
 def _score(candidate: Candidate) -> float:

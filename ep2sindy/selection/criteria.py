@@ -104,7 +104,7 @@ class EBIC:
 
 def log_supports(library: Library, terms: Sequence[str]) -> float:
     """Log of the number of supports of this size among terms of no higher degree than these."""
-    degrees = library.exponents.sum(axis=1)
+    degrees = library.degrees
     highest = max((degrees[library.index(name)] for name in terms), default=0)
     return log(comb(int((degrees <= highest).sum()), len(terms)))
 

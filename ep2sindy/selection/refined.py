@@ -22,10 +22,8 @@ from ep2sindy.selection.rule import FLOOR
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
 LEAST_PAIRS = 3
 
-
 # Steps of all windows of all points that are refined together: more leave the cache.
 BATCH_STEPS = 6000
-
 
 # Standard errors that the winner may lie above the best.
 N_ERRORS = 2.0

@@ -15,10 +15,8 @@ from ep2sindy.signals.kernels import likelihood, smoothed
 # From a memory of some 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
 
-
 # Below what data can tell: over 1000 samples the most likely one scatters by 0.03 and more.
 LOG10_RATIO_TOLERANCE = 0.01
-
 
 # Three samples start the filter; two more are the least that can tell noise from signal.
 MIN_SAMPLES = 5

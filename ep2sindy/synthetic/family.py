@@ -22,9 +22,7 @@ PARAMETERS: Mapping[str, Mapping[str, float]] = {
     for V_D, mdot_mgs in ((200, 5), (300, 2), (300, 4), (300, 5), (300, 6), (400, 5))
 }
 
-
 LAW = polynomial(["V_D", "mdot_mgs"], degree=1)
-
 
 # State -> term -> coefficients of 1, V_D and mdot_mgs in the law.
 TRUTH: Mapping[str, Mapping[str, Sequence[float]]] = {
@@ -32,12 +30,9 @@ TRUTH: Mapping[str, Mapping[str, Sequence[float]]] = {
     "n_n": {"1": (0.0, 0.0, 0.015), "n_i*n_n": (-1.0, -0.002, 0.05)},
 }
 
-
 LIBRARY = polynomial(list(TRUTH), degree=3)
 
-
 DURATION_S, RATE_HZ = 15.0, 10.0  # small oscillations last 18 to 30 s
-
 
 # Where records start, drawn evenly between: away from the steady state, which would show little.
 INITIAL = ((0.1, 0.4), (0.5, 1.6))

@@ -24,22 +24,16 @@ from ep2sindy.thruster.parameters import Thruster
 
 Equations = Mapping[str, Mapping[str, float]]
 
-
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s"}
-
 
 STATES = ("n_i", "n_n")
 
-
 INPUTS = ("u_iz", "u_ir", "R_ion")
-
 
 TERMS = ("1", "n_n", "n_i*u_iz", "n_i*u_ir", "n_i*n_n*R_ion")
 
-
 # Axial convection and ionization as in the thesis's Eq. 25 at 300 V, 5 mg/s (Table IV).
 IONS = {"n_i*u_iz": -41.0, "n_i*n_n*R_ion": 0.82}
-
 
 REGIONS: Mapping[str, Equations] = {
     "anode": {"n_i": IONS, "n_n": {"1": 8e22, "n_i*n_n*R_ion": -0.77}},
@@ -49,7 +43,6 @@ REGIONS: Mapping[str, Equations] = {
         "n_n": {"1": 8e22, "n_i*n_n*R_ion": -0.77},
     },
 }
-
 
 # A point with more than this share of one region's coefficients counts as inside the region.
 INSIDE = 0.95

@@ -15,10 +15,8 @@ import xarray as xr
 # Time stays a number, whatever its attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
 
-
 # What the parsing libraries raise on damaged files beyond ValueError and OSError.
 LIBRARY_ERRORS = (zipfile.BadZipFile, zlib.error)
-
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

@@ -18,7 +18,6 @@ from ep2sindy.refinement.steps import RungeKutta
 
 Optimizer = Callable[[list[nn.Parameter]], torch.optim.Optimizer]
 
-
 LBFGS: Optimizer = partial(torch.optim.LBFGS, line_search_fn="strong_wolfe")
 
 

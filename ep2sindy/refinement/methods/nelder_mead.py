@@ -72,18 +72,18 @@ def window_paths(problem: Problem, scaling: np.ndarray) -> np.ndarray:
     basis, offset = (part.detach().cpu().numpy() for part in ode.linear_parts())
     matrix = basis @ scaling + offset
     path = np.full(batch.data.shape, np.nan)
-    factors, n = ode.library.factors, ode.n_states
-    padded = np.ones(len(ode.variables) + 1)
+    values, terms = ode.library.at_points(ode.variables)
+    n = ode.n_states
     for w, data in enumerate(batch.data):
         t = np.append(0.0, np.cumsum(batch.steps[w]))
 
         def rhs(x: np.ndarray, now: float, t: np.ndarray = t, w: int = w) -> np.ndarray:
-            padded[:n] = x
-            if len(padded) > n + 1:
+            values[:n] = x
+            if len(values) > n:
                 k = min(max(int(np.searchsorted(t, now, side="right")) - 1, 0), len(t) - 2)
                 share = (now - t[k]) / (t[k + 1] - t[k])
-                padded[n:-1] = share**CUBIC @ batch.inputs[w, k]
-            return padded[factors].prod(axis=1) @ matrix
+                values[n:] = share**CUBIC @ batch.inputs[w, k]
+            return terms() @ matrix
 
         with np.errstate(over="ignore", invalid="ignore"):
             states, info = lsoda(rhs, data[0], t, full_output=True)

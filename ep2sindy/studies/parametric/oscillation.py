@@ -13,15 +13,11 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 OSCILLATING, STEADY = "oscillating", "steady"
 
-
 LEAST_SPREAD = 0.01  # of every state, in means, in the second half of the record
-
 
 LEAST_SHARE = 0.5  # of the first half's standard deviation that is left in the second
 
-
 LEAST_PERIODS = 4.0  # in the record: fewer may be a drift
-
 
 # The spectrum's peak, 5 % or two bins to either side, must hold a fifth of the power: white noise
 # has a tenth there at most, the thruster's breathing two thirds.

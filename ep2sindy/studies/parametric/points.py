@@ -41,7 +41,6 @@ from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap, resampled_
 
 FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
 
-
 REFINED = "_refined"  # ends the name of a case's refinement
 
 

@@ -1,0 +1,80 @@
+"""How a model shows itself: equations with units and intervals, on a screen or in a notebook."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from ep2sindy.library.equations import equation_html, equation_parts
+from ep2sindy.library.units import unit_product
+from ep2sindy.machine.screen import N_LINES, cut, wrapped
+from ep2sindy.model.rollout import Equations
+
+MOST_TERMS = 40  # of one equation in a notebook
+
+
+@runtime_checkable
+class Readable(Equations, Protocol):
+    """What is shown, a SparseModel."""
+
+    @property
+    def covariance(self) -> np.ndarray | None: ...
+
+    def terms(self, state: str) -> dict[str, float]: ...
+
+    def intervals(self, state: str) -> dict[str, tuple[float, float]]: ...
+
+
+def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
+    """Equations with their units, then the units of the variables; at most n_lines."""
+    foot = cut(_units_text(model))
+    room = n_lines - 1
+    if len(model.states) > room:
+        left = len(model.states) - room + 1
+        states, tail = model.states[: room - 1], [f"... {left} more equations", foot]
+    else:
+        states, tail = model.states, [foot]
+    # Every equation gets one line, and an even share of those that the others leave.
+    spare = n_lines - len(tail) - len(states)
+    lines: list[str] = []
+    for k, state in enumerate(states):
+        parts = equation_parts(model.terms(state), reach=half_widths(model, state)) or ["0"]
+        parts[-1] += f" [{_rate_unit(model, state)}]"
+        share = 1 + spare // (len(states) - k)
+        own = wrapped([f"{state}' =", *parts], what="terms", n_lines=share)
+        spare -= len(own) - 1
+        lines += own
+    return [*lines, *tail]
+
+
+def model_html(model: Readable) -> str:
+    """The same for a notebook."""
+    lines = []
+    for state in model.states:
+        terms = dict(list(model.terms(state).items())[:MOST_TERMS])
+        left = len(model.terms(state)) - len(terms)
+        text = equation_html(state, terms, reach=half_widths(model, state))
+        more = f" ... {left} more terms" if left else ""
+        lines.append(f"<div>{text}{more} &nbsp; [{html.escape(_rate_unit(model, state))}]</div>")
+    return "\n".join([*lines, f"<div><small>{html.escape(_units_text(model))}</small></div>"])
+
+
+def half_widths(model: Readable, state: str) -> Mapping[str, float]:
+    """Half of the 95 % interval of each coefficient, where a covariance is known."""
+    if model.covariance is None:
+        return {}
+    return {name: (high - low) / 2.0 for name, (low, high) in model.intervals(state).items()}
+
+
+def _rate_unit(model: Readable, state: str) -> str:
+    return unit_product([(model.units[state], 1), ("s", -1)])
+
+
+def _units_text(model: Readable) -> str:
+    known = [f"{name} in {unit}" for name, unit in model.units.items() if unit != "1"]
+    return ", ".join([*known, "t in s"]) + (
+        "" if model.covariance is None else "; ± 95 % intervals"
+    )

@@ -1,0 +1,176 @@
+"""Models run freely, evaluated at samples and scored: what a user does with one at hand."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from ep2sindy.data.trajectory import ConstantStateError, Trajectory
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.signals.smoothers import NoSmoothing
+
+A = np.array([[-0.5, 2.0], [-2.0, -0.1]])
+
+
+def linear() -> SparseModel:
+    library = named_terms(["x", "y"], ["x", "y"])
+    return SparseModel(library, ["x", "y"], A.T, {"x": "m", "y": "m/s"})
+
+
+def driven() -> SparseModel:
+    """x' = -2 x + u + 3 w, whose variables stand in no special order."""
+    library = named_terms(["w", "x", "u"], ["w", "x", "u"])
+    return SparseModel(library, ["x"], np.array([[3.0], [-2.0], [1.0]]), {"u": "V"})
+
+
+def exact(t: np.ndarray) -> np.ndarray:
+    """x(0) = 1, u = sin t, w = 0."""
+    return np.exp(-2 * t) * 1.2 + (2 * np.sin(t) - np.cos(t)) / 5
+
+
+def test_a_linear_system_follows_its_exponential() -> None:
+    t, x0 = np.linspace(0.5, 6.5, 25), np.array([1.0, -0.5])
+    found = linear().simulate(t, x0)
+    expected = np.array([expm(A * (now - t[0])) @ x0 for now in t])
+    assert not found.diverged
+    # The solver keeps 1e-8 per step, over about 40 steps.
+    np.testing.assert_allclose(found.states, expected, atol=1e-6)
+    run = found.trajectory(label="free")
+    assert (run.state_names, dict(run.units), run.label) == (
+        ("x", "y"),
+        {"x": "m", "y": "m/s"},
+        "free",
+    )
+    assert np.array_equal(run.t, t)
+
+
+def test_runs_scale_with_their_units() -> None:
+    t = np.linspace(0.0, 5.0, 11)
+    small = linear().simulate(t, [1e-20, -5e-21]).states
+    np.testing.assert_allclose(small * 1e20, linear().simulate(t, [1.0, -0.5]).states, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["functions", "samples", "array"])
+def test_inputs_come_as_functions_samples_or_an_array(kind: str) -> None:
+    t = np.linspace(0.0, 5.0, 201)
+    inputs = {
+        "functions": {"u": np.sin, "w": 0.0},
+        "samples": {"u": np.sin(t), "w": 0 * t},
+        "array": np.stack([0 * t, np.sin(t)], axis=1),
+    }[kind]
+    assert driven().inputs == ("w", "u")
+    found = driven().simulate(t, [1.0], inputs)
+    # A function is exact; the error of a spline is below dt^4 * 5/384, here 5e-9.
+    np.testing.assert_allclose(
+        found.states[:, 0], exact(t), atol=1e-6 if kind == "functions" else 2e-6
+    )
+    assert found.trajectory().units["u"] == "V"
+    np.testing.assert_allclose(found.trajectory().columns(["u"])[:, 0], np.sin(t))
+
+
+def test_sampled_inputs_are_of_fourth_order_at_least() -> None:
+    """Splines are; within a step their errors cancel in part, which a slow system integrates."""
+    errors = []
+    for n in (11, 21, 41):
+        t = np.linspace(0.0, 5.0, n)
+        found = driven().simulate(t, [1.0], {"u": np.sin(t), "w": 0.0}, rtol=1e-12)
+        errors.append(np.abs(found.states[:, 0] - exact(t)).max())
+    slope = np.polyfit(np.log([10, 20, 40]), np.log(errors), 1)[0]
+    assert 4.0 < -slope < 5.5
+
+
+def test_what_starts_at_zero_has_a_scale_of_its_own() -> None:
+    """x' = 1e-15: an absolute tolerance of one unit would see nothing."""
+    model = SparseModel(polynomial(["x"], degree=1), ["x"], np.array([[1e-15], [-1.0]]))
+    t = np.linspace(0.0, 4.0, 9)
+    found = model.simulate(t, [0.0]).states[:, 0]
+    np.testing.assert_allclose(found, 1e-15 * (1 - np.exp(-t)), rtol=1e-6)
+
+
+def test_a_run_that_diverges_is_marked_and_ends_there() -> None:
+    model = SparseModel(named_terms(["x"], ["x^2"]), ["x"], np.array([[1.0]]))
+    found = model.simulate(np.linspace(0.0, 2.0, 201), [1.0])  # 1/(1 - t)
+    assert found.diverged
+    assert "t = 1" in found.message or "t = 0.99" in found.message
+    assert found.t[-1] <= 1.0
+    assert found.trajectory().n_samples == len(found.t) == len(found.inputs)
+
+
+def test_a_run_that_rests_is_no_trajectory() -> None:
+    found = linear().simulate([0.0, 1.0], [0.0, 0.0])
+    assert found.states.tolist() == [[0.0, 0.0], [0.0, 0.0]]
+    with pytest.raises(ConstantStateError, match="a state must vary"):
+        found.trajectory()
+
+
+@pytest.mark.parametrize(
+    ("t", "x0", "inputs", "message"),
+    [
+        ([0.0, 1.0], [1.0, 2.0], {"u": 0.0, "w": 0.0}, r"a finite number for each of \['x'\]"),
+        ([0.0, 1.0], [np.nan], {"u": 0.0, "w": 0.0}, "a finite number for each"),
+        ([0.0, 0.0], [1.0], {"u": 0.0, "w": 0.0}, "t must increase"),
+        ([0.0], [1.0], {"u": 0.0, "w": 0.0}, "at least two samples"),
+        ([0.0, 1.0], [1.0], None, r"driven by \['w', 'u'\]: \['w', 'u'\] are missing"),
+        ([0.0, 1.0], [1.0], {"u": 0.0}, r"\['w'\] are missing"),
+        ([0.0, 1.0], [1.0], {"u": 0.0, "w": 0.0, "v": 1.0}, r"unknown inputs \['v'\]"),
+        ([0.0, 1.0], [1.0], {"u": [1.0, 2.0, 3.0], "w": 0.0}, r"input 'u' must have shape \(2,\)"),
+        ([0.0, 1.0], [1.0], [[1.0], [2.0]], r"inputs must have shape \(2, 2\)"),
+        ([0.0, 1.0], [1.0], {"u": np.inf, "w": 0.0}, "input 'u' must be finite"),
+    ],
+)
+def test_what_cannot_be_run_says_why(t, x0, inputs, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        driven().simulate(t, x0, inputs)
+
+
+def test_predictions_take_samples_one_or_many_and_trajectories() -> None:
+    rng = np.random.default_rng(0)
+    x, u, w = rng.normal(size=(3, 7))
+    expected = (-2.0 * x + u + 3.0 * w)[:, None]
+    model = driven()
+    np.testing.assert_allclose(model.predict(x[:, None], {"u": u, "w": w}), expected, rtol=1e-14)
+    np.testing.assert_allclose(
+        model.predict(x[:, None], np.stack([w, u], axis=1)), expected, rtol=1e-14
+    )
+    np.testing.assert_allclose(
+        model.predict([x[0]], {"u": u[0], "w": w[0]}), expected[0], rtol=1e-14
+    )
+    run = Trajectory(
+        t=np.arange(7.0), states=x[:, None], state_names=["x"],
+        inputs=np.stack([u, w], axis=1), input_names=["u", "w"],
+    )  # fmt: skip
+    np.testing.assert_allclose(model.predict(run), expected, rtol=1e-14)
+    np.testing.assert_allclose(linear().predict([1.0, 2.0]), A @ [1.0, 2.0])
+    with pytest.raises(ValueError, match="a Trajectory brings its own inputs"):
+        model.predict(run, {"u": u, "w": w})
+    with pytest.raises(ValueError, match=r"a column for each of \['x', 'y'\]: shape \(7, 1\)"):
+        linear().predict(x[:, None])
+    with pytest.raises(ValueError, match="must be samples here: a function came"):
+        model.predict(x[:, None], {"u": np.sin, "w": w})
+
+
+def test_the_true_model_scores_one_and_a_constant_zero() -> None:
+    t = np.linspace(0.0, 6.0, 601)
+    model = linear()
+    run = model.simulate(t, [1.0, -0.5]).trajectory()
+    assert model.score(run) == pytest.approx(1.0, abs=1e-6)
+    assert model.score(run, x_dot=run.states @ A.T) == pytest.approx(1.0, abs=1e-15)
+    # Differences are off by dt^2/6 * x''', which is below 8; R2 takes the square of that.
+    assert 1.0 - model.score(run, smoother=NoSmoothing()) < (0.01**2 / 6 * 8) ** 2
+    x_dot = run.states @ A.T
+    library = polynomial(["x", "y"], degree=1)
+    still = SparseModel(library, ["x", "y"], np.array([x_dot.mean(axis=0), [0, 0], [0, 0]]))
+    assert still.score(run, x_dot=x_dot) == pytest.approx(0.0, abs=1e-12)
+    with pytest.raises(ValueError, match=r"x_dot must have shape \(601, 2\)"):
+        model.score(run, x_dot=x_dot[:-1])
+
+
+def test_a_score_is_the_mean_over_the_states() -> None:
+    t = np.linspace(0.0, 6.0, 301)
+    run = linear().simulate(t, [1.0, -0.5]).trajectory()
+    x_dot = run.states @ A.T
+    half = SparseModel(
+        linear().library, ["x", "y"], coef_matrix(linear().library, [{"x": -0.5, "y": 2.0}, {}])
+    )
+    lost = 1.0 - np.square(x_dot[:, 1]).sum() / np.square(x_dot[:, 1] - x_dot[:, 1].mean()).sum()
+    assert half.score(run, x_dot=x_dot) == pytest.approx((1.0 + lost) / 2, rel=1e-12)
