@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -12,18 +11,15 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.last_fit import assemble_model
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.model.integrated import Integrated, integrate, samples_in
+from ep2sindy.model.integrated import Integrated
 from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.report.document import Captioned, Section
 from ep2sindy.report.run import Run
-from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll
 from ep2sindy.studies.libraries_view import comparison, drawings, front_tables, sections, summary
+from ep2sindy.studies.library_result import LibraryResult, result_of
 from ep2sindy.studies.shown import Shown, rollout_table
 from ep2sindy.studies.source import Source
 
@@ -52,21 +48,6 @@ class LibraryCase:
             return recipe
         rule: Any = recipe.selection
         return replace(recipe, selection=replace(rule, n_norm=self.n_norm))
-
-
-@dataclass(frozen=True, eq=False)
-class LibraryResult:
-    """One library's discovery and its selected model; the published terms, fitted to our data.
-
-    given: the published terms as printed, by state.
-    """
-
-    recipe: Recipe
-    discovery: Discovery
-    selected: Integrated
-    given: Mapping[str, Mapping[str, float]]
-    refitted: Mapping[str, Candidate]
-    published: Integrated | None
 
 
 @dataclass(frozen=True)
@@ -99,57 +80,6 @@ class Study:
             for (name, library), rng in zip(libraries.items(), streams, strict=True)
         }
         return Outcome(self, data, results)
-
-
-def result_of(
-    data: Trajectory,
-    library: Library,
-    recipe: Recipe,
-    published: Mapping[str, Mapping[str, float]],
-    rollout_s: float | None,
-    *,
-    rng: np.random.Generator,
-) -> LibraryResult:
-    """What one library finds, and how its model and the published one run."""
-    n_samples = data.n_samples if rollout_s is None else samples_in(data, rollout_s)
-    found = discover(data, library, recipe, seed=rng)
-    refitted = _refitted(found, published)
-    return LibraryResult(
-        recipe=recipe,
-        discovery=found,
-        selected=integrate(found.model, data, n_samples),
-        given=published,
-        refitted=refitted,
-        published=_integrate_refitted(found, refitted, data, n_samples),
-    )
-
-
-def _refitted(
-    found: Discovery, published: Mapping[str, Mapping[str, float]]
-) -> dict[str, Candidate]:
-    """Published terms fitted to our rows, where the data can tell them from others."""
-    fits = {}
-    for state, terms in published.items():
-        if state in found.fronts:
-            problem = found.fronts[state].problem
-            at_hand = set(compress(problem.term_names, usable_terms(problem)))
-            if set(terms) <= at_hand:
-                fits[state] = fit_support(problem, state, list(terms))
-    return fits
-
-
-def _integrate_refitted(
-    found: Discovery, refitted: Mapping[str, Candidate], data: Trajectory, n_samples: int
-) -> Integrated | None:
-    if set(refitted) != set(data.state_names):
-        return None
-    model = assemble_model(
-        found.model.library,
-        [refitted[state] for state in data.state_names],
-        units=data.units,
-        provenance={**found.model.provenance, "search": "published terms, refitted"},
-    )
-    return integrate(model, data, n_samples)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,11 +18,9 @@ from ep2sindy.report.document import Block, Captioned, Equation, Picture, Sectio
 from ep2sindy.search.front import Candidate
 from ep2sindy.selection.rule import selected
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.studies.library_result import LibraryResult
 from ep2sindy.studies.shown import INTEGRATED, Shown
 from ep2sindy.studies.source import data_summary
-
-if TYPE_CHECKING:
-    from ep2sindy.studies.libraries import LibraryResult
 
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",

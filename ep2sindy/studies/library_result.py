@@ -1,0 +1,84 @@
+"""What one library finds, and how its model runs beside a published one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import compress
+
+import numpy as np
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.last_fit import assemble_model
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.library.library import Library
+from ep2sindy.model.integrated import Integrated, integrate, samples_in
+from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.search.front import Candidate, fit_support
+
+
+@dataclass(frozen=True, eq=False)
+class LibraryResult:
+    """One library's discovery and its selected model; the published terms, fitted to our data.
+
+    given: the published terms as printed, by state.
+    """
+
+    recipe: Recipe
+    discovery: Discovery
+    selected: Integrated
+    given: Mapping[str, Mapping[str, float]]
+    refitted: Mapping[str, Candidate]
+    published: Integrated | None
+
+
+def result_of(
+    data: Trajectory,
+    library: Library,
+    recipe: Recipe,
+    published: Mapping[str, Mapping[str, float]],
+    rollout_s: float | None,
+    *,
+    rng: np.random.Generator,
+) -> LibraryResult:
+    """What one library finds, and how its model and the published one run."""
+    n_samples = data.n_samples if rollout_s is None else samples_in(data, rollout_s)
+    found = discover(data, library, recipe, seed=rng)
+    refitted = _refitted(found, published)
+    return LibraryResult(
+        recipe=recipe,
+        discovery=found,
+        selected=integrate(found.model, data, n_samples),
+        given=published,
+        refitted=refitted,
+        published=_integrate_refitted(found, refitted, data, n_samples),
+    )
+
+
+def _refitted(
+    found: Discovery, published: Mapping[str, Mapping[str, float]]
+) -> dict[str, Candidate]:
+    """Published terms fitted to our rows, where the data can tell them from others."""
+    fits = {}
+    for state, terms in published.items():
+        if state in found.fronts:
+            problem = found.fronts[state].problem
+            at_hand = set(compress(problem.term_names, usable_terms(problem)))
+            if set(terms) <= at_hand:
+                fits[state] = fit_support(problem, state, list(terms))
+    return fits
+
+
+def _integrate_refitted(
+    found: Discovery, refitted: Mapping[str, Candidate], data: Trajectory, n_samples: int
+) -> Integrated | None:
+    if set(refitted) != set(data.state_names):
+        return None
+    model = assemble_model(
+        found.model.library,
+        [refitted[state] for state in data.state_names],
+        units=data.units,
+        provenance={**found.model.provenance, "search": "published terms, refitted"},
+    )
+    return integrate(model, data, n_samples)
