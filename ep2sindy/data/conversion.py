@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 import tokenize
+from functools import cache
 from typing import Any
 
 import numpy as np
-import pint
 import xarray as xr
 
 from ep2sindy.data.fields import COORDINATE_UNITS
-from ep2sindy.library.units import registry, unit_product
+from ep2sindy.library.units import PLAIN, registry, unit_product
 
 # What our usual names mean: a unit of another kind is a mistake in the mapping.
 KNOWN_UNITS = {
@@ -24,15 +24,15 @@ NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
 # Names that end so keep this unit; all others are SI.
 SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
 
-# What pint raises on text that is no unit.
-UNIT_ERRORS = (
-    pint.PintError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    ArithmeticError,
-    tokenize.TokenError,
-)
+
+@cache
+def _unit_errors() -> tuple[type[Exception], ...]:
+    """What pint raises on text that is no unit."""
+    import pint
+
+    return (
+        pint.PintError, ValueError, TypeError, AttributeError, ArithmeticError, tokenize.TokenError,
+    )  # fmt: skip
 
 
 def to_si(array: xr.DataArray, ours: str, unit: str) -> xr.DataArray:
@@ -57,10 +57,12 @@ def conversion(ours: str, unit: str) -> tuple[float, float, str]:
     """Factor, offset and target unit that take numbers in `unit` to the unit our name means."""
     suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
     target = (COORDINATE_UNITS | KNOWN_UNITS).get(ours) or next(suffixes, None)
+    if unit == (target or "1") and unit in PLAIN | {"1"}:
+        return 1.0, 0.0, unit
     try:
         given = _ruler(unit)
         ruler = given.to(target) if target else given.to_base_units()
-    except UNIT_ERRORS as error:
+    except _unit_errors() as error:
         raise ValueError(
             f"the unit of {ours} must be one that converts to {target or 'SI'}: {unit!r} came "
             f"({error}); write for example 'cm^-3', '1e19 m^-3', 'km/s'"
@@ -85,7 +87,7 @@ def same_unit(unit: str, stated: str) -> bool:
     """Whether both texts mean one unit; a text that is no unit says nothing against."""
     try:
         a, b = _ruler(unit).to_base_units(), _ruler(stated).to_base_units()
-    except UNIT_ERRORS:
+    except _unit_errors():
         return True
     return a.check(b.dimensionality) and np.allclose(a.magnitude, b.magnitude, rtol=1e-9, atol=0.0)
 

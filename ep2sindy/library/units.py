@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     import pint
 
 
+# Symbols that are their own base symbol: what they mean needs no registry.
+PLAIN = frozenset({"s", "m", "A", "V", "eV"})
+
+
 @cache
 def registry() -> pint.UnitRegistry:
     """The one registry of the package; importing and building it takes a quarter of a second."""
@@ -24,6 +28,8 @@ def _powers(unit: str) -> dict[str, float]:
     """Base symbol -> exponent of one unit string; an unknown unit stays a symbol of its own."""
     if unit in ("", "1"):
         return {}
+    if unit in PLAIN:
+        return {unit: 1.0}
     import pint
 
     try:
