@@ -1,0 +1,287 @@
+"""From a command line to a study: configs, their errors, sweeps and their index."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+import ep2sindy as ep
+from ep2sindy.app import main as program
+from ep2sindy.app.build import deferred
+from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_config, study_class
+from ep2sindy.app.schema import keys_of, study_of, value_of
+from ep2sindy.app.sweep import index_text, write_index
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.selection.rule import Selection
+from ep2sindy.studies.kinds import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Inner:
+    width: float
+    label: str = "none"
+
+
+@dataclass(frozen=True)
+class Toy:
+    """A study's signature with every kind of key."""
+
+    recipe: Recipe
+    n: Count
+    share: Share
+    span: PositiveOrAll
+    names: Names
+    lengths: Counts
+    noises: Levels
+    inner: Inner
+    many: Mapping[str, Inner]
+    rows: Sequence[Inner]
+    rule: Selection
+    later: Deferred
+    free: Mapping[str, Any] = field(default_factory=dict)
+    switch: bool = False
+
+
+GOOD = """
+experiment: toy
+study: toy
+seed: 0
+output: outputs
+formulation: {_target_: ep2sindy.Differential}
+search: {_target_: ep2sindy.BestSubset}
+bootstraps: {_target_: ep2sindy.Bootstraps, n: 0}
+selection: {_target_: ep2sindy.Knee}
+depth: 2
+n: 3
+share: 0.25
+span: null
+names: [a, b]
+lengths: [10, 20]
+noises: [0.0, 0.1]
+inner: {width: 1}
+many: {one: {width: 2.0, label: x}}
+rows: [{width: 3.0}]
+rule: {_target_: ep2sindy.EBIC, gamma: 0.5}
+later: {_target_: ep2sindy.Knee, n_norm: library}
+free: {anything: [1, {goes: here}]}
+"""
+
+
+def config(*changes: str) -> DictConfig:
+    merged = OmegaConf.merge(OmegaConf.create(GOOD), OmegaConf.from_dotlist(list(changes)))
+    assert isinstance(merged, DictConfig)
+    return merged
+
+
+def test_a_study_is_built_from_its_signature() -> None:
+    study = study_of(Toy, config())
+    assert study.recipe.depth == 2
+    assert isinstance(study.recipe.search, ep.BestSubset)
+    assert (study.n, study.share, study.span, study.switch) == (3, 0.25, None, False)
+    assert (study.names, study.lengths, study.noises) == (["a", "b"], [10, 20], [0.0, 0.1])
+    assert study.inner == Inner(1.0)
+    assert study.many == {"one": Inner(2.0, "x")}
+    assert study.rows == [Inner(3.0)]
+    assert study.rule == ep.EBIC(gamma=0.5)
+    assert study.later.build() == ep.Knee()
+    assert study.free == {"anything": [1, {"goes": "here"}]}
+
+
+def test_a_recipe_stands_for_its_groups() -> None:
+    groups = {"formulation", "search", "bootstraps", "selection", "depth"}
+    assert groups < keys_of(Toy)
+    assert "recipe" not in keys_of(Toy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("nn=1", r"unknown keys \['nn'\]; there are \["),
+        ("n=0", "n must be a whole number, one or more: 0 came"),
+        ("n=1.5", "n must be a whole number, one or more: 1.5 came"),
+        ("share=1", "share must be a number between 0 and 1: 1 came"),
+        ("span=-1", "span must be a positive number, or null for all: -1 came"),
+        ("names=[a,a]", r"names must be a list such as \[a,b\], each once"),
+        ("names=a", r"names must be a list such as \[a,b\], each once: 'a' came"),
+        ("lengths=[0]", r"lengths\[0\] must be whole numbers, above zero: 0 came"),
+        ("noises=[-1.0]", r"noises\[0\] must be numbers, zero or more: -1.0 came"),
+        ("inner.widht=1", r"inner may have \['label', 'width'\] and needs width: \['widht', "),
+        ("many.one.lable=x", r"many.one may have .*: \['label', 'lable', 'width'\] came"),
+        ("many.one.label=1", "many.one.label must be text: 1 came"),
+        ("many=1", r"many must be like {name: ...}: 1 came"),
+        ("rows=[{width: 1, hight: 2}]", r"rows\[0\] may have .*: \['hight', 'width'\] came"),
+        ("rows=[{width: wide}]", r"rows\[0\].width must be a number: 'wide' came"),
+        ("rows=1", "rows must be a list: 1 came"),
+        ("switch=1", "switch must be true or false: 1 came"),
+        ("rule.gama=1", "unexpected keyword argument 'gama'"),
+        ("selection._target_=ep2sindy.BestSubset", "selection must name a _target_ that is a Sele"),
+        ("later=1", "later must name a _target_: 1 came"),
+        ("search.max_terms=0", "max_terms must be at least 1: 0 came"),
+        ("depth=0", "depth must be a whole number, one or more: 0 came"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_by_its_place(change: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        study_of(Toy, config(change))
+
+
+def test_a_key_that_is_missing_is_named() -> None:
+    without = config()
+    del without["share"]
+    with pytest.raises(ValueError, match="the config of this experiment must have 'share'"):
+        study_of(Toy, without)
+
+
+def test_what_is_built_later_can_be_changed_by_place() -> None:
+    point = {"voltage": 300.0, "mass_flow_mg_s": 5.0}
+    node = OmegaConf.create({"_target_": "ep2sindy.OperatingPoint", **point})
+    later = deferred(node, "data")
+    changed = later.changed({"voltage": 200.0}, {"neutral_speed": 190.0})
+    assert changed.build().voltage == 200.0
+    assert changed.build().neutral_speed == 190.0
+    assert later.build().voltage == 300.0
+    assert str(changed) != str(later)
+    with pytest.raises(ValueError, match="data.volts must be there to be changed: it is not"):
+        later.changed({"volts": 1.0})
+
+
+def test_only_groups_that_a_study_uses_may_be_set() -> None:
+    check_overrides(["search=stlsq", "n=1"], used=keys_of(Toy), experiment="toy")
+    for unused in ("parallel=serial", "+data.path=x", "trajectory.zone.z=[0,1]", "prepare=[]"):
+        with pytest.raises(ValueError, match="would do nothing: toy does not use"):
+            check_overrides([unused], used=keys_of(Toy), experiment="toy")
+
+
+def test_studies_are_found_by_name() -> None:
+    assert "libraries" in known_studies()
+    assert study_class("libraries").__name__ == "Study"
+    with pytest.raises(ValueError, match=r"study must name a module .* 'librarys' came"):
+        study_class("librarys")
+    with pytest.raises(ValueError, match="'ep2sindy.studies.kinds' came"):
+        study_class("ep2sindy.studies.kinds")
+
+
+def test_runs_are_compared_by_plain_settings() -> None:
+    settings: Any = OmegaConf.to_container(config(), resolve=True)
+    found = hparams_of(settings, keys_of(Toy))
+    assert found["n"] == 3
+    assert found["names"] == "['a', 'b']"
+    assert found["search"] == "_target_=ep2sindy.BestSubset"
+    assert "many" not in found
+
+
+@pytest.mark.parametrize("value", [True, -1, "a"])
+def test_a_seed_must_be_a_number(value: object, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="seed must be a whole number, zero or more"):
+        run_config(OmegaConf.create({"seed": value, "experiment": "toy", "study": "libraries"}))
+
+
+def test_a_value_of_two_kinds_is_taken_as_the_first_that_fits() -> None:
+    assert value_of(int | str, 3, "x") == 3
+    assert value_of(int | str, "a", "x") == "a"
+    assert value_of(float | None, None, "x") is None
+
+
+def test_a_package_without_its_configs_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(program, "PACKAGE", tmp_path / "ep2sindy")
+    with pytest.raises(OSError, match=r"configs must lie in one of .* install the package again"):
+        program.conf_folder()
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_configs_below_the_folder_one_stands_in_are_found(
+    named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "conf").mkdir()
+    monkeypatch.chdir(tmp_path)
+    given = ["--config-dir", "elsewhere", "+exp=mine"] if named else ["+exp=mine"]
+    monkeypatch.setattr(sys, "argv", ["ep2sindy", *given])
+    program.add_own_configs(ROOT / "conf")
+    own = ["--config-dir", str(tmp_path / "conf"), "+exp=mine"]
+    assert sys.argv[1:] == (given if named else own)
+
+
+def records(folder: Path) -> None:
+    done = {"job": 0, "overrides": ["+exp=toy", "seed=1"], "status": "done"}
+    done |= {"folder": "outputs/toy/1", "headline": {"r2": 0.5}}
+    failed = {"job": 1, "overrides": ["+exp=toy", "seed=-1"], "status": "failed", "error": "no"}
+    for record in (failed, done):
+        path = folder / "jobs" / f"{record['job']}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(record))
+
+
+def test_an_index_has_every_job_in_order(tmp_path: Path) -> None:
+    records(tmp_path)
+    write_index(tmp_path)
+    index = pd.read_csv(tmp_path / "index.csv", keep_default_na=False)
+    assert list(index.columns) == ["job", "overrides", "status", "r2", "folder", "error"]
+    assert index["status"].tolist() == ["done", "failed"]
+    assert index["error"].tolist() == ["", "no"]
+    text = index_text(tmp_path)
+    assert "sweep of 2 jobs" in text
+    assert "seed=-1" in text
+    assert "+exp=toy" not in text  # what all jobs share is left out
+    assert text.endswith("index.csv")
+
+
+def run_program(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ep2sindy.app.main", *overrides],
+        cwd=cwd,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_sweep_goes_on_after_a_failed_job_and_says_so(tmp_path: Path) -> None:
+    """Three jobs that end early, each for its own reason: no job ends another."""
+    (tmp_path / "conf" / "exp").mkdir(parents=True)
+    own = "# @package _global_\ndefaults: [discover]\nexperiment: mine\n"
+    (tmp_path / "conf" / "exp" / "mine.yaml").write_text(own)
+    result = run_program(
+        "-m", "+exp=mine", "data=file", "data.path=none.nc", "trajectory.states=[x,y]",
+        "seed=-1,2", cwd=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 1
+    for text in ("job 0: ", "job 1: ", "sweep of 2 jobs", "seed must be a whole number"):
+        assert text in result.stdout
+    (path,) = tmp_path.glob("outputs/multirun/*/index.csv")
+    errors = pd.read_csv(path)["error"].tolist()
+    assert errors[0] == "seed must be a whole number, zero or more: -1 came"
+    assert errors[1].startswith("no such file: ")
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([], "error: choose an experiment with +exp=NAME; there are benchmark, breathing"),
+        (["+exp=breathing", "sede=1"], "Could not override 'sede'"),
+        (["+exp=breathing", "--config-dir", "nowhere"], "nowhere"),
+        (["+exp=breathing", "output=/proc/none"], "choose another with output=PATH"),
+    ],
+)
+def test_mistakes_end_in_one_clear_message(
+    overrides: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ep2sindy", *overrides])
+    with pytest.raises(SystemExit) as ended:
+        program.main()
+    assert message in str(ended.value)
+    assert str(ended.value).startswith("error: ")
