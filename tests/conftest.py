@@ -3,7 +3,10 @@
 import pkgutil
 from pathlib import Path
 
+import pytest
 from jaxtyping import install_import_hook
+
+from tests.warm import compile_kernels
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 # Compiled by numba, which cannot look inside a checking wrapper.
@@ -18,3 +21,9 @@ def checked_modules() -> list[str]:
 
 
 install_import_hook(checked_modules(), "beartype.beartype")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Before workers start; a run of one process compiles as it goes."""
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        compile_kernels()

@@ -66,9 +66,10 @@ class Recipe:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")
 
     def searched(
-        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> list[SearchedEquation]:
         """Assemble the rows, search every bootstrap of them, and fit what is found."""
+        rng = np.random.default_rng(rng)
         equations = []
         for problem in self.formulation.assemble(runs, library, rng=rng):
             draws = resamples(problem, self.bootstraps, rng=rng)
@@ -87,9 +88,10 @@ class Recipe:
         return scores, [selected(*pair) for pair in zip(fronts, scores, strict=True)]
 
     def find(
-        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
         """The supports alone: what a benchmark counts."""
+        rng = np.random.default_rng(rng)
         fronts = [equation.front for equation in self.searched(runs, library, rng=rng)]
         _, chosen = self.choice(fronts)
         return Finding(

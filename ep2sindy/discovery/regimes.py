@@ -75,7 +75,7 @@ class Regimes:
 def regimes(
     result: xr.Dataset,
     *,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     max_regimes: int = 8,
     least: float = 0.1,
     resolution: float = 0.2,
@@ -87,6 +87,7 @@ def regimes(
     max_regimes: where as many come out, the points may bear more.
     Raises ValueError where no point has equations, or no bootstraps stand behind them.
     """
+    rng = np.random.default_rng(rng)
     if not result.sizes["draw"]:
         raise ValueError("a regime's confidence needs bootstraps: the study made none; ask for 32")
     space = [axis for axis in SPACE if axis in result["weight"].dims]
@@ -129,7 +130,7 @@ def group_points(
     weights: Float[np.ndarray, "points features"],
     draws: Float[np.ndarray, "draws points features"],
     *,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     max_regimes: int = 8,
     least: float = 0.1,
     resolution: float = 0.2,
@@ -142,6 +143,7 @@ def group_points(
     between two regimes.
     Raises ValueError unless max_regimes is one or more, least and resolution above 0.
     """
+    rng = np.random.default_rng(rng)
     if max_regimes < 1 or not least > 0.0 or not resolution > 0.0:
         raise ValueError(
             "grouping needs max_regimes of 1 or more, least and resolution above 0: "

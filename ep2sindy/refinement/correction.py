@@ -87,7 +87,7 @@ def refine_with_correction(
     constraint: Constraint | None = None,
     free_start: bool = True,
     n_reweights: int = 0,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
 ) -> Corrected:
@@ -105,6 +105,7 @@ def refine_with_correction(
     result: see `status`.
     Source: Rackauckas et al. 2020, arXiv:2001.04385.
     """
+    rng = np.random.default_rng(rng)
     batch = cut_windows(
         trajectories,
         states=model.states,

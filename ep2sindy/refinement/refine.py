@@ -70,7 +70,7 @@ def refine(
     constraint: Constraint | None = None,
     free_start: bool = True,
     n_reweights: int = 1,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
 ) -> Refinement:
@@ -83,6 +83,7 @@ def refine(
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
     terms or a constraint that leaves out one of them. A failed fit is a result: see `status`.
     """
+    rng = np.random.default_rng(rng)
     (found,) = refine_many(
         [model],
         [trajectories],
@@ -110,7 +111,7 @@ def refine_many(
     free_start: bool = True,
     n_reweights: int = 1,
     points_per_batch: int = 8,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
 ) -> list[Refinement]:
@@ -121,6 +122,7 @@ def refine_many(
     Models may differ in their terms; those of a batch all cost what the largest does.
     Raises ValueError if the models differ in their variables or the windows in their number.
     """
+    rng = np.random.default_rng(rng)
     found: list[Refinement] = []
     for first in range(0, len(models), points_per_batch):
         chunk = models[first : first + points_per_batch]
@@ -158,9 +160,10 @@ def loss_against_window(
     constraint: Constraint | None = None,
     free_start: bool = True,
     n_reweights: int = 1,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
 ) -> dict[int, Refinement]:
     """Refine once per window length; the loss of each says where the model ceases to follow."""
+    rng = np.random.default_rng(rng)
     return {
         window: refine(
             model,

@@ -64,13 +64,14 @@ def cut_windows(
     inputs: Sequence[str],
     n_windows: int,
     window: int,
-    rng: np.random.Generator,
+    rng: np.random.Generator | int,
 ) -> WindowBatch:
     """Cut `n_windows` windows of `window` samples, fewer where there are not that many places.
 
     Raises ValueError for no trajectory, a window that no trajectory can hold or of under five
     samples, or a missing variable.
     """
+    rng = np.random.default_rng(rng)
     _check(trajectories, n_windows, window)
     values = [trajectory.columns([*states, *inputs]) for trajectory in trajectories]
     joined = np.concatenate(values)

@@ -70,8 +70,9 @@ class RegionField:
         """(z, r): whether a point is away from the transitions."""
         return self.share.max("region") > INSIDE
 
-    def noisy(self, noise: float, *, rng: np.random.Generator) -> RegionField:
+    def noisy(self, noise: float, *, rng: np.random.Generator | int) -> RegionField:
         """The same with white noise of `noise` times the RMS of each variable at each point."""
+        rng = np.random.default_rng(rng)
         if noise < 0.0:
             raise ValueError(f"noise must be zero or more: {noise} came")
         field = self.field.map(_with_noise, keep_attrs=True, args=(noise, rng))

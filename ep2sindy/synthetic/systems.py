@@ -32,7 +32,7 @@ class System:
         *,
         initial: Float[np.ndarray, " n_states"] | None = None,
         noise: float = 0.0,
-        rng: np.random.Generator | None = None,
+        rng: np.random.Generator | int | None = None,
     ) -> Trajectory:
         """Integrate to 1e-10 and add white noise of `noise` times each state's RMS.
 
@@ -55,8 +55,9 @@ class System:
         )
         states = solution.y.T
         if rng is not None:
+            generator = np.random.default_rng(rng)
             rms = np.sqrt(np.square(states).mean(axis=0))
-            states = states + noise * rms * rng.standard_normal(states.shape)
+            states = states + noise * rms * generator.standard_normal(states.shape)
         return Trajectory(t=t, states=states, state_names=self.model.states, label=self.name)
 
 

@@ -1,0 +1,37 @@
+"""Compile every kernel once, before test workers start: each would compile all of them again."""
+
+import subprocess
+import sys
+
+import numpy as np
+
+import ep2sindy as ep
+
+
+def search() -> None:
+    """Kernels of the smoother, the rows and the searches."""
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=np.random.default_rng(0))
+    ep.discover(run)
+    for method in (ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset()):
+        ep.discover(run, recipe=ep.Recipe(ep.Differential(), method, ep.Bootstraps(n=2), ep.Knee()))
+
+
+def simulation() -> None:
+    """Kernels of the simulator and of the refinement."""
+    settings = {"duration_s": 2e-5, "warm_up_s": 0.0, "sample_s": 1e-6, "n_cells": 20}
+    ep.simulate(ep.Thruster(), ep.OperatingPoint(300.0, 5.0), progress=False, **settings)
+    system = ep.lotka_volterra()
+    ep.refine(system.model, [system.trajectory()], window=20, n_windows=2, rng=0)
+
+
+def compile_kernels() -> None:
+    """Both at once: there are two cores."""
+    parts = [
+        subprocess.Popen([sys.executable, "-m", "tests.warm", n]) for n in ("search", "simulation")
+    ]
+    for part in parts:
+        part.wait()  # one that fails fails again in its test, which then says why
+
+
+if __name__ == "__main__":
+    {"search": search, "simulation": simulation}[sys.argv[1]]()
