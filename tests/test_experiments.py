@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from hydra.utils import instantiate
@@ -14,12 +13,11 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from ep2sindy.constraints.relations import constraint
-from ep2sindy.data.open import write_field
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.problem import Iteration
-from experiments import constrained, frontier, ils, libraries, weak, weak_windows
+from experiments import frontier, ils, libraries, weak, weak_windows
 from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
@@ -30,44 +28,6 @@ EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         return compose("config", overrides=list(overrides))
-
-
-@pytest.fixture(scope="module")
-def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""
-    a, b, c = 1.64e5, 4.66e-14, 4.39e4
-    dt_s, n_samples = 1.5e-6, 1200
-    states = np.empty((n_samples, 2))
-    states[0] = x = np.array([5e17, 4e18])
-
-    def slope(x: np.ndarray) -> np.ndarray:
-        burn = b * x[0] * x[1]
-        return np.array([burn - a * x[0], c * x[1] - burn])
-
-    for k in range(1, n_samples):
-        for _ in range(4):  # classical Runge-Kutta, a quarter of a sample per step
-            h = dt_s / 4
-            k1 = slope(x)
-            k2 = slope(x + h / 2 * k1)
-            k3 = slope(x + h / 2 * k2)
-            k4 = slope(x + h * k3)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        states[k] = x
-    profile = np.ones((1, 5))
-    time = dt_s * np.arange(n_samples)
-    data = {
-        "n_i": (states[:, :1] * profile, "m^-3"),
-        "n_n": (states[:, 1:] * profile, "m^-3"),
-        "R_ion": (4e-14 * (1 + 0.3 * np.sin(9e4 * time))[:, None] * profile, "m^3/s"),
-        "u_iz": (5e3 * (1 + 0.2 * np.sin(7e4 * time))[:, None] * profile, "m/s"),
-    }
-    field = xr.Dataset(
-        {name: (("time", "z"), v, {"units": unit}) for name, (v, unit) in data.items()},
-        coords={"time": time, "z": np.linspace(0.012, 0.028, 5)},
-    )
-    path = tmp_path_factory.mktemp("data") / "predator_prey.nc"
-    write_field(field, path)
-    return path
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -602,58 +562,6 @@ def test_ils_settings_that_cannot_work_are_refused(
         ils.run(config)
     assert message in str(innermost(caught.value))
     assert not list(tmp_path.glob("ils/*/models"))
-
-
-def constrained_on(path: Path, output: Path) -> list[str]:
-    """Overrides that run `+exp=constrained` on a file."""
-    return [
-        "+exp=constrained",
-        "data=file",
-        f"data.path={path}",
-        "data.variables.R_ion.name=R_ion",
-        "data.variables.u_iz.name=u_iz",
-        f"output={output}",
-    ]
-
-
-def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:
-    config = composed(*constrained_on(predator_prey, tmp_path), "~models.ionization")
-    folder = constrained.run(config)
-    models = summary_of(folder)["models"]
-    assert list(models) == ["predator_prey", "velocity"]
-    for name, model in models.items():
-        shared = "n_i*n_n" if name == "predator_prey" else "n_i*n_n*R_ion"
-        pairs = {kind: found["equations"] for kind, found in model.items()}
-        assert set(pairs) == {"base", "constrained"}
-        assert pairs["constrained"]["n_i"][shared] == -pairs["constrained"]["n_n"][shared]
-        assert pairs["base"]["n_i"][shared] != -pairs["base"]["n_n"][shared]
-        assert all(set(found) >= JUDGED for found in model.values())
-    exact = models["predator_prey"]["constrained"]
-    for state, terms in EXACT.items():
-        # As in the test of breathing.
-        assert exact["equations"][state] == pytest.approx(terms, rel=0.02)
-    assert "figures/trajectories.png" in (folder / "report.html").read_text()
-    assert len(pd.read_csv(folder / "tables" / "methods.csv")) == 8
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["models=null"], "models must be like {name: {terms: {x: [x, x*y]}, relations: [..]}}"),
-        (["~models.velocity.relations"], "models.velocity must have terms and relations"),
-        (["models.velocity.relations=null"], "models.velocity.relations must be a list"),
-        (["~models.velocity.terms.n_i"], "models.velocity.terms must list the terms"),
-        (["models.velocity.relations=['n_i: 2']"], "joined by one '=='"),
-        (["held_out=yes"], "held_out must be a number between 0 and 1"),
-    ],
-)
-def test_constrained_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*constrained_on(predator_prey, tmp_path), *overrides)
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
-        constrained.run(config)
-    assert message in str(caught.value)
 
 
 def test_a_sweep_can_go_to_slurm() -> None:
