@@ -12,12 +12,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.problem import Iteration
-from experiments import frontier, ils, libraries, weak, weak_windows
+from experiments import frontier, libraries, weak, weak_windows
 from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
@@ -445,123 +443,6 @@ def test_frontier_settings_that_cannot_work_are_refused(
     with pytest.raises((ValueError, HydraException)) as caught:
         frontier.run(config)
     assert message in str(innermost(caught.value))
-
-
-EXACT = {
-    "n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14},
-    "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14},
-}
-JUDGED = {
-    "text", "f_kHz", "f_error", "nrmse", "amplitude_ratio", "status", "ci95", "cpu_s",
-}  # fmt: skip
-
-
-def ils_on(path: Path, output: Path) -> list[str]:
-    """Overrides that run `+exp=ils` on a file, at toy size."""
-    return [
-        "+exp=ils",
-        "data=file",
-        f"data.path={path}",
-        f"output={output}",
-        "n_windows=8",
-        "windows=[60]",
-        "weak.test_functions.n_windows=500",
-        "weak.test_functions.n_points=50",
-    ]
-
-
-def test_integral_least_squares_returns_predator_and_prey(
-    predator_prey: Path, tmp_path: Path
-) -> None:
-    folder = ils.run(composed(*ils_on(predator_prey, tmp_path)))
-    summary = summary_of(folder)
-    methods = summary["methods"]
-    assert list(methods) == ["base", "weak", "constrained", "ils", "ils_constrained"]
-    for name, found in methods.items():
-        assert set(found) >= JUDGED
-        # As in the test of breathing; a refinement has the error of one Runge-Kutta step alone,
-        # (omega dt)^4 / 120 = 3e-6 for a sine, and the wave has harmonics.
-        refined = name.startswith("ils")
-        for state, terms in EXACT.items():
-            rel = 1e-4 if refined else 0.02
-            assert found["equations"][state] == pytest.approx(terms, rel=rel)
-        assert (found["status"], found["ci95"] is None) == (
-            ("converged", False) if refined else (None, True)
-        )
-        # Of a Hann window on some four periods: 1 % of a bin at most.
-        assert found["f_error"] == pytest.approx(0.0, abs=0.02 if not refined else 1e-3)
-        assert found["amplitude_ratio"] == pytest.approx(1.0, abs=0.1 if not refined else 1e-3)
-        assert (folder / "models" / f"{name}.json").is_file()
-    for name in ("constrained", "ils_constrained"):
-        equations = methods[name]["equations"]
-        assert equations["n_i"]["n_i*n_n"] == -equations["n_n"]["n_i*n_n"]
-    low, high = methods["ils"]["ci95"]["n_i"]["n_i"]
-    assert low <= methods["ils"]["equations"]["n_i"]["n_i"] <= high
-    swept = summary["loss_against_window"]
-    assert [row["method"] for row in swept] == ["ils", "ils_constrained"]
-    assert [row["window"] for row in swept] == [60, 60]
-    assert all(row["loss"] < 1e-6 for row in swept)
-    page = (folder / "report.html").read_text()
-    for name in ("trajectories", "phase", "spectra", "loss_against_window"):
-        assert f"figures/{name}.png" in page
-        assert (folder / "figures" / f"{name}.png").is_file()
-
-
-class Recorder:
-    """Keeps what would go to TensorBoard."""
-
-    def __init__(self) -> None:
-        self.steps: list[tuple[int, dict[str, float]]] = []
-
-    def write(self, scalars: dict[str, float], *, step: int) -> None:
-        self.steps.append((step, scalars))
-
-
-def test_every_iteration_is_told_one_scalar_each() -> None:
-    library = polynomial(["x", "y"], degree=2)
-    relations = constraint(
-        library, {"x": ["x", "x*y"], "y": ["y", "x*y"]}, ["x: x*y == -1 * y: x*y"]
-    )
-    recorder = Recorder()
-    watch = ils.Watcher(recorder, {"ils": relations})
-    for loss in (0.5, 0.25):
-        watch("ils", Iteration(0, 25, loss, np.array([1.0, 2.0, 3.0]), 0.1, 1e-9))
-    assert [step for step, _ in recorder.steps] == [0, 1]
-    assert recorder.steps[1][1] == {
-        "ils/loss": 0.25,
-        "ils/step": 0.1,
-        "ils/defect": 1e-9,
-        "ils/window_stage": 25,
-        "ils/scaling/x/x": 1.0,
-        "ils/scaling/x/x.y": 2.0,
-        "ils/scaling/y/y": 3.0,
-    }
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["held_out=1.5"], "held_out must be a number between 0 and 1: 1.5 came"),
-        (["held_out=0.001"], "held_out=0.001 must leave 20 samples on either side"),
-        (["window=0"], "window must be a whole number, one or more: 0 came"),
-        (["window=901"], "window must hold 5 samples or more and fit the first part"),
-        (["windows=[3]"], "windows must hold 5 samples or more and fit the first part"),
-        (["windows=60"], "windows must be a list such as [a,b]"),
-        (["relations=[]"], "relations must be a list of relations, such as"),
-        (["relations=['n_i: n_n == 1']"], "'n_n' is not in the support of 'n_i'"),
-        (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
-        (["+figures.colour=1"], "figures must have duration_s and f_max_Hz"),
-        (["+n_points=3"], "unknown keys ['n_points']"),
-    ],
-)
-def test_ils_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*ils_on(predator_prey, tmp_path), *overrides)
-    with pytest.raises((ValueError, HydraException)) as caught:
-        ils.run(config)
-    assert message in str(innermost(caught.value))
-    assert not list(tmp_path.glob("ils/*/models"))
 
 
 def test_a_sweep_can_go_to_slurm() -> None:
