@@ -6,20 +6,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ep2sindy.constraints.relations import constraint
-from ep2sindy.data.open import write_field
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.problem import Iteration
-from experiments import constrained, frontier, ils, libraries, weak, weak_windows
+from experiments import frontier, libraries, weak, weak_windows
 from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
@@ -30,44 +26,6 @@ EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         return compose("config", overrides=list(overrides))
-
-
-@pytest.fixture(scope="module")
-def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""
-    a, b, c = 1.64e5, 4.66e-14, 4.39e4
-    dt_s, n_samples = 1.5e-6, 1200
-    states = np.empty((n_samples, 2))
-    states[0] = x = np.array([5e17, 4e18])
-
-    def slope(x: np.ndarray) -> np.ndarray:
-        burn = b * x[0] * x[1]
-        return np.array([burn - a * x[0], c * x[1] - burn])
-
-    for k in range(1, n_samples):
-        for _ in range(4):  # classical Runge-Kutta, a quarter of a sample per step
-            h = dt_s / 4
-            k1 = slope(x)
-            k2 = slope(x + h / 2 * k1)
-            k3 = slope(x + h / 2 * k2)
-            k4 = slope(x + h * k3)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        states[k] = x
-    profile = np.ones((1, 5))
-    time = dt_s * np.arange(n_samples)
-    data = {
-        "n_i": (states[:, :1] * profile, "m^-3"),
-        "n_n": (states[:, 1:] * profile, "m^-3"),
-        "R_ion": (4e-14 * (1 + 0.3 * np.sin(9e4 * time))[:, None] * profile, "m^3/s"),
-        "u_iz": (5e3 * (1 + 0.2 * np.sin(7e4 * time))[:, None] * profile, "m/s"),
-    }
-    field = xr.Dataset(
-        {name: (("time", "z"), v, {"units": unit}) for name, (v, unit) in data.items()},
-        coords={"time": time, "z": np.linspace(0.012, 0.028, 5)},
-    )
-    path = tmp_path_factory.mktemp("data") / "predator_prey.nc"
-    write_field(field, path)
-    return path
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -485,175 +443,6 @@ def test_frontier_settings_that_cannot_work_are_refused(
     with pytest.raises((ValueError, HydraException)) as caught:
         frontier.run(config)
     assert message in str(innermost(caught.value))
-
-
-EXACT = {
-    "n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14},
-    "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14},
-}
-JUDGED = {
-    "text", "f_kHz", "f_error", "nrmse", "amplitude_ratio", "status", "ci95", "cpu_s",
-}  # fmt: skip
-
-
-def ils_on(path: Path, output: Path) -> list[str]:
-    """Overrides that run `+exp=ils` on a file, at toy size."""
-    return [
-        "+exp=ils",
-        "data=file",
-        f"data.path={path}",
-        f"output={output}",
-        "n_windows=8",
-        "windows=[60]",
-        "weak.test_functions.n_windows=500",
-        "weak.test_functions.n_points=50",
-    ]
-
-
-def test_integral_least_squares_returns_predator_and_prey(
-    predator_prey: Path, tmp_path: Path
-) -> None:
-    folder = ils.run(composed(*ils_on(predator_prey, tmp_path)))
-    summary = summary_of(folder)
-    methods = summary["methods"]
-    assert list(methods) == ["base", "weak", "constrained", "ils", "ils_constrained"]
-    for name, found in methods.items():
-        assert set(found) >= JUDGED
-        # As in the test of breathing; a refinement has the error of one Runge-Kutta step alone,
-        # (omega dt)^4 / 120 = 3e-6 for a sine, and the wave has harmonics.
-        refined = name.startswith("ils")
-        for state, terms in EXACT.items():
-            rel = 1e-4 if refined else 0.02
-            assert found["equations"][state] == pytest.approx(terms, rel=rel)
-        assert (found["status"], found["ci95"] is None) == (
-            ("converged", False) if refined else (None, True)
-        )
-        # Of a Hann window on some four periods: 1 % of a bin at most.
-        assert found["f_error"] == pytest.approx(0.0, abs=0.02 if not refined else 1e-3)
-        assert found["amplitude_ratio"] == pytest.approx(1.0, abs=0.1 if not refined else 1e-3)
-        assert (folder / "models" / f"{name}.json").is_file()
-    for name in ("constrained", "ils_constrained"):
-        equations = methods[name]["equations"]
-        assert equations["n_i"]["n_i*n_n"] == -equations["n_n"]["n_i*n_n"]
-    low, high = methods["ils"]["ci95"]["n_i"]["n_i"]
-    assert low <= methods["ils"]["equations"]["n_i"]["n_i"] <= high
-    swept = summary["loss_against_window"]
-    assert [row["method"] for row in swept] == ["ils", "ils_constrained"]
-    assert [row["window"] for row in swept] == [60, 60]
-    assert all(row["loss"] < 1e-6 for row in swept)
-    page = (folder / "report.html").read_text()
-    for name in ("trajectories", "phase", "spectra", "loss_against_window"):
-        assert f"figures/{name}.png" in page
-        assert (folder / "figures" / f"{name}.png").is_file()
-
-
-class Recorder:
-    """Keeps what would go to TensorBoard."""
-
-    def __init__(self) -> None:
-        self.steps: list[tuple[int, dict[str, float]]] = []
-
-    def write(self, scalars: dict[str, float], *, step: int) -> None:
-        self.steps.append((step, scalars))
-
-
-def test_every_iteration_is_told_one_scalar_each() -> None:
-    library = polynomial(["x", "y"], degree=2)
-    relations = constraint(
-        library, {"x": ["x", "x*y"], "y": ["y", "x*y"]}, ["x: x*y == -1 * y: x*y"]
-    )
-    recorder = Recorder()
-    watch = ils.Watcher(recorder, {"ils": relations})
-    for loss in (0.5, 0.25):
-        watch("ils", Iteration(0, 25, loss, np.array([1.0, 2.0, 3.0]), 0.1, 1e-9))
-    assert [step for step, _ in recorder.steps] == [0, 1]
-    assert recorder.steps[1][1] == {
-        "ils/loss": 0.25,
-        "ils/step": 0.1,
-        "ils/defect": 1e-9,
-        "ils/window_stage": 25,
-        "ils/scaling/x/x": 1.0,
-        "ils/scaling/x/x.y": 2.0,
-        "ils/scaling/y/y": 3.0,
-    }
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["held_out=1.5"], "held_out must be a number between 0 and 1: 1.5 came"),
-        (["held_out=0.001"], "held_out=0.001 must leave 20 samples on either side"),
-        (["window=0"], "window must be a whole number, one or more: 0 came"),
-        (["window=901"], "window must hold 5 samples or more and fit the first part"),
-        (["windows=[3]"], "windows must hold 5 samples or more and fit the first part"),
-        (["windows=60"], "windows must be a list such as [a,b]"),
-        (["relations=[]"], "relations must be a list of relations, such as"),
-        (["relations=['n_i: n_n == 1']"], "'n_n' is not in the support of 'n_i'"),
-        (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
-        (["+figures.colour=1"], "figures must have duration_s and f_max_Hz"),
-        (["+n_points=3"], "unknown keys ['n_points']"),
-    ],
-)
-def test_ils_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*ils_on(predator_prey, tmp_path), *overrides)
-    with pytest.raises((ValueError, HydraException)) as caught:
-        ils.run(config)
-    assert message in str(innermost(caught.value))
-    assert not list(tmp_path.glob("ils/*/models"))
-
-
-def constrained_on(path: Path, output: Path) -> list[str]:
-    """Overrides that run `+exp=constrained` on a file."""
-    return [
-        "+exp=constrained",
-        "data=file",
-        f"data.path={path}",
-        "data.variables.R_ion.name=R_ion",
-        "data.variables.u_iz.name=u_iz",
-        f"output={output}",
-    ]
-
-
-def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:
-    config = composed(*constrained_on(predator_prey, tmp_path), "~models.ionization")
-    folder = constrained.run(config)
-    models = summary_of(folder)["models"]
-    assert list(models) == ["predator_prey", "velocity"]
-    for name, model in models.items():
-        shared = "n_i*n_n" if name == "predator_prey" else "n_i*n_n*R_ion"
-        pairs = {kind: found["equations"] for kind, found in model.items()}
-        assert set(pairs) == {"base", "constrained"}
-        assert pairs["constrained"]["n_i"][shared] == -pairs["constrained"]["n_n"][shared]
-        assert pairs["base"]["n_i"][shared] != -pairs["base"]["n_n"][shared]
-        assert all(set(found) >= JUDGED for found in model.values())
-    exact = models["predator_prey"]["constrained"]
-    for state, terms in EXACT.items():
-        # As in the test of breathing.
-        assert exact["equations"][state] == pytest.approx(terms, rel=0.02)
-    assert "figures/trajectories.png" in (folder / "report.html").read_text()
-    assert len(pd.read_csv(folder / "tables" / "methods.csv")) == 8
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["models=null"], "models must be like {name: {terms: {x: [x, x*y]}, relations: [..]}}"),
-        (["~models.velocity.relations"], "models.velocity must have terms and relations"),
-        (["models.velocity.relations=null"], "models.velocity.relations must be a list"),
-        (["~models.velocity.terms.n_i"], "models.velocity.terms must list the terms"),
-        (["models.velocity.relations=['n_i: 2']"], "joined by one '=='"),
-        (["held_out=yes"], "held_out must be a number between 0 and 1"),
-    ],
-)
-def test_constrained_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*constrained_on(predator_prey, tmp_path), *overrides)
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
-        constrained.run(config)
-    assert message in str(caught.value)
 
 
 def test_a_sweep_can_go_to_slurm() -> None:

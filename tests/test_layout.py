@@ -29,7 +29,7 @@ ROOMS = [
 ]
 # What takes a second to import, and the modules that may load it, by themselves or through others.
 HEAVY = {
-    "torch": ("refinement", "selection.refined", "studies.held_out", "studies.parametric"),
+    "torch": ("refinement", "selection.refined", "studies.parametric"),
     "hydra": ("app",),
     "omegaconf": ("app",),
     "matplotlib": ("figures", "report", "studies", "app"),

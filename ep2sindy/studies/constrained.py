@@ -1,0 +1,76 @@
+"""Relations between the coefficients of equations, beside none: `+exp=constrained`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from ep2sindy.constraints.relations import Constraint, constraint
+from ep2sindy.library.library import Library
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.report.run import Run
+from ep2sindy.studies.held_out import first_and_last, fit_and_judge
+from ep2sindy.studies.held_out_view import Outcome, judged_summary
+from ep2sindy.studies.kinds import Kind, Share
+from ep2sindy.studies.known_terms import Relations, Terms, terms_of
+from ep2sindy.studies.shown import Shown
+from ep2sindy.studies.source import Source
+
+KINDS = ("base", "constrained")
+
+
+@dataclass(frozen=True)
+class ModelCase:
+    """The terms of every state, and relations between their coefficients."""
+
+    terms: Terms
+    relations: Relations
+
+    def constraints(self, name: str, states: Sequence[str]) -> tuple[Library, list[Constraint]]:
+        """A library of the terms, and the constraint of either kind of fit."""
+        library, terms = terms_of(self.terms, states=states, key=f"models.{name}.terms")
+        return library, [constraint(library, terms, given) for given in ((), self.relations)]
+
+
+Models = Annotated[
+    Mapping[str, ModelCase],
+    Kind(
+        "like {name: {terms: {x: [x, x*y]}, relations: [..]}}",
+        lambda value: isinstance(value, dict) and bool(value),
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Fit every model with and without its relations, and judge it on the end of the record."""
+
+    source: Source
+    formulation: Formulation
+    models: Models
+    held_out: Share
+    figures: Shown
+
+    def compute(self, run: Run) -> Outcome:
+        models = {n: case.constraints(n, self.source.states) for n, case in self.models.items()}
+        libraries = [library for library, _ in models.values()]
+        data = self.source.sampled(self.source.field(), libraries, run)
+        train, held = first_and_last(data, self.held_out)
+        judged, labels, findings = {}, {}, {}
+        streams = np.random.default_rng(run.seed).spawn(len(models))
+        for (name, (library, constraints)), stream in zip(models.items(), streams, strict=True):
+            # Both draw the same: what differs between them is then the constraint alone.
+            seed = int(stream.integers(2**63))
+            for kind, each in zip(KINDS, constraints, strict=True):
+                rng = np.random.default_rng(seed)
+                fit = fit_and_judge(train, held, library, each, self.formulation, rng=rng)
+                judged[f"{name}_{kind}"] = fit
+                labels[f"{name}_{kind}"] = f"{name.replace('_', ' ')}, {kind}"
+            findings[name] = {kind: judged_summary(judged[f"{name}_{kind}"]) for kind in KINDS}
+        relations = dict.fromkeys(text for case in self.models.values() for text in case.relations)
+        return Outcome(
+            train, held, judged, labels, list(relations), self.figures, {"models": findings}
+        )

@@ -1,0 +1,199 @@
+"""Integral least squares beside base, weak and constrained models: `+exp=ils`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from time import process_time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.constraints.relations import Constraint, constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.windows import MIN_SAMPLES
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.report.document import Captioned
+from ep2sindy.report.run import Run
+from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.held_out import Judged, first_and_last, fit_and_judge, judge
+from ep2sindy.studies.held_out_view import COMPARED, Outcome, judged_summary, run_summary
+from ep2sindy.studies.kinds import Count, Counts, Share
+from ep2sindy.studies.known_terms import Relations, Terms, terms_of
+from ep2sindy.studies.shown import Shown
+from ep2sindy.studies.source import Source
+
+if TYPE_CHECKING:
+    from ep2sindy.refinement.problem import Iteration
+
+LABELS = {
+    "base": "base",
+    "weak": "weak",
+    "constrained": "constrained",
+    "ils": "ILS",
+    "ils_constrained": "ILS, constrained",
+}
+CAPTION = (
+    "Refinement with windows of several lengths: loss on the fitted part, where each window has a "
+    "start of its own; frequency error and nrmse on held-out time, from its first sample (full) "
+    "and from a fitted start (dashed). The dotted line marks one period, the grey one 1 %."
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """Base, weak and constrained least squares, and refinements of base and constrained.
+
+    model: the terms of every state. relations: of the constrained fits. window: samples in each;
+    None takes one and a half periods. windows: lengths for loss against window length.
+    """
+
+    source: Source
+    formulation: Formulation
+    weak: Formulation
+    model: Terms
+    relations: Relations
+    held_out: Share
+    n_windows: Count
+    window: Count | None
+    windows: Counts
+    figures: Shown
+
+    def compute(self, run: Run) -> Outcome:
+        library, terms = terms_of(self.model, states=self.source.states)
+        free, tied = constraint(library, terms), constraint(library, terms, self.relations)
+        data = self.source.sampled(self.source.field(), [library], run)
+        train, held = first_and_last(data, self.held_out)
+        self._check_windows(train)
+        rng, sweep_rng = np.random.default_rng(run.seed).spawn(2)
+        streams = iter(rng.spawn(5))
+        fits = (
+            ("base", free, self.formulation),
+            ("weak", free, self.weak),
+            ("constrained", tied, self.formulation),
+        )
+        judged = {
+            name: fit_and_judge(train, held, library, each, form, rng=next(streams))
+            for name, each, form in fits
+        }
+        refined = {}
+        for name, start, each in (("ils", "base", free), ("ils_constrained", "constrained", tied)):
+            refined[name] = partial(self._refined, judged[start].model, each, train, held)
+            watch = watcher(run.board.scalars, name, each)
+            judged[name] = refined[name](self.window, rng=next(streams), watch=watch)
+        by_window = {
+            name: {window: again(window, rng=stream) for window in self.windows}
+            for (name, again), stream in zip(refined.items(), sweep_rng.spawn(2), strict=True)
+        }
+        return self._outcome(train, held, judged, by_window)
+
+    def _check_windows(self, train: Trajectory) -> None:
+        """Raise ValueError for windows that the fitted part of the data cannot hold."""
+        asked = {"window": [self.window or MIN_SAMPLES], "windows": self.windows}
+        for key, lengths in asked.items():
+            for length in lengths:
+                if not MIN_SAMPLES <= length <= train.n_samples:
+                    raise ValueError(
+                        f"{key} must hold {MIN_SAMPLES} samples or more and fit the first part of "
+                        f"the data, {train.n_samples} samples: {length} came"
+                    )
+
+    def _refined(
+        self,
+        start: SparseModel,
+        constraint: Constraint,
+        train: Trajectory,
+        held: Trajectory,
+        window: int | None,
+        *,
+        rng: np.random.Generator,
+        watch: Callable[[Iteration], None] | None = None,
+    ) -> Judged:
+        from ep2sindy.refinement.refine import refine  # PyTorch takes seconds to load
+
+        begun = process_time()
+        found = refine(
+            start,
+            [train],
+            n_windows=self.n_windows,
+            window=window,
+            constraint=constraint,
+            rng=rng,
+            callback=watch,
+        )
+        cpu_s = process_time() - begun
+        return judge(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
+
+    def _outcome(
+        self,
+        train: Trajectory,
+        held: Trajectory,
+        judged: Mapping[str, Judged],
+        by_window: Mapping[str, Mapping[int, Judged]],
+    ) -> Outcome:
+        period_s = 1.0 / dominant_frequency(train.t, train.states[:, 0])
+        windows = window_table(by_window, dt_s=train.dt_s, period_s=period_s)
+        labelled = windows.replace({"method": LABELS})
+        draw = partial(loss_against_window_figure, labelled, period=period_s / train.dt_s)
+        return Outcome(
+            train,
+            held,
+            judged,
+            LABELS,
+            self.relations,
+            self.figures,
+            findings={
+                "methods": {name: judged_summary(each) for name, each in judged.items()},
+                "loss_against_window": windows.to_dict("records"),
+            },
+            more_tables={"loss_against_window": windows},
+            more_figures={"loss_against_window": Captioned(draw, CAPTION)},
+        )
+
+
+def window_table(
+    by_window: Mapping[str, Mapping[int, Judged]], *, dt_s: float, period_s: float
+) -> pd.DataFrame:
+    """One row per method and window length; _started: from a fitted start."""
+    rows = []
+    for method, judgements in by_window.items():
+        for window, each in judgements.items():
+            row = {
+                "method": method,
+                "window": window,
+                "periods": (window - 1) * dt_s / period_s,
+                "loss": each.loss,
+                "status": each.status,
+                "text": each.model.text(),
+            }
+            for run, suffix in ((each.from_sample, ""), (each.from_fit, "_started")):
+                numbers = run_summary(run)
+                row |= {f"{key}{suffix}": numbers[key] for key in COMPARED}
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def watcher(
+    tell: Callable[..., None], method: str, constraint: Constraint
+) -> Callable[[Iteration], None]:
+    """What tells every iteration of a refinement, one scalar each, its number being the step."""
+    names = [constraint.coefficients[k] for k in constraint.free]
+    steps = count()
+
+    def watch(iteration: Iteration) -> None:
+        scalars = {
+            f"{method}/loss": iteration.loss,
+            f"{method}/step": iteration.step,
+            f"{method}/defect": iteration.defect,
+            f"{method}/window_stage": iteration.block,
+        }
+        for (state, term), value in zip(names, iteration.scaling, strict=True):
+            scalars[f"{method}/scaling/{state}/{term.replace('*', '.')}"] = float(value)
+        tell(scalars, step=next(steps))
+
+    return watch

@@ -1,0 +1,86 @@
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from ep2sindy.app.runner import run_config
+from ep2sindy.app.schema import study_of
+from ep2sindy.studies.constrained import Study
+
+ROOT = Path(__file__).resolve().parents[1]
+JUDGED = {
+    "text", "f_kHz", "f_error", "nrmse", "amplitude_ratio", "status", "ci95", "cpu_s",
+}  # fmt: skip
+
+
+def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
+    """`+exp=constrained` on a file."""
+    on_file = [
+        "+exp=constrained",
+        "data=file",
+        f"data.path={path}",
+        "data.variables.R_ion.name=R_ion",
+        "data.variables.u_iz.name=u_iz",
+        f"output={output}",
+    ]
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=[*on_file, *overrides])
+
+
+def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:
+    folder = run_config(constrained(predator_prey, tmp_path, "~models.ionization")).folder
+    summary = json.loads((folder / "summary.json").read_text())
+    assert list(summary) == ["experiment", "seed", "data", "models"]
+    assert (summary["data"]["n_samples"], summary["data"]["n_held_out"]) == (1200, 300)
+    models = summary["models"]
+    assert list(models) == ["predator_prey", "velocity"]
+    for name, model in models.items():
+        shared = "n_i*n_n" if name == "predator_prey" else "n_i*n_n*R_ion"
+        pairs = {kind: found["equations"] for kind, found in model.items()}
+        assert set(pairs) == {"base", "constrained"}
+        assert pairs["constrained"]["n_i"][shared] == -pairs["constrained"]["n_n"][shared]
+        assert pairs["base"]["n_i"][shared] != -pairs["base"]["n_n"][shared]
+        assert all(set(found) >= JUDGED for found in model.values())
+    exact = models["predator_prey"]["constrained"]["equations"]
+    # Second-order differences at 1.5 us on a 14 kHz wave: (omega dt)^2 / 6 = 0.3 %, and the
+    # smoothing window flattens peaks by about 1 %.
+    assert exact["n_i"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=0.02)
+    assert exact["n_n"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
+    assert len(pd.read_csv(folder / "tables" / "methods.csv")) == 8
+    page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
+    assert "figures/trajectories.png" in page
+    for words in ("relation: n_i: n_i*n_n == -1 * n_n: n_i*n_n", "predator prey, constrained"):
+        assert words in page
+        assert words in log
+    assert "status" not in page  # least squares has none
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["models=null"], "models must be like {name: {terms: {x: [x, x*y]}, relations: [..]}}"),
+        (["~models.velocity.relations"], "models.velocity must have terms and relations"),
+        (["models.velocity.relations=null"], "models.velocity.relations must be a list"),
+        (["~models.velocity.terms.n_i"], "models.velocity.terms must list the terms"),
+        (["models.velocity.relations=['n_i: 2']"], "joined by one '=='"),
+        (["held_out=yes"], "held_out must be a number between 0 and 1"),
+    ],
+)
+def test_constrained_settings_that_cannot_work_are_refused(
+    overrides: list[str], message: str, tmp_path: Path
+) -> None:
+    # There are no data: settings are refused before any are opened.
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
+        run_config(constrained(tmp_path / "none.nc", tmp_path, *overrides))
+    assert message in str(caught.value)
+
+
+def test_the_constant_may_come_as_a_number(tmp_path: Path) -> None:
+    """As Hydra reads it from a command line."""
+    given = "models.velocity.terms.n_n=[1,n_i*n_n*R_ion]"
+    study = study_of(Study, constrained(tmp_path / "none.nc", tmp_path, given))
+    _, (base, _) = study.models["velocity"].constraints("velocity", study.source.states)
+    assert [term for state, term in base.coefficients if state == "n_n"] == ["1", "n_i*n_n*R_ion"]

@@ -1,0 +1,140 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+
+from ep2sindy.app.runner import run_config
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.library.library import polynomial
+from ep2sindy.refinement.problem import Iteration
+from ep2sindy.studies.ils import watcher
+
+ROOT = Path(__file__).resolve().parents[1]
+EXACT = {
+    "n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14},
+    "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14},
+}
+JUDGED = {
+    "text", "f_kHz", "f_error", "nrmse", "amplitude_ratio", "status", "ci95", "cpu_s",
+}  # fmt: skip
+
+
+def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
+    """`+exp=ils` on a file, at toy size."""
+    toy = [
+        "+exp=ils",
+        "data=file",
+        f"data.path={path}",
+        f"output={output}",
+        "n_windows=8",
+        "windows=[60]",
+        "weak.test_functions.n_windows=500",
+        "weak.test_functions.n_points=50",
+    ]
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=[*toy, *overrides])
+
+
+@pytest.fixture(scope="module")
+def toy_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_config(ils(predator_prey, tmp_path_factory.mktemp("outputs"))).folder
+
+
+def test_integral_least_squares_returns_predator_and_prey(toy_run: Path) -> None:
+    summary = json.loads((toy_run / "summary.json").read_text())
+    methods = summary["methods"]
+    assert list(methods) == ["base", "weak", "constrained", "ils", "ils_constrained"]
+    for name, found in methods.items():
+        assert set(found) >= JUDGED
+        # Second-order differences at 1.5 us on a 14 kHz wave: (omega dt)^2 / 6 = 0.3 %, and the
+        # smoothing window flattens peaks by about 1 %. A refinement has the error of one
+        # Runge-Kutta step alone, (omega dt)^4 / 120 = 3e-6 for a sine, and the wave has harmonics.
+        refined = name.startswith("ils")
+        for state, terms in EXACT.items():
+            rel = 1e-4 if refined else 0.02
+            assert found["equations"][state] == pytest.approx(terms, rel=rel)
+        assert (found["status"], found["ci95"] is None) == (
+            ("converged", False) if refined else (None, True)
+        )
+        # Of a Hann window on some four periods: 1 % of a bin at most.
+        assert found["f_error"] == pytest.approx(0.0, abs=0.02 if not refined else 1e-3)
+        assert found["amplitude_ratio"] == pytest.approx(1.0, abs=0.1 if not refined else 1e-3)
+        assert (toy_run / "models" / f"{name}.json").is_file()
+    for name in ("constrained", "ils_constrained"):
+        equations = methods[name]["equations"]
+        assert equations["n_i"]["n_i*n_n"] == -equations["n_n"]["n_i*n_n"]
+    low, high = methods["ils"]["ci95"]["n_i"]["n_i"]
+    assert low <= methods["ils"]["equations"]["n_i"]["n_i"] <= high
+    swept = summary["loss_against_window"]
+    assert [row["method"] for row in swept] == ["ils", "ils_constrained"]
+    assert [row["window"] for row in swept] == [60, 60]
+    assert all(row["loss"] < 1e-6 for row in swept)
+
+
+def test_page_and_terminal_show_every_method_and_the_page_its_figures(toy_run: Path) -> None:
+    page, log = (toy_run / "report.html").read_text(), (toy_run / "run.log").read_text()
+    for name in ("trajectories", "trajectories_started", "phase", "spectra", "loss_against_window"):
+        assert f"figures/{name}.png" in page
+        assert (toy_run / "figures" / f"{name}.png").is_file()
+    for words in ("relation: n_i: n_i*n_n == -1 * n_n: n_i*n_n", "ILS, constrained", "converged"):
+        assert words in page
+        assert words in log
+    assert page.count("95 %: ") == 4  # of both refinements, for both states
+    assert "95 %: " not in log
+
+
+def test_every_iteration_is_told_one_scalar_each() -> None:
+    library = polynomial(["x", "y"], degree=2)
+    relations = constraint(
+        library, {"x": ["x", "x*y"], "y": ["y", "x*y"]}, ["x: x*y == -1 * y: x*y"]
+    )
+    told: list[tuple[int, dict[str, float]]] = []
+    watch = watcher(lambda scalars, *, step: told.append((step, scalars)), "ils", relations)
+    for loss in (0.5, 0.25):
+        watch(Iteration(0, 25, loss, np.array([1.0, 2.0, 3.0]), 0.1, 1e-9))
+    assert [step for step, _ in told] == [0, 1]
+    assert told[1][1] == {
+        "ils/loss": 0.25,
+        "ils/step": 0.1,
+        "ils/defect": 1e-9,
+        "ils/window_stage": 25,
+        "ils/scaling/x/x": 1.0,
+        "ils/scaling/x/x.y": 2.0,
+        "ils/scaling/y/y": 3.0,
+    }
+
+
+def test_iterations_go_to_tensorboard(toy_run: Path) -> None:
+    events = b"".join(p.read_bytes() for p in (toy_run / "tensorboard").glob("events*"))
+    for tag in (b"ils/scaling/n_i/n_i.n_n", b"ils_constrained/loss"):
+        assert tag in events
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["held_out=1.5"], "held_out must be a number between 0 and 1: 1.5 came"),
+        (["held_out=0.001"], "held_out=0.001 must leave 20 samples on either side"),
+        (["window=0"], "window must be a whole number, one or more: 0 came"),
+        (["window=901"], "window must hold 5 samples or more and fit the first part"),
+        (["windows=[3]"], "windows must hold 5 samples or more and fit the first part"),
+        (["windows=60"], "windows must be a list such as [a,b]"),
+        (["relations=[]"], "relations must be a list of relations, such as"),
+        (["relations=['n_i: n_n == 1']"], "'n_n' is not in the support of 'n_i'"),
+        (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
+        (["+figures.colour=1"], "figures must have duration_s and f_max_Hz"),
+        (["+n_points=3"], "unknown keys ['n_points']"),
+    ],
+)
+def test_ils_settings_that_cannot_work_are_refused(
+    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
+) -> None:
+    config = ils(predator_prey, tmp_path, *overrides)
+    with pytest.raises((ValueError, HydraException)) as caught:
+        run_config(config)
+    assert message in str(caught.value)
+    assert not list(tmp_path.glob("ils/*/models"))
