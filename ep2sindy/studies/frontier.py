@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
-from ep2sindy.studies.benchmark import Variant, judged
+from ep2sindy.studies.variants import Variant, judged
 from ep2sindy.synthetic.systems import System
 
 

@@ -58,7 +58,9 @@ PositiveOrAll = Annotated[
 
 
 def _each_once(values: Any) -> bool:
-    return isinstance(values, list) and bool(values) and len(set(map(str, values))) == len(values)
+    if not isinstance(values, list) or not values:
+        return False
+    return all(value not in values[:k] for k, value in enumerate(values))  # 0 and 0.0 are one
 
 
 A_LIST = Kind("a list such as [a,b], each once", _each_once)
