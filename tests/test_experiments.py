@@ -19,7 +19,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.problem import Iteration
-from experiments import constrained, frontier, ils, libraries, weak, weak_windows
+from experiments import constrained, ils, libraries, weak, weak_windows
 from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
@@ -452,39 +452,6 @@ def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
         assert cell["n"] == 2
         assert {"n_windows", "noise", "error_mean", "error_std"} <= set(cell)
     assert "figures/errors.png" in (folder / "report.html").read_text()
-
-
-def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
-    overrides = ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]"]
-    settings = ["+exp=frontier", "parallel=serial", *overrides, f"output={tmp_path}"]
-    folder = frontier.run(composed(*settings))
-    points = summary_of(folder)["points"]
-    assert len(points) == 8
-    found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
-    assert found["STLSQ", 20.0, 40.0]
-    assert found["ours", 20.0, 40.0]
-    assert not found["STLSQ", 1.0, 5.0]
-    assert "STLSQ 1" in (folder / "report.html").read_text()  # too few samples to smooth
-    lowest = pd.read_csv(folder / "tables" / "lowest_rates.csv").set_index("variant")
-    assert lowest.loc["STLSQ", "40 s"] == 20.0
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
-        (["rates_Hz=[0]"], "rates_Hz must be numbers, above zero: 0 came"),
-        (["durations_s=10"], "durations_s must be a list such as [a,b]"),
-        (["parallel.n_jobs=0"], "n_jobs must be a number of processes"),
-    ],
-)
-def test_frontier_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, tmp_path: Path
-) -> None:
-    config = composed("+exp=frontier", *overrides, f"output={tmp_path}")
-    with pytest.raises((ValueError, HydraException)) as caught:
-        frontier.run(config)
-    assert message in str(innermost(caught.value))
 
 
 EXACT = {
