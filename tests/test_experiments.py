@@ -19,7 +19,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.problem import Iteration
-from experiments import constrained, ils, libraries, weak, weak_windows
+from experiments import constrained, ils, libraries, weak
 from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
@@ -435,23 +435,6 @@ def test_weak_settings_that_cannot_work_are_refused(
     with pytest.raises((ValueError, HydraException)) as caught:
         weak.run(config)
     assert message in str(innermost(caught.value))
-
-
-def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
-    overrides = ["n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "parallel=serial"]
-    config = composed("+exp=weak_windows", *overrides, "n_realizations=2", f"output={tmp_path}")
-    folder = weak_windows.run(config)
-    found = summary_of(folder)["cells"]
-    assert len(found) == 2 * (4 + 3)
-    assert {cell["setting"] for cell in found if cell["n_points"] is None} == {
-        "differential",
-        "automatic",
-        "automatic_weighted",
-    }
-    for cell in found:
-        assert cell["n"] == 2
-        assert {"n_windows", "noise", "error_mean", "error_std"} <= set(cell)
-    assert "figures/errors.png" in (folder / "report.html").read_text()
 
 
 EXACT = {

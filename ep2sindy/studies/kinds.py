@@ -26,7 +26,11 @@ class Deferred(Protocol):
     changed: the same with other values at some places, such as `operating_point.voltage`, then
     `more` merged in; ValueError for a place where nothing stands. str() gives all settings, in an
     order of its own: equal objects have equal text. It can be sent to another process.
+    settings: as plain values, `_target_` among them.
     """
+
+    @property
+    def settings(self) -> Mapping[str, Any]: ...
 
     def build(self) -> Any: ...
 

@@ -34,7 +34,7 @@ def built_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) ->
         raise ValueError(f"unknown variants {unknown}; there are {list(definitions)}")
     variants = {}
     for name in names:
-        if "PySINDy" in str(definitions[name]) and find_spec("pysindy") is None:
+        if "PySINDy" in definitions[name].settings["_target_"] and find_spec("pysindy") is None:
             raise ValueError(
                 f'variants {name!r} needs PySINDy: pip install "ep2sindy[benchmark]", or leave it '
                 "out, such as variants=[ours,STLSQ]"
