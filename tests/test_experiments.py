@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from hydra.utils import instantiate
@@ -14,12 +13,11 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from ep2sindy.constraints.relations import constraint
-from ep2sindy.data.open import write_field
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.problem import Iteration
-from experiments import constrained, ils, libraries, weak
+from experiments import constrained, ils, libraries
 from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
@@ -30,44 +28,6 @@ EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         return compose("config", overrides=list(overrides))
-
-
-@pytest.fixture(scope="module")
-def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""
-    a, b, c = 1.64e5, 4.66e-14, 4.39e4
-    dt_s, n_samples = 1.5e-6, 1200
-    states = np.empty((n_samples, 2))
-    states[0] = x = np.array([5e17, 4e18])
-
-    def slope(x: np.ndarray) -> np.ndarray:
-        burn = b * x[0] * x[1]
-        return np.array([burn - a * x[0], c * x[1] - burn])
-
-    for k in range(1, n_samples):
-        for _ in range(4):  # classical Runge-Kutta, a quarter of a sample per step
-            h = dt_s / 4
-            k1 = slope(x)
-            k2 = slope(x + h / 2 * k1)
-            k3 = slope(x + h / 2 * k2)
-            k4 = slope(x + h * k3)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        states[k] = x
-    profile = np.ones((1, 5))
-    time = dt_s * np.arange(n_samples)
-    data = {
-        "n_i": (states[:, :1] * profile, "m^-3"),
-        "n_n": (states[:, 1:] * profile, "m^-3"),
-        "R_ion": (4e-14 * (1 + 0.3 * np.sin(9e4 * time))[:, None] * profile, "m^3/s"),
-        "u_iz": (5e3 * (1 + 0.2 * np.sin(7e4 * time))[:, None] * profile, "m/s"),
-    }
-    field = xr.Dataset(
-        {name: (("time", "z"), v, {"units": unit}) for name, (v, unit) in data.items()},
-        coords={"time": time, "z": np.linspace(0.012, 0.028, 5)},
-    )
-    path = tmp_path_factory.mktemp("data") / "predator_prey.nc"
-    write_field(field, path)
-    return path
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -364,77 +324,6 @@ def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> Non
         libraries.run(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
-
-
-def weak_on(path: Path, output: Path) -> list[str]:
-    """Overrides that run `+exp=weak` on a file."""
-    return [
-        "+exp=weak",
-        "data=file",
-        f"data.path={path}",
-        f"output={output}",
-        "n_windows=500",
-        "n_points=[10,50]",
-    ]
-
-
-def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
-    folder = weak.run(composed(*weak_on(predator_prey, tmp_path)))
-    summary = summary_of(folder)
-    forms = ["differential", "n_points_10", "n_points_50", "automatic", "automatic_weighted"]
-    assert list(summary["settings"]) == forms
-    for name, setting in summary["settings"].items():
-        # Differences: as in the test of breathing. Trapezia: (omega dt)^2 / 12 = 0.13 % for a sine,
-        # and the wave has harmonics. Smooth windows: as good as exact.
-        rel = {"differential": 0.02, "n_points_10": 5e-3, "n_points_50": 5e-3}.get(name, 1e-4)
-        equations = setting["equations"]
-        assert equations["n_i"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=rel)
-        assert equations["n_n"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=rel)
-        assert setting["f_error"] == pytest.approx(0.0, abs=0.01)
-        assert {"text", "r2", "f_kHz", "nrmse", "verdict"} <= set(setting)
-        assert (folder / "models" / f"{name}.json").is_file()
-    automatic = summary["settings"]["automatic_weighted"]
-    for state, half_width in automatic["half_width"].items():
-        assert automatic["half_width_s"][state] == pytest.approx(1.5e-6 * half_width)
-        low, high = automatic["intervals"][state][state]
-        assert low < automatic["equations"][state][state] < high
-    assert len(pd.read_csv(folder / "tables" / "settings.csv")) == 2 * len(forms)
-    page = (folder / "report.html").read_text()
-    for name in ("trajectories", "phase", "derivatives", "spectra"):
-        assert f"figures/{name}.png" in page
-        assert (folder / "figures" / f"{name}.png").is_file()
-
-
-def test_windows_longer_than_the_data_end_a_run_before_any_fit(
-    predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*weak_on(predator_prey, tmp_path), "n_points=[10,1201]")
-    with pytest.raises(ValueError, match="n_points=1201 was asked of 1200 samples; lower n_points"):
-        weak.run(config)
-    assert not list(tmp_path.glob("weak/*/models"))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["n_points=[1]"], "windows must number one or more, of two samples or more"),
-        (["n_points=[10,10]"], "n_points must be a list such as [a,b], each once"),
-        (["n_points=[10.5]"], "n_points must be whole numbers, above zero: 10.5 came"),
-        (["boxes.test_functions.n_points=70"], "boxes.test_functions.n_points is what n_points"),
-        (["n_windows=0"], "n_windows must be a whole number, one or more: 0 came"),
-        (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
-        (["model.n_n=[q]"], "unknown variables ['q']"),
-        (["+rate_Hz=3"], "unknown keys ['rate_Hz']"),
-        (["rollout_s=-1"], "rollout_s must be a positive number"),
-    ],
-)
-def test_weak_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*weak_on(predator_prey, tmp_path), *overrides)
-    with pytest.raises((ValueError, HydraException)) as caught:
-        weak.run(config)
-    assert message in str(innermost(caught.value))
 
 
 EXACT = {
