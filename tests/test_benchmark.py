@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.recipe import Finding, Recipe
 from ep2sindy.figures.identified import benchmark_figure, merit_table
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Loky
@@ -15,7 +15,8 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
 from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.benchmark import Finding, Variant, cells, judged, run_benchmark
+from ep2sindy.studies.benchmark import cells, run_benchmark
+from ep2sindy.studies.variants import Variant, judged
 from ep2sindy.synthetic.draws import realization
 
 TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
@@ -111,7 +112,7 @@ def test_known_findings_give_exact_counts() -> None:
         n_realizations=4,
         progress=n_done.append,
     )
-    assert n_done == [1, 2, 3, 4]
+    assert sum(n_done) == 4
     assert outcomes["number"].tolist() == [0, 1, 2, 3]
     assert outcomes["on_front"].tolist() == [1, 1, 0, 1]
     assert outcomes["selected"].tolist() == [1, 0, 0, 0]

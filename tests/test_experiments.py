@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from experiments import frontier, libraries, weak, weak_windows
+from experiments import libraries
 from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
 from experiments.run import innermost
 
@@ -322,127 +322,6 @@ def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> Non
         libraries.run(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
-
-
-def weak_on(path: Path, output: Path) -> list[str]:
-    """Overrides that run `+exp=weak` on a file."""
-    return [
-        "+exp=weak",
-        "data=file",
-        f"data.path={path}",
-        f"output={output}",
-        "n_windows=500",
-        "n_points=[10,50]",
-    ]
-
-
-def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
-    folder = weak.run(composed(*weak_on(predator_prey, tmp_path)))
-    summary = summary_of(folder)
-    forms = ["differential", "n_points_10", "n_points_50", "automatic", "automatic_weighted"]
-    assert list(summary["settings"]) == forms
-    for name, setting in summary["settings"].items():
-        # Differences: as in the test of breathing. Trapezia: (omega dt)^2 / 12 = 0.13 % for a sine,
-        # and the wave has harmonics. Smooth windows: as good as exact.
-        rel = {"differential": 0.02, "n_points_10": 5e-3, "n_points_50": 5e-3}.get(name, 1e-4)
-        equations = setting["equations"]
-        assert equations["n_i"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=rel)
-        assert equations["n_n"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=rel)
-        assert setting["f_error"] == pytest.approx(0.0, abs=0.01)
-        assert {"text", "r2", "f_kHz", "nrmse", "verdict"} <= set(setting)
-        assert (folder / "models" / f"{name}.json").is_file()
-    automatic = summary["settings"]["automatic_weighted"]
-    for state, half_width in automatic["half_width"].items():
-        assert automatic["half_width_s"][state] == pytest.approx(1.5e-6 * half_width)
-        low, high = automatic["intervals"][state][state]
-        assert low < automatic["equations"][state][state] < high
-    assert len(pd.read_csv(folder / "tables" / "settings.csv")) == 2 * len(forms)
-    page = (folder / "report.html").read_text()
-    for name in ("trajectories", "phase", "derivatives", "spectra"):
-        assert f"figures/{name}.png" in page
-        assert (folder / "figures" / f"{name}.png").is_file()
-
-
-def test_windows_longer_than_the_data_end_a_run_before_any_fit(
-    predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*weak_on(predator_prey, tmp_path), "n_points=[10,1201]")
-    with pytest.raises(ValueError, match="n_points=1201 was asked of 1200 samples; lower n_points"):
-        weak.run(config)
-    assert not list(tmp_path.glob("weak/*/models"))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["n_points=[1]"], "windows must number one or more, of two samples or more"),
-        (["n_points=[10,10]"], "n_points must be a list such as [a,b], each once"),
-        (["n_points=[10.5]"], "n_points must be whole numbers, above zero: 10.5 came"),
-        (["boxes.test_functions.n_points=70"], "boxes.test_functions.n_points is what n_points"),
-        (["n_windows=0"], "n_windows must be a whole number, one or more: 0 came"),
-        (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
-        (["model.n_n=[q]"], "unknown variables ['q']"),
-        (["+rate_Hz=3"], "unknown keys ['rate_Hz']"),
-        (["rollout_s=-1"], "rollout_s must be a positive number"),
-    ],
-)
-def test_weak_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
-) -> None:
-    config = composed(*weak_on(predator_prey, tmp_path), *overrides)
-    with pytest.raises((ValueError, HydraException)) as caught:
-        weak.run(config)
-    assert message in str(innermost(caught.value))
-
-
-def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
-    overrides = ["n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "parallel=serial"]
-    config = composed("+exp=weak_windows", *overrides, "n_realizations=2", f"output={tmp_path}")
-    folder = weak_windows.run(config)
-    found = summary_of(folder)["cells"]
-    assert len(found) == 2 * (4 + 3)
-    assert {cell["setting"] for cell in found if cell["n_points"] is None} == {
-        "differential",
-        "automatic",
-        "automatic_weighted",
-    }
-    for cell in found:
-        assert cell["n"] == 2
-        assert {"n_windows", "noise", "error_mean", "error_std"} <= set(cell)
-    assert "figures/errors.png" in (folder / "report.html").read_text()
-
-
-def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
-    overrides = ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]"]
-    settings = ["+exp=frontier", "parallel=serial", *overrides, f"output={tmp_path}"]
-    folder = frontier.run(composed(*settings))
-    points = summary_of(folder)["points"]
-    assert len(points) == 8
-    found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
-    assert found["STLSQ", 20.0, 40.0]
-    assert found["ours", 20.0, 40.0]
-    assert not found["STLSQ", 1.0, 5.0]
-    assert "STLSQ 1" in (folder / "report.html").read_text()  # too few samples to smooth
-    lowest = pd.read_csv(folder / "tables" / "lowest_rates.csv").set_index("variant")
-    assert lowest.loc["STLSQ", "40 s"] == 20.0
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
-        (["rates_Hz=[0]"], "rates_Hz must be numbers, above zero: 0 came"),
-        (["durations_s=10"], "durations_s must be a list such as [a,b]"),
-        (["parallel.n_jobs=0"], "n_jobs must be a number of processes"),
-    ],
-)
-def test_frontier_settings_that_cannot_work_are_refused(
-    overrides: list[str], message: str, tmp_path: Path
-) -> None:
-    config = composed("+exp=frontier", *overrides, f"output={tmp_path}")
-    with pytest.raises((ValueError, HydraException)) as caught:
-        frontier.run(config)
-    assert message in str(innermost(caught.value))
 
 
 def test_a_sweep_can_go_to_slurm() -> None:

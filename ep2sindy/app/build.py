@@ -62,6 +62,12 @@ class Configured:
     node: DictConfig
     place: str
 
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        plain = OmegaConf.to_container(self.node, resolve=True)
+        assert isinstance(plain, dict)
+        return {str(key): value for key, value in plain.items()}
+
     def build(self) -> Any:
         return instantiated(self.node)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -35,6 +35,23 @@ def _on_one_thread(function: Callable[[Any], Any], numbered: tuple[int, Any]) ->
     number, piece = numbered
     with threadpool_limits(limits=1):
         return number, function(piece)
+
+
+def rows_in_order(
+    workers: Workers,
+    function: Callable[[Any], Sequence[Any]],
+    pieces: Iterable[Any],
+    progress: Callable[[int], None] = lambda n_more: None,
+) -> list[Any]:
+    """The rows that a function finds in every piece, in the order of the pieces.
+
+    progress: told of every finished piece.
+    """
+    found = {}
+    for number, rows in workers.run(function, pieces):
+        found[number] = rows
+        progress(1)
+    return [row for number in sorted(found) for row in found[number]]
 
 
 @dataclass(frozen=True)

@@ -1,32 +1,63 @@
 """The thesis's synthetic benchmark: how often each variant of the method finds known equations.
 
-Source: the thesis, appendix, II-E and III-C.
+`+exp=benchmark`. Source: the thesis, appendix, II-E and III-C.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Finding
-from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
+from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure
+from ep2sindy.machine.parallel import ONE_BY_ONE, Workers, rows_in_order
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Captioned, Section
+from ep2sindy.report.run import Run
+from ep2sindy.studies.benchmark_view import FIGURE, published_cells, sections
+from ep2sindy.studies.kinds import Count, Deferred, Levels, Names
+from ep2sindy.studies.variants import Variant, built_variants, judged
 from ep2sindy.synthetic.draws import check_systems, realization
 
 
-@runtime_checkable
-class Variant(Protocol):
-    """A complete method: trajectories and a library in, supports out; a `Recipe` is one."""
+@dataclass(frozen=True)
+class Study:
+    """Draw, search, count: every variant on the same realizations of every system and noise.
 
-    def find(
-        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
-    ) -> Finding: ...
+    noises: standard deviations of the white noise, in RMS of each state. n_trajectories: of each
+    realization. variants: names among the definitions. thesis: its tables, to stand beside ours.
+    """
+
+    systems: Names
+    noises: Levels
+    n_realizations: Count
+    n_trajectories: Count
+    variants: Names
+    definitions: Mapping[str, Deferred]
+    thesis: Mapping[str, Any]
+    parallel: Workers
+
+    def compute(self, run: Run) -> Outcome:
+        published = published_cells(self.thesis)
+        variants = built_variants(self.variants, self.definitions)
+        n_pieces = len(self.systems) * len(self.noises) * self.n_realizations
+        with run.counted(n_pieces, "realization") as progress:
+            outcomes = run_benchmark(
+                variants,
+                systems=self.systems,
+                noises=self.noises,
+                n_realizations=self.n_realizations,
+                n_trajectories=self.n_trajectories,
+                workers=self.parallel,
+                seed=run.seed,
+                progress=progress,
+            )
+        return Outcome(variants, outcomes, cells(outcomes), published)
 
 
 def run_benchmark(
@@ -38,7 +69,7 @@ def run_benchmark(
     n_trajectories: int = 1,
     workers: Workers = ONE_BY_ONE,
     seed: int = 0,
-    progress: Callable[[int], None] = lambda n_done: None,
+    progress: Callable[[int], None] = lambda n_more: None,
 ) -> pd.DataFrame:
     """Every variant on every realization, realizations being the workers' pieces.
 
@@ -53,17 +84,10 @@ def run_benchmark(
             f"n_realizations={n_realizations}, systems={list(systems)}, noises={list(noises)}, "
             f"variants={list(variants)}"
         )
-    tasks = [(s, noise, k) for s in systems for noise in noises for k in range(n_realizations)]
+    numbers = range(n_realizations)
+    tasks = [(name, noise, k) for name in systems for noise in sorted(noises) for k in numbers]
     judge = partial(_outcomes, variants, n_trajectories=n_trajectories, seed=seed)
-    rows = []
-    for n_done, (_, found) in enumerate(workers.run(judge, tasks), start=1):
-        rows += found
-        progress(n_done)
-    order = ["system", "noise", "number", "variant"]
-    table = pd.DataFrame(rows)
-    for column, names in (("system", systems), ("variant", variants)):
-        table[column] = pd.Categorical(table[column], categories=list(names), ordered=True)
-    return table.sort_values(order, ignore_index=True).astype({"system": str, "variant": str})
+    return pd.DataFrame(rows_in_order(workers, judge, tasks, progress))
 
 
 def _outcomes(
@@ -91,18 +115,6 @@ def _outcomes(
     return rows
 
 
-def judged(finding: Finding, truth: Mapping[str, frozenset[str]]) -> dict[str, float]:
-    """The three figures of merit for one realization, as numbers; NaN where none was selected."""
-    found = {"on_front": float(all(truth[state] in finding.kept[state] for state in truth))}
-    if finding.selected is None:
-        return found | {"selected": np.nan, "correct_terms": np.nan}
-    chosen = finding.selected
-    return found | {
-        "selected": float(all(chosen[state] == truth[state] for state in truth)),
-        "correct_terms": float(sum(len(chosen[state] & truth[state]) for state in truth)),
-    }
-
-
 def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
     """Counts over all realizations, one row per system, noise and variant.
 
@@ -117,3 +129,54 @@ def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
         n=("number", "count"),
         cpu_s_per_search=("cpu_s", "median"),
     ).reset_index()
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Every outcome, and counts of them.
+
+    published: the thesis's cells, as `cells` without the time.
+    """
+
+    variants: Mapping[str, Variant]
+    outcomes: pd.DataFrame
+    cells: pd.DataFrame
+    published: pd.DataFrame
+
+    def models(self) -> dict[str, SparseModel]:
+        return {}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """Outcomes, and our cells beside what the thesis found in the same ones."""
+        columns = {merit: f"thesis_{merit}" for merit in MERITS}
+        keys = ["system", "noise", "variant"]
+        beside = self.published.rename(columns=columns)[[*keys, *columns.values()]]
+        return {"outcomes": self.outcomes, "cells": self.cells.merge(beside, how="left", on=keys)}
+
+    def figures(self) -> dict[str, Captioned]:
+        draw = partial(benchmark_figure, self.cells, thesis=self.published)
+        return {"benchmark": Captioned(draw, FIGURE)}
+
+    def sections(self) -> list[Section]:
+        return sections(self.variants, self.cells, self.published)
+
+    def summary(self) -> dict[str, Any]:
+        """Counts as whole numbers; null where a variant selects nothing."""
+        rows = self.cells.astype({"on_front": int}).to_dict("records")
+        return {
+            "cells": [
+                row | {"selected": None if np.isnan(row["selected"]) else int(row["selected"])}
+                for row in rows
+            ]
+        }
+
+    def headline(self) -> dict[str, float]:
+        """Means over systems and noise levels; what selects nothing has 0 % selected, NaN terms."""
+        scalars = {}
+        for name, rows in self.cells.groupby("variant", sort=False):
+            for merit in COUNTS:
+                percent = 100.0 * rows[merit].sum() / rows["n"].sum()
+                scalars[f"{name}/{merit}_percent"] = float(percent)
+            scalars[f"{name}/mean_correct_terms"] = float(rows["mean_correct_terms"].mean())
+            scalars[f"{name}/cpu_ms"] = float(1e3 * rows["cpu_s_per_search"].mean())
+        return scalars

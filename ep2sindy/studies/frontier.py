@@ -1,20 +1,61 @@
 """The identification frontier: how fast and how long one must sample to find known equations.
 
-Source: the thesis, appendix, III-B.
+`+exp=frontier`. Source: the thesis, appendix, III-B.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
-from ep2sindy.studies.benchmark import Variant, judged
+from ep2sindy.figures.identified import frontier_figure
+from ep2sindy.machine.parallel import ONE_BY_ONE, Workers, rows_in_order
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
+from ep2sindy.report.run import Run
+from ep2sindy.studies.kinds import Deferred, Names, Positives
+from ep2sindy.studies.variants import Variant, built_variants, judged
 from ep2sindy.synthetic.systems import System
+
+TITLE = "Lowest sampling rate (Hz) from which on all rates identify the system, by duration"
+FIGURE = (
+    "Filled: the true equations of all states are on the variant's fronts. Hollow: they are not. "
+    "Cross: too few samples for the variant to run, which counts as not identified."
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """Sample a system at every rate and for every duration, search, judge.
+
+    variants: names among the definitions.
+    """
+
+    system: System
+    rates_Hz: Positives
+    durations_s: Positives
+    variants: Names
+    definitions: Mapping[str, Deferred]
+    parallel: Workers
+
+    def compute(self, run: Run) -> Outcome:
+        variants = built_variants(self.variants, self.definitions)
+        with run.counted(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
+            points = identification_frontier(
+                self.system,
+                variants,
+                rates_Hz=self.rates_Hz,
+                durations_s=self.durations_s,
+                workers=self.parallel,
+                seed=run.seed,
+                progress=progress,
+            )
+        return Outcome(self.system, points)
 
 
 def identification_frontier(
@@ -25,7 +66,7 @@ def identification_frontier(
     durations_s: Sequence[float],
     workers: Workers = ONE_BY_ONE,
     seed: int = 0,
-    progress: Callable[[int], None] = lambda n_done: None,
+    progress: Callable[[int], None] = lambda n_more: None,
 ) -> pd.DataFrame:
     """Every variant on one noise-free trajectory per sampling rate and duration.
 
@@ -44,14 +85,10 @@ def identification_frontier(
     points = sorted(((r, d) for r in rates_Hz for d in durations_s), reverse=True)
     largest = (max(rates_Hz), max(durations_s))
     judge = partial(_point, system, variants, seed=seed, largest=largest)
-    rows = []
-    for n_done, (_, found) in enumerate(workers.run(judge, points), start=1):
-        rows += found
-        progress(n_done)
-    table = pd.DataFrame(rows)
-    table["variant"] = pd.Categorical(table["variant"], categories=list(variants), ordered=True)
-    order = ["variant", "rate_Hz", "duration_s"]
-    return table.sort_values(order, ignore_index=True).astype({"variant": str})
+    rows: list[dict[str, Any]] = rows_in_order(workers, judge, points, progress)
+    place = {name: k for k, name in enumerate(variants)}
+    rows.sort(key=lambda row: (place[row["variant"]], row["rate_Hz"], row["duration_s"]))
+    return pd.DataFrame(rows)
 
 
 def _point(
@@ -92,3 +129,61 @@ def _point(
             }
         )
     return rows
+
+
+def lowest_rates(points: pd.DataFrame) -> pd.DataFrame:
+    """A row per variant: identified points, then the frontier in Hz; NaN where there is none."""
+    rows = []
+    for variant, of_variant in points.groupby("variant", sort=False):
+        row: dict[str, object] = {
+            "variant": variant,
+            "identified": f"{of_variant['identified'].sum()} of {len(of_variant)}",
+        }
+        for duration_s, column in of_variant.groupby("duration_s"):
+            falling = column.sort_values("rate_Hz", ascending=False)
+            unbroken = falling["identified"].cummin()
+            row[f"{duration_s:g} s"] = falling.loc[unbroken, "rate_Hz"].min()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """points: as `identification_frontier` gives them."""
+
+    system: System
+    points: pd.DataFrame
+
+    def models(self) -> dict[str, SparseModel]:
+        return {}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        return {"points": self.points, "lowest_rates": lowest_rates(self.points)}
+
+    def figures(self) -> dict[str, Captioned]:
+        return {"frontier": Captioned(partial(frontier_figure, self.points), FIGURE)}
+
+    def sections(self) -> list[Section]:
+        too_few = self.points[self.points["reason"] != ""].groupby("variant", sort=False).size()
+        counts = ", ".join(f"{variant} {n}" for variant, n in too_few.items())
+        text = (
+            f"{self.system.name}: one noise-free trajectory per sampling rate and duration, all "
+            f"from the same initial state. Points with too few samples to run: {counts or 'none'}; "
+            "tables/points.csv says why."
+        )
+        return [
+            Section("Points", [Text(text), Picture("frontier")]),
+            Section(TITLE, [Table(lowest_rates(self.points))]),
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        kept = self.points[["variant", "rate_Hz", "duration_s", "identified"]]
+        return {
+            "points": [
+                row | {"identified": bool(row["identified"])} for row in kept.to_dict("records")
+            ]
+        }
+
+    def headline(self) -> dict[str, float]:
+        percent = 100.0 * self.points.groupby("variant", sort=False)["identified"].mean()
+        return {f"{name}/identified_percent": float(value) for name, value in percent.items()}

@@ -26,7 +26,11 @@ class Deferred(Protocol):
     changed: the same with other values at some places, such as `operating_point.voltage`, then
     `more` merged in; ValueError for a place where nothing stands. str() gives all settings, in an
     order of its own: equal objects have equal text. It can be sent to another process.
+    settings: as plain values, `_target_` among them.
     """
+
+    @property
+    def settings(self) -> Mapping[str, Any]: ...
 
     def build(self) -> Any: ...
 
@@ -58,7 +62,9 @@ PositiveOrAll = Annotated[
 
 
 def _each_once(values: Any) -> bool:
-    return isinstance(values, list) and bool(values) and len(set(map(str, values))) == len(values)
+    if not isinstance(values, list) or not values:
+        return False
+    return all(value not in values[:k] for k, value in enumerate(values))  # 0 and 0.0 are one
 
 
 A_LIST = Kind("a list such as [a,b], each once", _each_once)

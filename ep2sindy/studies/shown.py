@@ -94,6 +94,6 @@ def equation_sections(models: Mapping[str, SparseModel]) -> list[Section]:
         for state in model.states:
             blocks.append(Equation(state, model.terms(state), on_screen=True))
             if model.covariance is not None:
-                blocks.append(Text(f"95 %: {intervals_text(model, state)}", page_only=True))
+                blocks.append(Text(f"95 %: {intervals_text(model, state)}"))
         found.append(Section(name, blocks, level=3))
     return found

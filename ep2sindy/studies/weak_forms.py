@@ -16,6 +16,7 @@ from ep2sindy.regression.rows import Formulation, Regression
 from ep2sindy.regression.test_functions import Boxes, Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.studies.kinds import Deferred
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,34 @@ class Fitted:
     half_width: Mapping[str, int]
     integrated: Integrated
     f_error: float
+
+
+def settings_of(
+    formulation: Formulation,
+    boxes: Deferred,
+    automatic: Formulation,
+    *,
+    n_windows: Sequence[int],
+    n_points: Sequence[int],
+) -> dict[str, Setting]:
+    """The differential form, random windows of every number and length, and smooth windows.
+
+    boxes: the form with random windows, whose number and length are null.
+    """
+    chosen = {"n_windows": n_windows[0], "n_points": n_points[0]}
+    for key in chosen:
+        given = boxes.settings.get("test_functions", {}).get(key)
+        if given is not None:
+            raise ValueError(
+                f"boxes.test_functions.{key} is what {key} says: {given!r} came; set {key} alone"
+            )
+    form = boxes.changed({f"test_functions.{key}": value for key, value in chosen.items()}).build()
+    return {
+        "differential": Setting(formulation),
+        **boxes_grid(form, n_windows=n_windows, n_points=n_points),
+        "automatic": Setting(automatic),
+        "automatic_weighted": Setting(automatic, weighted=True),
+    }
 
 
 def boxes_grid(

@@ -1,21 +1,76 @@
 """How the number and length of windows decide the coefficients that noise leaves.
 
-Source: the thesis, appendix, III-A: the true support is known, and least squares does the rest.
+`+exp=weak_windows`. Source: the thesis, appendix, III-A: the true support is known, and least
+squares does the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.machine.parallel import ONE_BY_ONE, Workers
-from ep2sindy.studies.weak_forms import Setting, check_windows, fitted_terms
+from ep2sindy.machine.parallel import ONE_BY_ONE, Workers, rows_in_order
+from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
+from ep2sindy.report.run import Run
+from ep2sindy.studies.kinds import Count, Counts, Deferred, Levels, Positive
+from ep2sindy.studies.weak_forms import Setting, check_windows, fitted_terms, settings_of
 from ep2sindy.synthetic.systems import System
+
+FIGURE = (
+    "||beta - beta_true|| / ||beta_true|| over all equations against noise: a panel per window "
+    "length, a line per number of windows; black: the same forms in every panel."
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """Draw noise, fit, measure: known terms in every form, with windows of every kind.
+
+    rate_Hz: at which the system is sampled. formulation: the differential form. boxes: random
+    windows. automatic: smooth windows. noises: as for `coefficient_errors`.
+    """
+
+    system: System
+    rate_Hz: Positive
+    formulation: Formulation
+    boxes: Deferred
+    automatic: Formulation
+    n_windows: Counts
+    n_points: Counts
+    noises: Levels
+    n_realizations: Count
+    parallel: Workers
+
+    def compute(self, run: Run) -> Outcome:
+        settings = settings_of(
+            self.formulation,
+            self.boxes,
+            self.automatic,
+            n_windows=self.n_windows,
+            n_points=self.n_points,
+        )
+        system = replace(self.system, rate_Hz=self.rate_Hz)
+        with run.counted(len(self.noises) * self.n_realizations, "realization") as progress:
+            errors = coefficient_errors(
+                system,
+                settings,
+                noises=self.noises,
+                n_realizations=self.n_realizations,
+                workers=self.parallel,
+                seed=run.seed,
+                progress=progress,
+            )
+        return Outcome(system, settings, errors, window_cells(errors, settings))
 
 
 def true_library(system: System) -> Library:
@@ -45,7 +100,7 @@ def coefficient_errors(
     n_realizations: int,
     workers: Workers = ONE_BY_ONE,
     seed: int = 0,
-    progress: Callable[[int], None] = lambda n_done: None,
+    progress: Callable[[int], None] = lambda n_more: None,
 ) -> pd.DataFrame:
     """The error of every setting on every realization, realizations being the workers' pieces.
 
@@ -62,11 +117,7 @@ def coefficient_errors(
     check_windows(settings, round(system.duration_s * system.rate_Hz))
     tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
     fit = partial(_realization, system, settings, seed=seed)
-    found = {}
-    for n_done, (place, rows) in enumerate(workers.run(fit, tasks), start=1):
-        found[place] = rows
-        progress(n_done)
-    return pd.DataFrame([row for place in sorted(found) for row in found[place]])
+    return pd.DataFrame(rows_in_order(workers, fit, tasks, progress))
 
 
 def _realization(
@@ -95,3 +146,66 @@ def window_cells(errors: pd.DataFrame, settings: Mapping[str, Setting]) -> pd.Da
         values = [getattr(box, key) if box else None for box in boxes]
         cells.insert(place, key, pd.Series(values, dtype="Int64"))
     return cells
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """errors: as `coefficient_errors` gives them. cells: their means, from `window_cells`."""
+
+    system: System
+    settings: Mapping[str, Setting]
+    errors: pd.DataFrame
+    cells: pd.DataFrame
+
+    def models(self) -> dict[str, SparseModel]:
+        return {}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        return {"errors": self.errors, "cells": self.cells}
+
+    def figures(self) -> dict[str, Captioned]:
+        references = [name for name, setting in self.settings.items() if not setting.boxes]
+        draw = partial(window_error_figure, self.cells, references=references)
+        return {"errors": Captioned(draw, FIGURE)}
+
+    def sections(self) -> list[Section]:
+        system = self.system
+        text = (
+            f"{system.name}, {system.duration_s:g} s at {system.rate_Hz:g} Hz, "
+            f"{int(self.cells['n'].iloc[0])} realizations of the noise, in % of each state's RMS; "
+            "the terms of the equations are known, and least squares finds their coefficients "
+            "(automatic_weighted: weighted)."
+        )
+        note = "Without noise the error is that of the integrals and derivatives."
+        return [
+            Section("Windows", [Text(text), Picture("errors")]),
+            Section(
+                "Coefficient error, mean over the realizations",
+                [Table(by_noise(self.cells), note=note)],
+            ),
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        counts = ("n_windows", "n_points")
+        rows = self.cells.to_dict("records")
+        return {
+            "cells": [
+                row | {key: None if pd.isna(row[key]) else int(row[key]) for key in counts}
+                for row in rows
+            ]
+        }
+
+    def headline(self) -> dict[str, float]:
+        return {
+            f"{row['setting']}/error_{100 * row['noise']:g}_percent": row["error_mean"]
+            for row in self.cells.to_dict("records")
+        }
+
+
+def by_noise(cells: pd.DataFrame) -> pd.DataFrame:
+    """A row per setting, a column of mean errors per noise level, as text."""
+    shown = cells.assign(noise=[f"{100 * noise:g} % noise" for noise in cells["noise"]])
+    table = shown.pivot(index="setting", columns="noise", values="error_mean")
+    order = [shown["setting"].unique(), shown["noise"].unique()]
+    texts = table.loc[order[0], order[1]].map("{:.2e}".format)
+    return texts.reset_index().rename_axis(columns=None)

@@ -1,0 +1,48 @@
+import json
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from ep2sindy.app.runner import run_config
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=["+exp=frontier", *overrides])
+
+
+def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
+    overrides = ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]"]
+    config = composed("parallel=serial", *overrides, f"output={tmp_path}")
+    folder = run_config(config).folder
+    points = json.loads((folder / "summary.json").read_text())["points"]
+    assert len(points) == 8
+    found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
+    assert found["STLSQ", 20.0, 40.0]
+    assert found["ours", 20.0, 40.0]
+    assert not found["STLSQ", 1.0, 5.0]
+    assert "STLSQ 1" in (folder / "report.html").read_text()  # too few samples to smooth
+    lowest = pd.read_csv(folder / "tables" / "lowest_rates.csv").set_index("variant")
+    assert lowest.loc["STLSQ", "40 s"] == 20.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["variants=[STLSG]"], "unknown variants ['STLSG']; there are ['"),
+        (["rates_Hz=[0]"], "rates_Hz[0] must be numbers, above zero: 0 came"),
+        (["durations_s=10"], "durations_s must be a list such as [a,b]"),
+        (["parallel.n_jobs=0"], "n_jobs must be a number of processes"),
+    ],
+)
+def test_frontier_settings_that_cannot_work_are_refused(
+    overrides: list[str], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        run_config(composed(*overrides, f"output={tmp_path}"))

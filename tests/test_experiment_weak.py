@@ -1,0 +1,90 @@
+import json
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from ep2sindy.app.runner import run_config
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
+
+
+def weak_on(path: Path, output: Path) -> list[str]:
+    """Overrides that run `+exp=weak` on a file."""
+    return [
+        "+exp=weak",
+        "data=file",
+        f"data.path={path}",
+        f"output={output}",
+        "n_windows=500",
+        "n_points=[10,50]",
+    ]
+
+
+def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
+    folder = run_config(composed(*weak_on(predator_prey, tmp_path))).folder
+    summary = json.loads((folder / "summary.json").read_text())
+    forms = ["differential", "n_points_10", "n_points_50", "automatic", "automatic_weighted"]
+    assert list(summary["settings"]) == forms
+    for name, setting in summary["settings"].items():
+        # Differences: as in the test of breathing. Trapezia: (omega dt)^2 / 12 = 0.13 % for a sine,
+        # and the wave has harmonics. Smooth windows: as good as exact.
+        rel = {"differential": 0.02, "n_points_10": 5e-3, "n_points_50": 5e-3}.get(name, 1e-4)
+        equations = setting["equations"]
+        assert equations["n_i"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=rel)
+        assert equations["n_n"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=rel)
+        assert setting["f_error"] == pytest.approx(0.0, abs=0.01)
+        assert {"text", "r2", "f_kHz", "nrmse", "verdict"} <= set(setting)
+        assert (folder / "models" / f"{name}.json").is_file()
+    automatic = summary["settings"]["automatic_weighted"]
+    for state, half_width in automatic["half_width"].items():
+        assert automatic["half_width_s"][state] == pytest.approx(1.5e-6 * half_width)
+        low, high = automatic["intervals"][state][state]
+        assert low < automatic["equations"][state][state] < high
+    assert len(pd.read_csv(folder / "tables" / "settings.csv")) == 2 * len(forms)
+    log, page = ((folder / name).read_text() for name in ("run.log", "report.html"))
+    assert "thesis, Eq. 24: n_i' = -1.51e+05 n_i + 4.21e-14 n_i n_n" in log
+    assert log.count("95 %: ") == page.count("95 %: ") == 2  # of the weighted fit, by state
+    assert max(map(len, log.splitlines())) <= 120
+    for name in ("trajectories", "phase", "derivatives", "spectra"):
+        assert f"figures/{name}.png" in page
+        assert (folder / "figures" / f"{name}.png").is_file()
+
+
+def test_windows_longer_than_the_data_end_a_run_before_any_fit(
+    predator_prey: Path, tmp_path: Path
+) -> None:
+    config = composed(*weak_on(predator_prey, tmp_path), "n_points=[10,1201]")
+    with pytest.raises(ValueError, match="n_points=1201 was asked of 1200 samples; lower n_points"):
+        run_config(config)
+    assert not list(tmp_path.glob("weak/*/models"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["n_points=[1]"], "windows must number one or more, of two samples or more"),
+        (["n_points=[10,10]"], "n_points must be a list such as [a,b], each once"),
+        (["n_points=[10.5]"], "n_points[0] must be whole numbers, above zero: 10.5 came"),
+        (["boxes.test_functions.n_points=70"], "boxes.test_functions.n_points is what n_points"),
+        (["n_windows=0"], "n_windows must be a whole number, one or more: 0 came"),
+        (["~model.n_n"], "model must list the terms of every state of ['n_i', 'n_n']"),
+        (["model.n_n=[q]"], "unknown variables ['q']"),
+        (["+rate_Hz=3"], "unknown keys ['rate_Hz']"),
+        (["rollout_s=-1"], "rollout_s must be a positive number"),
+    ],
+)
+def test_weak_settings_that_cannot_work_are_refused(
+    overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
+) -> None:
+    config = composed(*weak_on(predator_prey, tmp_path), *overrides)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        run_config(config)

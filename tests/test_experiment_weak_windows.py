@@ -1,0 +1,49 @@
+import json
+import re
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from ep2sindy.app.runner import run_config
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", overrides=["+exp=weak_windows", *overrides])
+
+
+def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
+    overrides = ["n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "parallel=serial"]
+    config = composed(*overrides, "n_realizations=2", f"output={tmp_path}")
+    folder = run_config(config).folder
+    found = json.loads((folder / "summary.json").read_text())["cells"]
+    assert len(found) == 2 * (4 + 3)
+    assert {cell["setting"] for cell in found if cell["n_points"] is None} == {
+        "differential",
+        "automatic",
+        "automatic_weighted",
+    }
+    for cell in found:
+        assert cell["n"] == 2
+        assert {"n_windows", "noise", "error_mean", "error_std"} <= set(cell)
+    assert "figures/errors.png" in (folder / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["rate_Hz=0"], "rate_Hz must be a positive number: 0 came"),
+        (["n_points=[10,3001]"], "n_points=3001 was asked of 3000 samples"),
+        (["boxes.test_functions.n_windows=9"], "boxes.test_functions.n_windows is what n_windows"),
+        (["n_realizations=0"], "n_realizations must be a whole number, one or more: 0 came"),
+    ],
+)
+def test_weak_windows_settings_that_cannot_work_are_refused(
+    overrides: list[str], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        run_config(composed(*overrides, f"output={tmp_path}"))
