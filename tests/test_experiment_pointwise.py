@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,15 +12,16 @@ import pandas as pd
 import pytest
 import xarray as xr
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ep2sindy.app.runner import run_config, started_run
+from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.discovery.blocks import Block, Kept
+from ep2sindy.studies import pointwise
+from ep2sindy.studies.pointwise_view import Outcome
 from ep2sindy.synthetic.regions import TERMS, three_regions
-from experiments import pointwise
-from experiments.run import innermost
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -27,6 +29,18 @@ ROOT = Path(__file__).resolve().parents[1]
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         return compose("config", overrides=["+exp=pointwise", *overrides])
+
+
+def computed(*overrides: str) -> tuple[Outcome, Path]:
+    """What the study finds, and the run folder, without tables and figures."""
+    config = composed(*overrides)
+    with started_run(config) as run:
+        return study_of(pointwise.Study, config).compute(run), run.folder.path
+
+
+def key_of(*overrides: str) -> str:
+    settings = OmegaConf.to_container(composed(*overrides), resolve=True)
+    return pointwise.blocks_key(settings)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +72,7 @@ def summary_of(folder: Path) -> dict:
 
 @pytest.fixture(scope="module")
 def toy_run(grid: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return pointwise.run(composed(*on_file(grid, tmp_path_factory.mktemp("run"))))
+    return run_config(composed(*on_file(grid, tmp_path_factory.mktemp("run")))).folder
 
 
 def test_the_summary_counts_the_points(toy_run: Path) -> None:
@@ -105,10 +119,10 @@ def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Pat
     with xr.open_dataset(grid, decode_times=False) as field:
         write_field(field.isel(r=2, drop=True).load(), line)
     overrides = ["data.r.name=null", "data.variables.u_ir.name=null"]
-    folder = pointwise.run(composed(*on_file(line, tmp_path), *overrides))
-    assert summary_of(folder)["n_points"] == 6
+    found, folder = computed(*on_file(line, tmp_path), *overrides)
+    assert found.summary()["n_points"] == 6
     assert "lacks their variables: ['n_i*u_ir']" in (folder / "run.log").read_text()
-    assert (folder / "figures" / "regimes.png").exists()
+    assert found.figures()["regimes"].draw().axes
     with xr.open_dataset(folder / "pointwise.nc") as result:
         assert list(result["term"].values) == [name for name in TERMS if "u_ir" not in name]
 
@@ -118,30 +132,75 @@ def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Pat
     [
         ("block_points=0", "block_points must be a whole number, one or more: 0 came"),
         ("max_regimes=0", "max_regimes must be a whole number, one or more: 0 came"),
-        ("terms=[n_i*B]", "unknown variables ['B']; this field has"),
-        ("states=[n_i,n_x]", "unknown variables ['n_x']; this field has"),
+        ("terms=[n_n,n_n]", "terms must be a list such as [a,b], each once"),
         ("bootstraps.n=0", "a pointwise study needs bootstraps for its spread: n=0 came"),
-        ("bootstraps.block=100000", "no point could be fitted: a block must hold"),
         ("outline.inner_radius=0.06", "inner_radius must be below outer_radius"),
+        ("outline=SPT100", "outline may have ['boundary_T_e_eV', "),
         ("+rollout_s=1", "unknown keys ['rollout_s']; there are "),
         ("least_variation=2.0", "least_variation must lie in [0, 1): 2.0"),
+        ("terms=[n_i-n_n]", "a term is variables joined by *"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(
+def test_settings_that_cannot_work_are_refused_before_data_are_opened(
+    override: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        computed(*on_file(tmp_path / "not_there.nc", tmp_path), override)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("terms=[n_i*B]", "unknown variables ['B']; this field has"),
+        ("states=[n_i,n_x]", "unknown variables ['n_x']; this field has"),
+        ("bootstraps.block=100000", "no point could be fitted: a block must hold"),
+    ],
+)
+def test_settings_that_do_not_fit_the_data_are_refused(
     override: str, message: str, grid: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises((ValueError, HydraException)) as caught:
-        pointwise.run(composed(*on_file(grid, tmp_path), override))
-    assert message in str(innermost(caught.value))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        computed(*on_file(grid, tmp_path), override)
+
+
+def test_an_outline_that_is_no_thruster_is_refused(tmp_path: Path) -> None:
+    config = composed(*on_file(tmp_path / "not_there.nc", tmp_path))
+    config.outline = {"_target_": "ep2sindy.EBIC"}
+    with pytest.raises(ValueError, match="outline must name a _target_ that is a .*Thruster"):
+        study_of(pointwise.Study, config)
+
+
+def test_the_constant_needs_no_quotes(tmp_path: Path) -> None:
+    config = composed(*on_file(tmp_path / "not_there.nc", tmp_path), "terms=[1,n_n]")
+    assert study_of(pointwise.Study, config).library(lacking=()).names == ("1", "n_n")
 
 
 def test_a_rate_table_that_has_changed_has_other_blocks(grid: Path, tmp_path: Path) -> None:
     table = tmp_path / "rates.csv"
-    step = f"{{_target_: ep2sindy.ionization_rate, table: {table}}}"
+    overrides = [
+        *on_file(grid, tmp_path),
+        f"prepare=[{{_target_: ep2sindy.ionization_rate, table: {table}}}]",
+    ]
     table.write_text("1,1e-15\n100,1e-13\n")
-    before = pointwise.blocks_key(composed(*on_file(grid, tmp_path), f"prepare=[{step}]"))
+    before = key_of(*overrides)
     table.write_text("1,5e-15\n100,5e-13\n")
-    assert pointwise.blocks_key(composed(*on_file(grid, tmp_path), f"prepare=[{step}]")) != before
+    assert key_of(*overrides) != before
+
+
+@pytest.mark.parametrize("place", ["mine/__init__.py", "mine.py"])
+def test_own_code_that_has_changed_has_other_blocks(
+    place: str, grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    source = tmp_path / place
+    source.parent.mkdir(exist_ok=True)
+    as_step = [*on_file(grid, tmp_path), "prepare=[{_target_: mine.half}]"]
+    as_study = [*on_file(grid, tmp_path), "study=mine.maps"]
+    keys = []
+    for divisor in (2, 4):
+        source.write_text(f"def half(field):\n    return field / {divisor}\n")
+        keys += [key_of(*as_step), key_of(*as_study)]
+    assert len(set(keys)) == 4
 
 
 def test_a_study_that_selects_nothing_is_a_result(tmp_path: Path) -> None:
@@ -154,16 +213,17 @@ def test_a_study_that_selects_nothing_is_a_result(tmp_path: Path) -> None:
     path = tmp_path / "noise.nc"
     write_field(xr.Dataset(noise, coords={"time": time_s, "z": z}), path)
     overrides = [*on_file(path, tmp_path), "data.r.name=null", "data.variables.u_ir.name=null"]
-    folder = pointwise.run(composed(*overrides, "terms=[n_i*u_iz]", "selection=ebic"))
-    found = summary_of(folder)
-    assert found["n_valid"] == 3
-    assert found["equations"] == [{"n_i": {}, "n_n": {}}]
-    assert not (folder / "figures" / "coefficients.png").exists()
+    found, _ = computed(*overrides, "terms=[n_i*u_iz]", "selection=ebic")
+    assert found.summary()["n_valid"] == 3
+    assert found.summary()["equations"] == [{"n_i": {}, "n_n": {}}]
+    assert set(found.figures()) == {"regimes", "quality"}
+    for figure in found.figures().values():
+        assert figure.draw().axes
 
 
 def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:
     def key(*overrides: str) -> str:
-        return pointwise.blocks_key(composed(*on_file(grid, tmp_path), *overrides))
+        return key_of(*on_file(grid, tmp_path), *overrides)
 
     same = [key(), key("max_regimes=2"), key("parallel=loky"), key("output=elsewhere")]
     assert len(set(same)) == 1
@@ -185,13 +245,12 @@ def test_an_interrupted_run_says_how_to_go_on(
 
     monkeypatch.setattr(Kept, "write", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        pointwise.run(composed(*overrides))
+        computed(*overrides)
     assert "the same command goes on" in " ".join(capsys.readouterr().out.split())
     monkeypatch.undo()
-    folder = pointwise.run(composed(*overrides))
+    found, folder = computed(*overrides)
     assert "going on with 10 of 30 points" in (folder / "run.log").read_text()
-    found = summary_of(folder)
-    assert found["points_per_s"] == pytest.approx(20 / found["wall_s"])
+    assert found.points_per_s == pytest.approx(20 / found.wall_s)
 
 
 @pytest.mark.slow

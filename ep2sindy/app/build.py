@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from types import UnionType
 from typing import Any
 
 from hydra.errors import HydraException
@@ -36,8 +37,9 @@ def instantiated(node: DictConfig, **how: Any) -> Any:
 def instance_of(node: DictConfig, kind: Any, place: str) -> Any:
     """The object that a node names, if it is of this kind."""
     value = instantiated(node)
-    if isinstance(kind, type) and not isinstance(value, kind):
-        raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: {value!r} came")
+    if isinstance(kind, type | UnionType) and not isinstance(value, kind):
+        name = getattr(kind, "__name__", str(kind))
+        raise ValueError(f"{place} must name a _target_ that is a {name}: {value!r} came")
     return value
 
 

@@ -198,6 +198,13 @@ def _mixture(
     return candidates[best] if best else None
 
 
+def spread(coef: Float[np.ndarray, " points"]) -> tuple[float, float, float]:
+    """16, 50 and 84 % of the points that have the term; NaN where none has it."""
+    held = coef[coef != 0.0]
+    low, middle, high = np.percentile(held, [16, 50, 84]) if held.size else [np.nan] * 3
+    return low, middle, high
+
+
 def _table(
     result: xr.Dataset,
     labels: Int[np.ndarray, " points"],
@@ -213,15 +220,14 @@ def _table(
         for e, equation in enumerate(result["equation"].values):
             for k, term in enumerate(result["term"].values):
                 values = coef[inside, e, k]
-                held = values[values != 0.0]
-                low, middle, high = np.percentile(held, [16, 50, 84]) if held.size else [np.nan] * 3
+                low, middle, high = spread(values)
                 rows.append(
                     {
                         "regime": regime,
                         "equation": str(equation),
                         "term": str(term),
                         "acts": bool(np.median(np.abs(weights[inside, e, k])) >= least),
-                        "in_support": held.size / inside.sum(),
+                        "in_support": np.count_nonzero(values) / inside.sum(),
                         "weight": float(np.median(weights[inside, e, k])),
                         "coef": middle,
                         "coef_low": low,

@@ -35,10 +35,10 @@ def write_text(path: Path, text: str) -> None:
 def fingerprint(settings: str, *, sources: Path) -> str:
     """Sixteen hexadecimal digits of some settings and of the source text that uses them.
 
-    sources: a folder of Python files; what a changed formula would answer differently is not
-    taken from what an old one left on disk.
+    sources: a Python file, or a folder of them; what a changed formula would answer differently
+    is not taken from what an old one left on disk.
     """
     digest = hashlib.sha256(settings.encode())
-    for source in sorted(sources.rglob("*.py")):
+    for source in [sources] if sources.is_file() else sorted(sources.rglob("*.py")):
         digest.update(source.name.encode() + source.read_bytes())
     return digest.hexdigest()[:16]

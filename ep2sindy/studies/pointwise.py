@@ -1,0 +1,178 @@
+"""A search at every grid point, and the regimes that come out: `+exp=pointwise`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import xarray as xr
+
+import ep2sindy
+from ep2sindy.discovery.blocks import Kept, blocks_of
+from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.regimes import regimes
+from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.terms import variables_of
+from ep2sindy.machine.files import fingerprint
+from ep2sindy.machine.parallel import Workers
+from ep2sindy.report.run import Run
+from ep2sindy.studies.kinds import A_LIST, Count, Names
+from ep2sindy.studies.pointwise_view import Outcome
+from ep2sindy.studies.source import FieldSource
+from ep2sindy.thruster.parameters import Thruster
+
+# What does not change the result of a point, and may differ when a broken run is taken up.
+AFTERWARDS = {"output", "parallel", "max_regimes", "keep", "outline", "experiment", "study"}
+
+
+@dataclass(frozen=True)
+class Study:
+    """Search everywhere, group what was found.
+
+    terms: those of variables_if_present are left out where the field lacks their variables.
+    keep: folder of finished blocks, where a run that takes up a broken one finds them. outline:
+    the thruster whose channel is drawn into the maps.
+    """
+
+    source: FieldSource
+    recipe: Recipe
+    parallel: Workers
+    states: Names
+    terms: Annotated[Sequence[str | int], A_LIST]  # 1, the constant, is a number to YAML
+    variables_if_present: Sequence[str]
+    least_variation: float
+    max_regimes: Count
+    block_points: Count
+    keep: str
+    outline: Thruster | None
+
+    def __post_init__(self) -> None:
+        self.search(self.library(lacking=()), seed=0)  # what cannot work is refused here
+
+    def library(self, *, lacking: Collection[str]) -> Library:
+        """The terms, without those of variables that a field lacks."""
+        factors = {name: variables_of(name) for name in map(str, self.terms)}
+        terms = [name for name, variables in factors.items() if not {*lacking} & {*variables}]
+        used = dict.fromkeys([*self.states, *(v for name in terms for v in factors[name])])
+        return named_terms(list(used), terms)
+
+    def search(self, library: Library, *, seed: int) -> PointSearch:
+        return PointSearch(self.states, library, self.recipe, self.least_variation, seed)
+
+    def compute(self, run: Run) -> Outcome:
+        field = self.source.field()
+        lacking = [name for name in self.variables_if_present if name not in field]
+        search = self.search(self.library(lacking=lacking), seed=run.seed)
+        left_out = [name for name in map(str, self.terms) if name not in search.library.names]
+        if left_out:
+            run.say(f"terms left out, for this field lacks their variables: {left_out}")
+        kept = Kept(Path(self.keep) / blocks_key(run.settings))
+        begin = time.perf_counter()
+        result, n_before = self._searched(field, search, kept, run)
+        wall_s = time.perf_counter() - begin
+        rng = np.random.default_rng(run.seed)
+        found = regimes(result, rng=rng, max_regimes=self.max_regimes)
+        result = result.assign(regime=found.labels, confidence=found.confidence)
+        packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
+        run.write(
+            "pointwise.nc", lambda path: result.to_netcdf(path, engine="h5netcdf", encoding=packed)
+        )
+        kept.clear()
+        return Outcome(result, found, self.outline, wall_s=wall_s, n_before=n_before)
+
+    def _searched(
+        self, field: xr.Dataset, search: PointSearch, kept: Kept, run: Run
+    ) -> tuple[xr.Dataset, int]:
+        """The result, from where an earlier run was broken off; points that it had done."""
+        blocks = blocks_of(field, self.block_points)
+        n_before = sum(block.n_points for block in blocks if kept.holds(block))
+        n_points = sum(block.n_points for block in blocks)
+        if n_before:
+            run.say(f"going on with {n_before} of {n_points} points that a broken run had done")
+        try:
+            with watched(run, n_points, n_before) as progress:
+                result = pointwise(
+                    field,
+                    search,
+                    workers=self.parallel,
+                    kept=kept,
+                    block_points=self.block_points,
+                    progress=progress,
+                )
+        except KeyboardInterrupt:
+            run.say(
+                f"finished blocks are kept in {kept.folder}: the same command goes on with them"
+            )
+            raise
+        return result, n_before
+
+
+@contextmanager
+def watched(run: Run, n_points: int, n_before: int) -> Iterator[Callable[[int], None]]:
+    """A bar with points per second, and the same in TensorBoard while the run goes on.
+
+    n_before: points that were done already, and come first.
+    """
+    begin = time.perf_counter()
+    done = 0
+    with run.counted(n_points, "point") as count:
+
+        def progress(n_more: int) -> None:
+            nonlocal done
+            done += n_more
+            count(n_more)
+            per_s = max(done - n_before, 0) / max(time.perf_counter() - begin, 1e-9)
+            run.board.scalars({"points/done": float(done), "points/per_s": per_s}, step=done)
+
+        yield progress
+
+
+def blocks_key(settings: Mapping[str, Any]) -> str:
+    """What the result of a block depends on: settings, the files they name, the code."""
+    decisive = {key: value for key, value in settings.items() if key not in AFTERWARDS}
+    decisive["files"] = [
+        (str(path), each.stat().st_size, each.stat().st_mtime_ns)
+        for path in files_named([settings["data"], settings["prepare"]])
+        for each in (path, *sorted(path.rglob("*")))  # a Zarr store is a folder
+    ]
+    found = json.dumps(decisive, sort_keys=True)
+    for sources in (Path(ep2sindy.__file__).parent, *own_sources(settings)):
+        found = fingerprint(found, sources=sources)
+    return found
+
+
+def files_named(settings: object) -> list[Path]:
+    """Every text among some settings that is the path of a file or folder, but the cache."""
+    if isinstance(settings, dict):
+        settings = [value for key, value in settings.items() if key != "cache"]
+    if isinstance(settings, list):
+        return [path for each in settings for path in files_named(each)]
+    is_path = isinstance(settings, str) and settings and Path(settings).exists()
+    return [Path(str(settings))] if is_path else []
+
+
+def own_sources(settings: Mapping[str, Any]) -> list[Path]:
+    """Modules and packages other than ours that the settings name: the user's own code."""
+    names = {*targets(settings), str(settings["study"])}
+    modules = {name.split(".")[0] for name in names if "." in name} - {"ep2sindy"}
+    origins = [spec.origin for name in sorted(modules) if (spec := find_spec(name))]
+    paths = [Path(origin) for origin in origins if origin]
+    return [path.parent if path.name == "__init__.py" else path for path in paths]
+
+
+def targets(settings: object) -> Iterator[str]:
+    """Every `_target_`, at any depth."""
+    if isinstance(settings, dict):
+        yield from (str(settings[key]) for key in settings if key == "_target_")
+        settings = list(settings.values())
+    if isinstance(settings, list):
+        for each in settings:
+            yield from targets(each)
