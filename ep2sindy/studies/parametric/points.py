@@ -70,7 +70,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class PointStudy:
     """What is done at every operating point.
 
     library: holds the terms of all cases. searched: the library that terms are looked for in, by
@@ -89,6 +89,11 @@ class Study:
         for case in self.cases.values():
             for quantity in case.quantities.values():
                 quantity.place(case.constraint, self.library)
+
+    @property
+    def fits(self) -> dict[str, Case]:
+        """By name all fits of a point: every case, and its refinement."""
+        return {name + end: case for name, case in self.cases.items() for end in ("", REFINED)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +137,7 @@ class PointResult:
 
 
 def parametric_study(
-    points: Sequence[PointData], study: Study, *, workers: Workers, rng: np.random.Generator
+    points: Sequence[PointData], study: PointStudy, *, workers: Workers, rng: np.random.Generator
 ) -> Iterator[tuple[int, PointResult]]:
     """Every point on its own samples: all cases fitted and refined, and terms searched for.
 
@@ -147,7 +152,9 @@ def parametric_study(
     yield from workers.run(partial(_fitted_point, study=study), pieces)
 
 
-def _fitted_point(piece: tuple[PointData, np.random.Generator], *, study: Study) -> PointResult:
+def _fitted_point(
+    piece: tuple[PointData, np.random.Generator], *, study: PointStudy
+) -> PointResult:
     """All that is made of one operating point, whose name goes before what cannot work."""
     point, rng = piece
     try:
@@ -156,7 +163,7 @@ def _fitted_point(piece: tuple[PointData, np.random.Generator], *, study: Study)
         raise ValueError(f"operating point {point_label(point.parameters)}: {error}") from error
 
 
-def _point_result(point: PointData, study: Study, *, rng: np.random.Generator) -> PointResult:
+def _point_result(point: PointData, study: PointStudy, *, rng: np.random.Generator) -> PointResult:
     run = point.trajectory
     if run is None:
         return PointResult(point.parameters, point.status)
@@ -186,7 +193,7 @@ def _least_squares(
     run: Trajectory,
     problems: Sequence[Regression],
     case: Case,
-    study: Study,
+    study: PointStudy,
     period_s: float,
     *,
     rng: np.random.Generator,
@@ -225,7 +232,7 @@ def _refined(
     run: Trajectory,
     problems: Sequence[Regression],
     case: Case,
-    study: Study,
+    study: PointStudy,
     period_s: float,
     *,
     start: SparseModel,
@@ -254,7 +261,7 @@ def _refined(
     )
 
 
-def _searched(run: Trajectory, study: Study, *, rng: np.random.Generator) -> Fitted:
+def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
     found = discover(run, study.searched, study.recipe, seed=rng)
     problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
     return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))
