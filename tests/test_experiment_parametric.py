@@ -17,8 +17,8 @@ from ep2sindy.figures.trends import trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.page import page_html
-from ep2sindy.studies.parametric.study import Outcome, Study
-from ep2sindy.studies.parametric.view import with_error
+from ep2sindy.studies.parametric.study import Study
+from ep2sindy.studies.parametric.view import Outcome, with_error
 
 ROOT = Path(__file__).resolve().parents[1]
 ESTIMATES = {

@@ -8,7 +8,7 @@ from typing import Any
 
 from ep2sindy.data.trajectory import ConstantStateError
 from ep2sindy.studies.kinds import Deferred
-from ep2sindy.studies.parametric.oscillation import STEADY, PointData, point_label
+from ep2sindy.studies.parametric.oscillation import STEADY, PointData, naming, point_label
 from ep2sindy.studies.source import Source
 
 WITHOUT_OSCILLATION = (STEADY, "decaying", "diverged")  # what a simulation says of itself
@@ -30,17 +30,16 @@ class PointSource:
 
         A state that stays exactly where it is makes a point steady: no trajectory may hold it.
         """
-        try:
-            field = self.source.field()
-            if (status := field.attrs.get("status")) in WITHOUT_OSCILLATION:
-                return PointData(self.parameters, None, status)
-            sampling = self.source.trajectory
-            run = sampling.trajectory(field, inputs=inputs, label=self.label)
-            return PointData(self.parameters, run)
-        except ConstantStateError:
-            return PointData(self.parameters, None, STEADY)
-        except (ValueError, OSError) as error:
-            raise ValueError(f"operating point {self.label}: {error}") from error
+        with naming(self.parameters):
+            try:
+                field = self.source.field()
+                if (status := field.attrs.get("status")) in WITHOUT_OSCILLATION:
+                    return PointData(self.parameters, None, status)
+                sampling = self.source.trajectory
+                run = sampling.trajectory(field, inputs=inputs, label=self.label)
+                return PointData(self.parameters, run)
+            except ConstantStateError:
+                return PointData(self.parameters, None, STEADY)
 
 
 def point_sources(

@@ -27,8 +27,8 @@ from ep2sindy.studies.parametric.oscillation import (
     OSCILLATING,
     PointData,
     check_points,
+    naming,
     oscillation,
-    point_label,
     spread,
 )
 from ep2sindy.studies.parametric.quantities import (
@@ -37,11 +37,13 @@ from ep2sindy.studies.parametric.quantities import (
     drawn_estimates,
     propagated_estimates,
 )
-from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap, resampled_coefficients
+from ep2sindy.studies.parametric.time_bootstrap import (
+    TimeBootstrap,
+    coefficients_of,
+    resampled_coefficients,
+)
 
 FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
-
-
 REFINED = "_refined"  # ends the name of a case's refinement
 
 
@@ -155,12 +157,9 @@ def parametric_study(
 def _fitted_point(
     piece: tuple[PointData, np.random.Generator], *, study: PointStudy
 ) -> PointResult:
-    """All that is made of one operating point, whose name goes before what cannot work."""
     point, rng = piece
-    try:
+    with naming(point.parameters):
         return _point_result(point, study, rng=rng)
-    except ValueError as error:
-        raise ValueError(f"operating point {point_label(point.parameters)}: {error}") from error
 
 
 def _point_result(point: PointData, study: PointStudy, *, rng: np.random.Generator) -> PointResult:
@@ -211,12 +210,7 @@ def _least_squares(
         n_draws=study.bootstrap.n_draws,
         rng=rng,
     )
-    coef = np.array(
-        [
-            model.coef[study.library.index(term), model.states.index(state)]
-            for state, term in case.constraint.coefficients
-        ]
-    )
+    coef = coefficients_of(model, case.constraint)
     covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
     estimates, drawn = drawn_estimates(coef, draws, case.quantities, case.constraint, study.library)
     return Fitted(

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
-import pandas as pd
 
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Workers
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Section
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.opening import PointSource, point_sources
-from ep2sindy.studies.parametric.points import Case, PointStudy, Refining, parametric_study
+from ep2sindy.studies.parametric.points import (
+    Case,
+    PointResult,
+    PointStudy,
+    Refining,
+    parametric_study,
+)
 from ep2sindy.studies.parametric.quantities import Quantity
-from ep2sindy.studies.parametric.summary import headline, live, summary
-from ep2sindy.studies.parametric.tables import Findings, published_table
+from ep2sindy.studies.parametric.summary import live
+from ep2sindy.studies.parametric.tables import published_table
 from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap
 from ep2sindy.studies.parametric.trends import laws
-from ep2sindy.studies.parametric.view import drawings, sections
+from ep2sindy.studies.parametric.view import Outcome, Panels
 from ep2sindy.studies.source import Source
 
 
@@ -69,14 +72,6 @@ class Trend:
 
     along: str
     at: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class Panels:
-    """Quantities that share a panel of the figure, and what axes and legend call them."""
-
-    panels: Sequence[Sequence[str]]
-    labels: Mapping[str, str]
 
 
 Cases = Annotated[
@@ -132,24 +127,22 @@ class Study:
         law, tying = (polynomial(names, degree=n) for n in (self.law.degree, self.law.tied_degree))
         published = published_table(self.thesis or {}, names)
         sources = point_sources(self.source, self.parameters, self.points)
-        opening = partial(
-            PointSource.opened, inputs=self.source.inputs([how.library, how.searched])
-        )
-        points = _in_order(self.parallel.run(opening, sources), run, len(sources), "opened")
+        inputs = self.source.inputs([how.library, how.searched])
+        opening = self.parallel.run(partial(PointSource.opened, inputs=inputs), sources)
+        points = _in_order(opening, len(sources), "opened", run)
 
         alone, together = np.random.default_rng(run.seed).spawn(2)
         fitted = parametric_study(points, how, workers=self.parallel, rng=alone)
-        results = _in_order(fitted, run, len(points), "fitted", tell=partial(_tell, run))
-        found = Findings(
+        results = _in_order(_told(fitted, run), len(points), "fitted", run)
+        return Outcome(
             study=how,
-            parameters=names,
             results=results,
             laws=laws(results, law, max_terms=self.law.max_terms),
             joint=searched_jointly(points, results, how, tying, rng=together),
             along=[(each.along, each.at) for each in self.trends],
             published=published,
+            shown=self.figures,
         )
-        return Outcome(found, self.figures)
 
     def at_every_point(self) -> PointStudy:
         library, terms = terms_of(self.model, states=self.source.states)
@@ -166,51 +159,19 @@ class Study:
         )
 
 
-def _in_order(
-    numbered: Iterable[tuple[int, Any]],
-    run: Run,
-    total: int,
-    verb: str,
-    *,
-    tell: Callable[[int, Any], None] = lambda number, result: None,
-) -> list[Any]:
-    """Results by number, each told of and counted as it comes."""
+def _in_order(numbered: Iterable[tuple[int, Any]], total: int, verb: str, run: Run) -> list[Any]:
     found = {}
     with run.counted(total, f"point {verb}") as came:
         for number, result in numbered:
             found[number] = result
-            tell(number, result)
             came(1)
     return [found[number] for number in range(total)]
 
 
-def _tell(run: Run, number: int, result: Any) -> None:
-    """To TensorBoard; a step is the number of a point in the config."""
-    run.board.scalars(live(result), step=number)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What all points gave."""
-
-    found: Findings
-    shown: Panels
-
-    def models(self) -> dict[str, SparseModel]:
-        models = self.found.models.items()
-        return {f"point_{number}_{name}": model for (number, name), model in models}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        return self.found.tables()
-
-    def figures(self) -> dict[str, Captioned]:
-        return drawings(self.found, panels=self.shown.panels, labels=self.shown.labels)
-
-    def sections(self) -> list[Section]:
-        return sections(self.found)
-
-    def summary(self) -> dict[str, Any]:
-        return summary(self.found)
-
-    def headline(self) -> dict[str, float]:
-        return headline(self.found)
+def _told(
+    numbered: Iterable[tuple[int, PointResult]], run: Run
+) -> Iterator[tuple[int, PointResult]]:
+    """Every result to TensorBoard as it comes; a step is the number of a point in the config."""
+    for number, result in numbered:
+        run.board.scalars(live(result), step=number)
+        yield number, result

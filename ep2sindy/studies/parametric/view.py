@@ -1,21 +1,24 @@
-"""How the parametric study reads: terminal, page and `summary.json`."""
+"""What the parametric study leaves, and how it reads on the terminal and on the page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.figures.trends import trends_figure
+from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.signals.spectrum import frequency_text
+from ep2sindy.studies.parametric import summary, tables
 from ep2sindy.studies.parametric.all_points import JointResult
 from ep2sindy.studies.parametric.oscillation import point_label
-from ep2sindy.studies.parametric.points import REFINED, PointResult
-from ep2sindy.studies.parametric.tables import Findings, laws_table, supports_table, tied_table
+from ep2sindy.studies.parametric.points import REFINED, Fitted, PointResult, PointStudy
+from ep2sindy.studies.shown import coefficients
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
@@ -27,41 +30,165 @@ INTERVALS = (
 )
 TIED = "One support for all points: R2 with coefficients of its own at each, and tied by a law"
 TRENDS = (
-    "Trends: exponents p of quantity ~ parameter^p, the other parameters held; R2: whether points "
-    "follow it"
+    "Trends: exponents p of quantity ~ parameter^p, the other parameters held, with 95 % "
+    "intervals; r2: whether points follow it"
 )
 LAWS = "Control laws, with the RMS error at points left out, over the mean"
 LEFT_OUT = (
-    "Left out: the law's terms, fitted without the point that they predict. Search left out: the "
+    "loo_error: the law's terms, fitted without the point that they predict. search_error: the "
     "terms searched without it too, the honest one of the two."
 )
 UNITS = "Units are SI, unless a name ends in another, such as mdot_mg_s."
+CAPTION = (
+    "Quantities against one parameter, the others held: filled with 95 % intervals, which are "
+    "smaller than the markers where no bars show"
+)
 
 
-def sections(found: Findings) -> list[Section]:
-    fitted = [result for result in found.results if result.fits]
-    lines = [Text(_point_line(result), warning=not result.fits) for result in found.results]
-    points = [Section("Operating points", [*lines, Text(UNITS, page_only=True)])]
-    for fit in found.study.fits if fitted else ():
-        points.append(Section(_fit_title(found, fit), [Table(_readable_fit(found, fit))], level=3))
-    if fitted:
-        points.append(Section("Intervals", [Text(INTERVALS)], level=3))
-    together = {
-        "Terms found, beside those given": _table(supports_table(found)),
-        TIED: _tied(found.joint),
-        TRENDS: [*_table(_readable_trends(found)), Picture("trends")],
-        LAWS if found.laws else "Control laws": _laws(found),
-    }
-    models = [_model(fitted[0], case) for case in found.study.cases] if fitted else []
-    return [
-        *models,
-        *points,
-        *(Section(title, blocks) for title, blocks in together.items()),
-    ]
+@dataclass(frozen=True)
+class Panels:
+    """Quantities that share a panel of the figure, and what axes and legend call them."""
+
+    panels: Sequence[Sequence[str]]
+    labels: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What all points gave, and what is made of them together.
+
+    laws: by fit and quantity. joint: the search over all points at once; None where there was
+    none. along: (parameter, those held) of every trend. published: as `published_table` makes it.
+    """
+
+    study: PointStudy
+    results: Sequence[PointResult]
+    laws: summary.Laws
+    joint: JointResult | None
+    along: Sequence[tuple[str, Mapping[str, float]]]
+    published: pd.DataFrame
+    shown: Panels
+
+    @property
+    def searches(self) -> dict[str, Sequence[Fitted | None]]:
+        """What searches chose, one entry per point, None where there was nothing to fit."""
+        alone = {"each point": [result.searched for result in self.results]}
+        return alone | ({"all points": self.joint.fitted} if self.joint else {})
+
+    def models(self, pattern: str = "point_{}_{}") -> dict[str, SparseModel]:
+        """By number of the point and name of the fit."""
+        return {
+            pattern.format(number, name): fit.model
+            for number, result in enumerate(self.results)
+            for name, fit in result.fits.items()
+        }
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        return dict(self._tables)
+
+    @cached_property
+    def _tables(self) -> dict[str, pd.DataFrame]:
+        given = [result.fits.get(next(iter(self.study.cases))) for result in self.results]
+        return {
+            "points": tables.points_table(self.results),
+            "quantities": tables.estimates_table(self.results, self.published),
+            "supports": tables.supports_table(self.results, {"given": given, **self.searches}),
+            "laws": tables.laws_table(self.laws),
+            "trends": tables.trends_table(self.results, self.along, self.published),
+            "tied": tables.tied_table(self.joint),
+            "coefficients": coefficients(self.models("point {}, {}"), heading="model"),
+        }
+
+    def figures(self) -> dict[str, Captioned]:
+        """None where no point oscillates or no trend was asked for: it would say nothing."""
+        estimates = self._tables["quantities"]
+        if estimates.empty or not self.along or not self.shown.panels:
+            return {}
+        published = ", open what the thesis found in its data" if len(self.published) else ""
+        lines = ", lines the control laws of least squares" if self.laws else ""
+        draw = partial(
+            trends_figure,
+            estimates[estimates["usable"]],
+            self.published,
+            {fit: laws for fit, laws in self.laws.items() if not fit.endswith(REFINED)},
+            panels=self.shown.panels,
+            trends=self.along,
+            labels=self.shown.labels,
+        )
+        return {"trends": Captioned(draw, f"{CAPTION}{published}{lines}.")}
+
+    def sections(self) -> list[Section]:
+        oscillating = [result for result in self.results if result.fits]
+        cases, fits = (self.study.cases, self.study.fits) if oscillating else ((), ())
+        lines = [Text(_point_line(result), warning=not result.fits) for result in self.results]
+        return [
+            *(_model(oscillating[0], case) for case in cases),
+            Section("Operating points", [*lines, Text(UNITS, page_only=True)]),
+            *(self._fit(fit) for fit in fits),
+            *([Section("Intervals", [Text(INTERVALS)], level=3)] if fits else []),
+            *self._together(),
+        ]
+
+    def _fit(self, fit: str) -> Section:
+        """One row per point: its quantities with half their intervals, and the thesis's."""
+        estimates = tables.held(self._tables["quantities"], {"fit": fit})
+        units = next(each.fits[fit].model.units for each in self.results if each.fits)
+        headings = {
+            name: _heading(name, quantity.unit(self.study.library, units))
+            for name, quantity in self.study.fits[fit].quantities.items()
+        }
+        rows = []
+        for result in self.results:
+            here = tables.held(estimates, result.parameters).to_dict("records")
+            cells = {each["quantity"]: _cell(each) for each in here}
+            row: dict[str, Any] = dict(result.parameters)
+            row |= {heading: cells.get(name, "-") for name, heading in headings.items()}
+            if fitted := result.fits.get(fit):
+                row |= {f"R2 {state}": f"{value:.2f}" for state, value in fitted.r2.items()}
+                row |= {"loss": f"{fitted.loss:.3f}"} if fit.endswith(REFINED) else {}
+            rows.append(row | {"status": fitted.status if fitted else result.status})
+        thesis = " (thesis)" if estimates["thesis"].notna().any() else ""
+        return Section(f"{_spoken(fit)}{thesis}", [Table(pd.DataFrame(rows))], level=3)
+
+    def _together(self) -> list[Section]:
+        """What is made of all points."""
+        shown = self._tables
+        tied = _table(shown["tied"], ["state"])
+        if self.joint and self.joint.why_not_tied:
+            tied = [Text(f"Not tied by a law: {self.joint.why_not_tied}.")]
+        laws = [*_table(shown["laws"], ["fit"]), Text(LEFT_OUT)]
+        if not self.laws:
+            n = max(sum(each.usable(fit) for each in self.results) for fit in self.study.fits)
+            needed = "a law needs 3, and all parameters to vary over them"
+            laws = [Text(f"None: {n} points fitted; {needed}.")]
+        supports = _table(shown["supports"], list(self.results[0].parameters))
+        trends = _table(shown["trends"], ["along", "fit"])
+        return [
+            Section("Terms found, beside those given", supports),
+            Section(TIED, tied),
+            Section(TRENDS, [*trends, Picture("trends")]),
+            Section(LAWS if self.laws else "Control laws", laws),
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "points": [
+                summary.point_summary(
+                    result, self.study.cases, {name: at[k] for name, at in self.searches.items()}
+                )
+                for k, result in enumerate(self.results)
+            ],
+            "laws": summary.laws_summary(self.laws),
+            "trends": self._tables["trends"].to_dict("records"),
+            "joint": summary.joint_summary(self.joint),
+        }
+
+    def headline(self) -> dict[str, float]:
+        n_oscillating = float(sum(bool(result.fits) for result in self.results))
+        return {"n_oscillating": n_oscillating, **summary.law_errors(self.laws, self.study.fits)}
 
 
 def _model(result: PointResult, case: str) -> Section:
-    """The model of a case at one point."""
     at = ", ".join(f"{name} = {value:g}" for name, value in result.parameters.items())
     model = result.fits[case].model
     equations = [Equation(state, model.terms(state)) for state in model.states]
@@ -78,48 +205,13 @@ def _point_line(result: PointResult) -> str:
     return text if result.fits else f"{text}; left out of trends"
 
 
-def _table(rows: pd.DataFrame) -> list[Block]:
-    return [Table(rows) if len(rows) else Text("None.")]
-
-
-def _tied(joint: JointResult | None) -> list[Block]:
-    if joint and joint.why_not_tied:
-        return [Text(f"Not tied by a law: {joint.why_not_tied}.")]
-    return _table(tied_table(joint))
-
-
-def _fit_title(found: Findings, fit: str) -> str:
-    """`free (thesis)` where the thesis has values of this fit, whose cells then show them."""
-    title = fit.replace("_", ", ")
-    return f"{title} (thesis)" if (found.published["fit"] == fit).any() else title
-
-
-def _heading(found: Findings, fit: str, name: str) -> str:
+def _heading(name: str, unit: str) -> str:
     """`g_inj (m^-3 s^-1)`: a quantity with its unit, unless its name ends in that: `L_m`."""
-    units = next(result.fits[fit].model.units for result in found.results if fit in result.fits)
-    unit = found.study.fits[fit].quantities[name].unit(found.study.library, units)
     return name if unit == "1" or name.endswith(f"_{unit}") else f"{name} ({unit})"
 
 
-def _readable_fit(found: Findings, fit: str) -> pd.DataFrame:
-    """One row per point: its quantities with half the width of the interval, and the thesis's."""
-    headings = {name: _heading(found, fit, name) for name in found.study.fits[fit].quantities}
-    estimates = found.estimates[found.estimates["fit"] == fit]
-    rows = []
-    for result in found.results:
-        fitted = result.fits.get(fit)
-        here = estimates
-        for name, value in result.parameters.items():
-            here = here[here[name] == value]
-        cells = {each["quantity"]: _cell(each) for each in here.to_dict("records")}
-        row: dict[str, Any] = dict(result.parameters)
-        row |= {heading: cells.get(name, "-") for name, heading in headings.items()}
-        if fitted:
-            row |= {f"R2 {state}": f"{value:.2f}" for state, value in fitted.r2.items()}
-            if fit.endswith(REFINED):
-                row["loss"] = f"{fitted.loss:.3f}"
-        rows.append(row | {"status": fitted.status if fitted else result.status})
-    return pd.DataFrame(rows)
+def _spoken(fit: str) -> str:
+    return fit.replace("_", ", ")
 
 
 def _cell(row: Mapping[Any, Any]) -> str:
@@ -138,77 +230,13 @@ def with_error(value: float, reach: float) -> str:
     return f"{f'{value:#.{digits}g}'.removesuffix('.')} ±{reach:.1g}"
 
 
-def _readable_trends(found: Findings) -> pd.DataFrame:
-    table = found.trends
-    if table.empty:
-        return table
-    half = 0.5 * (table["high"] - table["low"])
-    readable = pd.DataFrame(
-        {
-            "along": table["along"],
-            "fit": table["fit"].str.replace("_", ", "),
-            "quantity": table["quantity"],
-            "points": table["n_points"],
-            "exponent": table["exponent"].map(_two_places),
-            "±": half.map(lambda v: "-" if np.isnan(v) else f"{v:.1g}"),
-            "R2": table["r2"].map(_two_places),
-            "thesis": table["thesis"].map(_two_places),
-        }
-    )
-    return readable if len(found.published) else readable.drop(columns="thesis")
-
-
-def _two_places(value: float) -> str:
-    return "-" if np.isnan(value) else f"{round(value, 2) + 0.0:.2f}"
-
-
-def _laws(found: Findings) -> list[Block]:
-    if not found.laws:
-        usable = (sum(r.usable(fit) for r in found.results) for fit in found.study.fits)
-        return [
-            Text(
-                f"None: {max(usable)} points fitted; a law needs 3, and all parameters to vary "
-                "over them."
-            )
-        ]
-    table = laws_table(found.laws)
-    readable = pd.DataFrame(
-        {
-            "fit": table["fit"].str.replace("_", ", "),
-            "law": table["law"],
-            "R2": table["r2"].map(_two_places),
-            "left out": table["loo_error"].map("{:.1%}".format),
-            "search left out": table["search_error"].map("{:.1%}".format),
-        }
-    )
-    return [Table(readable), Text(LEFT_OUT)]
-
-
-def drawings(
-    found: Findings, *, panels: Sequence[Sequence[str]], labels: Mapping[str, str]
-) -> dict[str, Captioned]:
-    """None where no point oscillates or no trend was asked for: an empty figure says nothing."""
-    if found.estimates.empty or not found.along or not panels:
-        return {}
-    draw = partial(
-        trends_figure,
-        found.estimates[found.estimates["usable"]],
-        found.published,
-        {fit: laws for fit, laws in found.laws.items() if not fit.endswith(REFINED)},
-        panels=panels,
-        trends=found.along,
-        labels=labels,
-    )
-    return {"trends": Captioned(draw, _caption(found))}
-
-
-def _caption(found: Findings) -> str:
-    parts = [
-        "Quantities against one parameter, the others held: filled with 95 % intervals, which are "
-        "smaller than the markers where no bars show"
-    ]
-    if len(found.published):
-        parts.append("open what the thesis found in its data")
-    if found.laws:
-        parts.append("lines the control laws of least squares")
-    return f"{', '.join(parts)}."
+def _table(rows: pd.DataFrame, by: Sequence[str]) -> list[Block]:
+    """Without columns that say nothing; a rule follows where those of `by` change."""
+    if rows.empty:
+        return [Text("None.")]
+    if "fit" in rows:
+        rows = rows.assign(fit=rows["fit"].map(_spoken))
+    keys = rows[list(by)]
+    ends = (keys != keys.shift(-1)).any(axis=1)
+    shown = rows.dropna(axis=1, how="all").round({"r2": 3, "exponent": 3})
+    return [Table(shown, breaks=np.flatnonzero(ends)[:-1].tolist())]
