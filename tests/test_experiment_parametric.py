@@ -6,18 +6,19 @@ import pandas as pd
 import pytest
 import xarray as xr
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from ep2sindy.app.runner import run_config, started_run
+from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.discovery.control_law import control_law
 from ep2sindy.figures.trends import trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from experiments import parametric
-from experiments.parametric_view import with_error
-from experiments.run import innermost
+from ep2sindy.report.page import page_html
+from ep2sindy.studies.parametric.study import Study
+from ep2sindy.studies.parametric.view import Outcome, with_error
 
 ROOT = Path(__file__).resolve().parents[1]
 ESTIMATES = {
@@ -29,10 +30,22 @@ THREE = (
     "{V_D_V: 300.0, mdot_mg_s: 2.0, data: {operating_point: {neutral_speed: 190.0}}}]"
 )
 
+LIBRARY_KEYS = "library may have ['degree', 'products', 'variables'] and needs variables and degree"
+
 
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         return compose("config", overrides=["+exp=parametric", *overrides])
+
+
+def computed(config: DictConfig) -> tuple[Outcome, str, str]:
+    """What a study finds, its page and its log: all but figures, which take long to draw."""
+    with started_run(config) as run:
+        outcome = study_of(Study, config).compute(run)
+        sections = outcome.sections()
+        run.screen.show(sections)
+        log = " ".join((run.folder.path / "run.log").read_text().split())
+    return outcome, page_html(config.experiment, sections, {}), log
 
 
 def toy(output: Path) -> list[str]:
@@ -54,7 +67,7 @@ def toy(output: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of three operating points."""
-    return parametric.run(composed(*toy(tmp_path_factory.mktemp("outputs")), THREE))
+    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), THREE)).folder
 
 
 def summary_of(folder: Path) -> dict:
@@ -142,9 +155,10 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
     page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
     assert "<h3>free (thesis)</h3>" in page
     assert "<h3>free, refined</h3>" in page  # the thesis refined nothing
+    assert "<h2>Model: constrained, at V_D_V = 200, mdot_mg_s = 5</h2>" in page
     assert "<th>L_m</th><th>g_inj (m^-3 s^-1)</th><th>eps</th>" in page
     assert "V_D_V=200, mdot_mg_s=5: oscillating" in log
-    assert "control laws, with the RMS error at points left out" in log
+    assert "Control laws, with the RMS error at points left out" in log
 
 
 @pytest.mark.parametrize(
@@ -233,8 +247,8 @@ def test_own_files_and_a_point_that_does_not_oscillate(tmp_path: Path) -> None:
     still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
     places = {first: "200.0", second: "300.0", still: "400.0"}
     points = [f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {p}}}}}" for p, V in places.items()]
-    folder = parametric.run(composed(*own_files(tmp_path, *points)))
-    summary = summary_of(folder)
+    outcome, *texts = computed(composed(*own_files(tmp_path, *points)))
+    summary = outcome.summary()
     assert [p["status"] for p in summary["points"]] == ["oscillating", "oscillating", "steady"]
     assert [p["dt_s"] for p in summary["points"]] == pytest.approx([1.5e-6, 2e-6, 1.5e-6])
     steady = summary["points"][2]
@@ -242,8 +256,7 @@ def test_own_files_and_a_point_that_does_not_oscillate(tmp_path: Path) -> None:
     assert steady["ci95"]["free"] is None
     assert summary["laws"] == {}
     assert {row["n_points"] for row in summary["trends"] if row["along"] == "V_D_V"} == {2}
-    page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
-    for text in (page, " ".join(log.split())):
+    for text in texts:
         assert "V_D_V=400, mdot_mg_s=5: steady; 1000 samples of 1.5e-06 s; left out of t" in text
         assert "one: 2 points fitted; a law needs 3" in text
         assert "Search left out" not in text  # there are no laws whose errors it could explain
@@ -254,11 +267,9 @@ def test_without_a_thesis_nothing_speaks_of_one(tmp_path: Path) -> None:
     second = breathing_file(tmp_path / "b.nc", amplitude=0.4, dt_s=1.5e-6, rate=1.1)
     places = {first: "200.0", second: "300.0"}
     points = [f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {p}}}}}" for p, V in places.items()]
-    folder = parametric.run(composed(*own_files(tmp_path, *points), "thesis=null"))
-    assert "thesis" not in (folder / "report.html").read_text()
-    assert "thesis" not in (folder / "run.log").read_text()
-    trends = pd.read_csv(folder / "tables" / "trends.csv")
-    assert trends["low"].isna().all()  # of two points at most
+    outcome, page, log = computed(composed(*own_files(tmp_path, *points), "thesis=null"))
+    assert "thesis" not in page + log + outcome.figures()["trends"].caption
+    assert outcome.tables()["trends"]["low"].isna().all()  # of two points at most
 
 
 def test_a_state_that_never_moves_makes_a_point_steady(tmp_path: Path) -> None:
@@ -266,16 +277,16 @@ def test_a_state_that_never_moves_makes_a_point_steady(tmp_path: Path) -> None:
     dead = breathing_file(tmp_path / "b.nc", amplitude=0.0, dt_s=1.5e-6)
     places = {swinging: "200.0", dead: "300.0"}
     points = [f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {p}}}}}" for p, V in places.items()]
-    folder = parametric.run(composed(*own_files(tmp_path, *points)))
-    assert [p["status"] for p in summary_of(folder)["points"]] == ["oscillating", "steady"]
+    outcome, _, _ = computed(composed(*own_files(tmp_path, *points)))
+    assert [p["status"] for p in outcome.summary()["points"]] == ["oscillating", "steady"]
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
     still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
     point = f"{{V_D_V: 300.0, mdot_mg_s: 5.0, data: {{path: {still}}}}}"
-    folder = parametric.run(composed(*own_files(tmp_path, point), "trajectory.zone=null"))
+    folder = run_config(composed(*own_files(tmp_path, point), "trajectory.zone=null")).folder
     assert not (folder / "figures").exists()
-    assert "none: 0 points fitted; a law needs 3" in " ".join(
+    assert "None: 0 points fitted; a law needs 3" in " ".join(
         (folder / "run.log").read_text().split()
     )
     assert summary_of(folder)["points"][0]["status"] == "steady"
@@ -290,7 +301,7 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
         for V, name in ((200.0, "a.nc"), (300.0, "b.nc"))
     ]
     with pytest.raises(ValueError, match=r"operating point V_D_V=300, mdot_mg_s=5: .*'u_iz'"):
-        parametric.run(composed(*own_files(tmp_path, *points)))
+        computed(composed(*own_files(tmp_path, *points)))
 
 
 @pytest.mark.parametrize(
@@ -307,15 +318,16 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
             ["parameters.V_D_V=null", "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"],
             "operating points must differ in their data: V_D_V=2, mdot_mg_s=5 has that of V_D_V=1",
         ),
-        (["parameters.V_D_V=operating_point.volts"], "data.operating_point.volts is none"),
+        (["parameters.V_D_V=operating_point.volts"], "data.operating_point.volts must be there"),
         (["points=[{V_D_V: 1, mdot_mg_s: 5, data: {n_cels: 3}}]"], "n_cels"),
         (["cases=null"], "cases must be like {free: {relations: [], quantities:"),
         (["~cases.free.relations"], "cases.free must have relations and quantities"),
         (["cases.free.quantities.L_m.coefficient='n_i: n_n'"], "unknown term 'n_n'; this library"),
         (["cases.free.quantities.L_m.power=3"], "the power 1 or -1"),
-        (["+cases.free.quantities.L_m.exponent=3"], "unexpected keyword argument 'exponent'"),
+        (["+cases.free.quantities.L_m.exponent=3"], "L_m may have ['coefficient', 'factor', 'po"),
         (["bootstrap.n_draws=5"], "a 95 % interval needs 40 draws or more"),
-        (["+library.variables_if_present=[u_ir]"], "the same for every point"),
+        (["+library.variables_if_present=[u_ir]"], LIBRARY_KEYS),
+        (["~library.products", "+library.n_norm=max_terms"], LIBRARY_KEYS),
         (["trends=[{along: V_D_V, at: {}}]"], "a trend goes along one parameter and holds"),
         (["figures.panels=[[L]]"], "figures.panels names ['L']; there are ["),
         (["+laws=1"], "unknown keys ['laws']"),
@@ -326,7 +338,7 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
 def test_settings_that_cannot_work_are_refused(
     overrides: list[str], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises((ValueError, HydraException, OmegaConfBaseException)) as caught:
-        parametric.run(composed(*toy(tmp_path), *overrides))
-    assert message in str(innermost(caught.value))
+    with pytest.raises((ValueError, OmegaConfBaseException)) as caught:
+        computed(composed(*toy(tmp_path), *overrides))
+    assert message in str(caught.value)
     assert not (tmp_path / "cache").exists()

@@ -27,8 +27,8 @@ from ep2sindy.studies.parametric.points import (
     Case,
     Fitted,
     PointResult,
+    PointStudy,
     Refining,
-    Study,
     parametric_study,
 )
 from ep2sindy.studies.parametric.quantities import (
@@ -63,9 +63,9 @@ CASES = {
 SEARCHED = polynomial(["x", "y", "R", "u"], degree=2, products=["x*y*R"])
 
 
-def study(*, weak: bool = True) -> Study:
+def study(*, weak: bool = True) -> PointStudy:
     every = RandomSplit(0.0)
-    return Study(
+    return PointStudy(
         library=LIBRARY,
         cases=CASES,
         bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
@@ -123,7 +123,7 @@ def points() -> list[PointData]:
     ]
 
 
-def results_of(points: list[PointData], how: Study, *, seed: int = 0) -> list[PointResult]:
+def results_of(points: list[PointData], how: PointStudy, *, seed: int = 0) -> list[PointResult]:
     found = dict(parametric_study(points, how, workers=Serial(), rng=np.random.default_rng(seed)))
     return [found[k] for k in range(len(points))]
 

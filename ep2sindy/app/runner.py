@@ -49,10 +49,17 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
 
 
 def study_class(name: str) -> type:
-    """The class `Study` of a module of `ep2sindy.studies`, or of one's own by its dotted name."""
+    """The class `Study` of a module of `ep2sindy.studies`, or of one's own by its dotted name.
+
+    A folder holds it in its module `study`.
+    """
     module = name if "." in name else f"ep2sindy.studies.{name}"
     try:
-        return import_module(module).Study
+        found = import_module(module)
+        if hasattr(found, "__path__") and not hasattr(found, "Study"):
+            module = f"{module}.study"
+            found = import_module(module)
+        return found.Study
     except (ModuleNotFoundError, AttributeError) as error:
         if isinstance(error, ModuleNotFoundError) and not module.startswith(str(error.name)):
             raise  # the module is there, but one that it needs is not
@@ -67,8 +74,8 @@ def known_studies() -> list[str]:
     folder = Path(ep2sindy.studies.__file__ or "").parent
     found = []
     for module in iter_modules([str(folder)]):
-        path = folder / (f"{module.name}/__init__.py" if module.ispkg else f"{module.name}.py")
-        if re.search(r"^class Study\b|import .*\bStudy\b", path.read_text("utf-8"), re.M):
+        path = folder / (f"{module.name}/study.py" if module.ispkg else f"{module.name}.py")
+        if path.is_file() and re.search(r"^class Study\b", path.read_text("utf-8"), re.M):
             found.append(module.name)
     return found
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.library.names import split_factors
+from ep2sindy.library.terms import variables_of
 from ep2sindy.studies.kinds import Kind
 
 Terms = Mapping[str, Sequence[int | str]]  # by state; the constant, 1, may come as a number
@@ -38,13 +38,8 @@ def terms_of(
         )
     terms = {state: [str(name) for name in given[state]] for state in states}
     factors = [
-        variable
-        for names in terms.values()
-        for name in names
-        if name.strip() != "1"
-        for variable, _ in split_factors(name)
+        variable for names in terms.values() for name in names for variable in variables_of(name)
     ]
     variables = list(dict.fromkeys([*states, *factors]))
     named = reduce(add, (named_terms(variables, names) for names in terms.values()))
-    by_degree = np.argsort(named.exponents.sum(axis=1), kind="stable")
-    return Library(variables, named.exponents[by_degree]), terms
+    return named.take(np.argsort(named.degrees, kind="stable")), terms

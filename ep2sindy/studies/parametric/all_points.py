@@ -13,7 +13,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
-from ep2sindy.studies.parametric.points import SEARCHED, Fitted, PointResult, Study
+from ep2sindy.studies.parametric.points import SEARCHED, Fitted, PointResult, PointStudy
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class JointResult:
 def searched_jointly(
     points: Sequence[PointData],
     results: Sequence[PointResult],
-    study: Study,
+    study: PointStudy,
     law: Library,
     *,
     rng: np.random.Generator,

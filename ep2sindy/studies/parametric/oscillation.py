@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +13,9 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 OSCILLATING, STEADY = "oscillating", "steady"
-
 LEAST_SPREAD = 0.01  # of every state, in means, in the second half of the record
-
 LEAST_SHARE = 0.5  # of the first half's standard deviation that is left in the second
-
 LEAST_PERIODS = 4.0  # in the record: fewer may be a drift
-
 # The spectrum's peak, 5 % or two bins to either side, must hold a fifth of the power: white noise
 # has a tenth there at most, the thruster's breathing two thirds.
 PEAK_WIDTH, LEAST_PEAK = 0.05, 0.2
@@ -43,6 +40,15 @@ class PointData:
 def point_label(parameters: Mapping[str, float]) -> str:
     """`V_D_V=300, mdot_mg_s=5`."""
     return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
+
+
+@contextmanager
+def naming(parameters: Mapping[str, float]) -> Iterator[None]:
+    """What cannot work at an operating point is said with its name before it."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise ValueError(f"operating point {point_label(parameters)}: {error}") from error
 
 
 def oscillation(run: Trajectory) -> str:
@@ -75,7 +81,5 @@ def check_points(points: Sequence[PointData], variables: Sequence[str]) -> None:
     """Raise ValueError, naming the point, unless all have the same states, variables and units."""
     known = [(point, point.trajectory) for point in points if point.trajectory is not None]
     for point, run in known:
-        try:
+        with naming(point.parameters):
             check_agreement([known[0][1], run], variables)
-        except ValueError as error:
-            raise ValueError(f"operating point {point_label(point.parameters)}: {error}") from error

@@ -27,8 +27,8 @@ from ep2sindy.studies.parametric.oscillation import (
     OSCILLATING,
     PointData,
     check_points,
+    naming,
     oscillation,
-    point_label,
     spread,
 )
 from ep2sindy.studies.parametric.quantities import (
@@ -37,10 +37,13 @@ from ep2sindy.studies.parametric.quantities import (
     drawn_estimates,
     propagated_estimates,
 )
-from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap, resampled_coefficients
+from ep2sindy.studies.parametric.time_bootstrap import (
+    TimeBootstrap,
+    coefficients_of,
+    resampled_coefficients,
+)
 
 FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
-
 REFINED = "_refined"  # ends the name of a case's refinement
 
 
@@ -69,7 +72,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class PointStudy:
     """What is done at every operating point.
 
     library: holds the terms of all cases. searched: the library that terms are looked for in, by
@@ -88,6 +91,11 @@ class Study:
         for case in self.cases.values():
             for quantity in case.quantities.values():
                 quantity.place(case.constraint, self.library)
+
+    @property
+    def fits(self) -> dict[str, Case]:
+        """By name all fits of a point: every case, and its refinement."""
+        return {name + end: case for name, case in self.cases.items() for end in ("", REFINED)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +139,7 @@ class PointResult:
 
 
 def parametric_study(
-    points: Sequence[PointData], study: Study, *, workers: Workers, rng: np.random.Generator
+    points: Sequence[PointData], study: PointStudy, *, workers: Workers, rng: np.random.Generator
 ) -> Iterator[tuple[int, PointResult]]:
     """Every point on its own samples: all cases fitted and refined, and terms searched for.
 
@@ -146,16 +154,15 @@ def parametric_study(
     yield from workers.run(partial(_fitted_point, study=study), pieces)
 
 
-def _fitted_point(piece: tuple[PointData, np.random.Generator], *, study: Study) -> PointResult:
-    """All that is made of one operating point, whose name goes before what cannot work."""
+def _fitted_point(
+    piece: tuple[PointData, np.random.Generator], *, study: PointStudy
+) -> PointResult:
     point, rng = piece
-    try:
+    with naming(point.parameters):
         return _point_result(point, study, rng=rng)
-    except ValueError as error:
-        raise ValueError(f"operating point {point_label(point.parameters)}: {error}") from error
 
 
-def _point_result(point: PointData, study: Study, *, rng: np.random.Generator) -> PointResult:
+def _point_result(point: PointData, study: PointStudy, *, rng: np.random.Generator) -> PointResult:
     run = point.trajectory
     if run is None:
         return PointResult(point.parameters, point.status)
@@ -185,7 +192,7 @@ def _least_squares(
     run: Trajectory,
     problems: Sequence[Regression],
     case: Case,
-    study: Study,
+    study: PointStudy,
     period_s: float,
     *,
     rng: np.random.Generator,
@@ -203,12 +210,7 @@ def _least_squares(
         n_draws=study.bootstrap.n_draws,
         rng=rng,
     )
-    coef = np.array(
-        [
-            model.coef[study.library.index(term), model.states.index(state)]
-            for state, term in case.constraint.coefficients
-        ]
-    )
+    coef = coefficients_of(model, case.constraint)
     covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
     estimates, drawn = drawn_estimates(coef, draws, case.quantities, case.constraint, study.library)
     return Fitted(
@@ -224,7 +226,7 @@ def _refined(
     run: Trajectory,
     problems: Sequence[Regression],
     case: Case,
-    study: Study,
+    study: PointStudy,
     period_s: float,
     *,
     start: SparseModel,
@@ -253,7 +255,7 @@ def _refined(
     )
 
 
-def _searched(run: Trajectory, study: Study, *, rng: np.random.Generator) -> Fitted:
+def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
     found = discover(run, study.searched, study.recipe, seed=rng)
     problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
     return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))

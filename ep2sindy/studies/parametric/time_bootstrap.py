@@ -59,7 +59,7 @@ def resampled_coefficients(
             f"next: {len(problems[0].trajectories)} came"
         )
     equations = weighted_equations(problems, constraint)
-    coef = np.array([_coefficient(model, *name) for name in constraint.coefficients])
+    coef = coefficients_of(model, constraint)
     rows = [_free_rows(equation, constraint, coef) for equation in equations]
     groups = [e.problem.groups[~e.problem.test] for e in equations]
     numbers = np.unique(np.concatenate(groups))
@@ -91,8 +91,10 @@ def _check_blocks(n_groups: int, block: int) -> None:
         )
 
 
-def _coefficient(model: SparseModel, state: str, term: str) -> float:
-    return float(model.coef[model.library.index(term), model.states.index(state)])
+def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
+    """In the order of the constraint's."""
+    index, states = model.library.index, model.states.index
+    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
 
 
 def _free_rows(
