@@ -45,7 +45,7 @@ def breathing(path: Path, output: Path) -> list[str]:
 def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of one breathing experiment on known data."""
     output = tmp_path_factory.mktemp("outputs")
-    return libraries.run(composed(*breathing(predator_prey, output)))
+    return run(composed(*breathing(predator_prey, output)))
 
 
 def summary_of(folder: Path) -> dict:
@@ -93,7 +93,7 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
 def test_a_fixed_seed_gives_the_same_summary(
     breathing_run: Path, predator_prey: Path, tmp_path: Path
 ) -> None:
-    again = libraries.run(composed(*breathing(predator_prey, tmp_path)))
+    again = run(composed(*breathing(predator_prey, tmp_path)))
     assert summary_of(again) == summary_of(breathing_run)
 
 
@@ -120,15 +120,11 @@ def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
         "search=best_subset",
         f"output={tmp_path}",
     )
-    found = summary_of(libraries.run(config))["models"]["model"]["equations"]
+    found = summary_of(run(config))["models"]["model"]["equations"]
     assert found["x"]["terms"] == pytest.approx({"v": 1.0}, rel=0.01)
     assert found["v"]["terms"]["x"] == pytest.approx(-9.0, rel=0.05)
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_composes(name: str) -> None:
-    config = composed(f"+exp={name}")
-    assert config.experiment == name
 
 
 @pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])
@@ -141,7 +137,7 @@ def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> 
         f"search={search}",
         f"output={tmp_path}",
     )
-    equations = summary_of(libraries.run(config))["models"]["model"]["equations"]
+    equations = summary_of(run(config))["models"]["model"]["equations"]
     assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
 
 
@@ -235,43 +231,16 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         "libraries.ionization.degree=2",
         f"output={tmp_path}",
     )
-    folder = libraries.run(config)
+    folder = run(config)
     assert summary_of(folder)["data"]["n_samples"] == 201
     assert "simulation: " in (folder / "run.log").read_text()
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
-def run_program(*overrides: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.run", *overrides],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
-def test_the_last_line_names_the_run_folder(predator_prey: Path, tmp_path: Path) -> None:
-    result = run_program(*breathing(predator_prey, tmp_path))
-    assert result.returncode == 0, result.stderr
-    assert (Path(result.stdout.splitlines()[-1]) / "summary.json").is_file()
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ([], f"error: choose an experiment with +exp=NAME; there are {', '.join(EXPERIMENTS)}"),
-        (["+exp=breathing", "sede=1"], "Could not override 'sede'"),
-        (["+exp=breathing", "data=file", "data.path=none.nc"], "error: no such file: "),
-    ],
-)
-def test_mistakes_end_in_one_clear_message(
-    overrides: list[str], message: str, tmp_path: Path
-) -> None:
-    result = run_program(*overrides, f"output={tmp_path}")
-    assert result.returncode != 0
-    assert message in result.stderr
-    assert "Traceback" not in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -303,34 +272,17 @@ def test_settings_that_cannot_work_are_refused(
 ) -> None:
     config = composed(*breathing(predator_prey, tmp_path), *overrides)
     with pytest.raises((ValueError, OSError, HydraException, OmegaConfBaseException)) as caught:
-        libraries.run(config)
+        run(config)
     assert message in str(innermost(caught.value))
 
 
-def test_a_setting_that_a_study_does_not_use_is_refused() -> None:
-    given = ["+exp=benchmark", "seed=1", "n_realizations=1"]
-    check_overrides(given, used=(), experiment="benchmark")
-    check_overrides(["search=stlsq", "depth=2"], used=("search", "depth"), experiment="breathing")
-    for unused in ("search=stlsq", "depth=2", "formulation.smoother.window=21", "data=file"):
-        with pytest.raises(ValueError, match="would do nothing: benchmark does not use"):
-            check_overrides([*given, unused], used=(), experiment="benchmark")
 
 
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:
     config = composed(*breathing(predator_prey, tmp_path), "bootstraps.n_culled=6")
     with pytest.raises(ValueError, match="n_culled"):
-        libraries.run(config)
+        run(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
 
 
-def test_a_sweep_can_go_to_slurm() -> None:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose(
-            "config",
-            overrides=["+exp=parametric", "hydra/launcher=slurm"],
-            return_hydra_config=True,
-        )
-    launcher = config.hydra.launcher
-    assert launcher._target_.endswith("SlurmLauncher")
-    assert (launcher.cpus_per_task, launcher.tasks_per_node) == (8, 1)
