@@ -156,9 +156,9 @@ def test_this_packages_path_is_a_variant_and_keeps_the_empty_support() -> None:
     ("settings", "message"),
     [
         ({"systems": ["pendulum"]}, "unknown systems ['pendulum']; there are ['oscillator', "),
-        ({"n_realizations": 0}, "a benchmark needs a realization, a system, a noise level"),
-        ({"noises": []}, "a benchmark needs a realization, a system, a noise level"),
-        ({"variants": {}}, "a benchmark needs a realization, a system, a noise level"),
+        ({"n_realizations": 0}, "there must be something to run"),
+        ({"noises": []}, "there must be something to run"),
+        ({"variants": {}}, "there must be something to run"),
     ],
 )
 def test_a_benchmark_of_nothing_is_refused(settings: dict, message: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 from distributed import LocalCluster
 from threadpoolctl import threadpool_info
 
-from ep2sindy.machine.parallel import Dask, Loky, Serial, Workers
+from ep2sindy.machine.parallel import Dask, Loky, Serial, Workers, rows_in_order
 
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
 
@@ -27,6 +27,11 @@ def scaled_total(values: np.ndarray, *, factor: float) -> float:
 def n_threads(_: object) -> int:
     np.ones((2, 2)) @ np.ones((2, 2))
     return max(pool["num_threads"] for pool in threadpool_info())
+
+
+def slow_first(piece: int) -> list[int]:
+    time.sleep(0.1 * piece)
+    return piece * [piece]
 
 
 def fails_on_three(piece: int) -> int:
@@ -64,6 +69,15 @@ def workers(request: pytest.FixtureRequest) -> Workers:
 def test_every_piece_is_done_once_and_keeps_its_number(workers: Workers) -> None:
     found = dict(workers.run(total, iter(PIECES)))
     assert found == {k: piece.sum() for k, piece in enumerate(PIECES)}
+
+
+def test_rows_come_in_the_order_of_their_pieces() -> None:
+    told: list[int] = []
+    rows = rows_in_order(Loky(n_jobs=2), slow_first, [3, 0, 2], told.append)
+    assert rows == [3, 3, 3, 2, 2]
+    assert told == [1, 1, 1]
+    with pytest.raises(ValueError, match="there must be something to run: 1 pieces came"):
+        rows_in_order(Serial(), slow_first, [0])
 
 
 def test_a_piece_has_one_thread(workers: Workers) -> None:

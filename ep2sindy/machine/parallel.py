@@ -46,11 +46,17 @@ def rows_in_order(
     """The rows that a function finds in every piece, in the order of the pieces.
 
     progress: told of every finished piece.
+    Raises ValueError where there is no row at all.
     """
     found = {}
     for number, rows in workers.run(function, pieces):
         found[number] = rows
         progress(1)
+    if not any(found.values()):
+        raise ValueError(
+            f"there must be something to run: {len(found)} pieces came, without a row; leave no "
+            "list of settings empty"
+        )
     return [row for number in sorted(found) for row in found[number]]
 
 

@@ -78,12 +78,6 @@ def run_benchmark(
     has NaN there. Raises ValueError for an unknown system, or nothing to run.
     """
     check_systems(systems)
-    if n_realizations < 1 or not (variants and systems and len(noises)):
-        raise ValueError(
-            "a benchmark needs a realization, a system, a noise level and a variant at least: "
-            f"n_realizations={n_realizations}, systems={list(systems)}, noises={list(noises)}, "
-            f"variants={list(variants)}"
-        )
     numbers = range(n_realizations)
     tasks = [(name, noise, k) for name in systems for noise in sorted(noises) for k in numbers]
     judge = partial(_outcomes, variants, n_trajectories=n_trajectories, seed=seed)

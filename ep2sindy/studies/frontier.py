@@ -76,15 +76,9 @@ def identification_frontier(
     Raises ValueError for nothing to run, and where a variant cannot run on the longest and
     fastest of all: that is no matter of samples.
     """
-    if not (variants and len(rates_Hz) and len(durations_s)):
-        raise ValueError(
-            "a frontier needs a variant, a rate and a duration at least: "
-            f"variants={list(variants)}, rates_Hz={list(rates_Hz)}, durations_s={list(durations_s)}"
-        )
     # The largest comes first: a variant that cannot run at all fails before the work is done.
     points = sorted(((r, d) for r in rates_Hz for d in durations_s), reverse=True)
-    largest = (max(rates_Hz), max(durations_s))
-    judge = partial(_point, system, variants, seed=seed, largest=largest)
+    judge = partial(_point, system, variants, seed=seed, largest=points[:1])
     rows: list[dict[str, Any]] = rows_in_order(workers, judge, points, progress)
     place = {name: k for k, name in enumerate(variants)}
     rows.sort(key=lambda row: (place[row["variant"]], row["rate_Hz"], row["duration_s"]))
@@ -97,7 +91,7 @@ def _point(
     point: tuple[float, float],
     *,
     seed: int,
-    largest: tuple[float, float],
+    largest: list[tuple[float, float]],
 ) -> list[dict[str, object]]:
     rate_Hz, duration_s = point
     n_samples = round(rate_Hz * duration_s)
@@ -115,7 +109,7 @@ def _point(
             finding = variant.find([run], system.model.library, rng=rng)
             identified = judged(finding, truth)["on_front"] == 1.0
         except ValueError as error:
-            if point == largest:
+            if [point] == largest:
                 raise
             reason = str(error)
         rows.append(

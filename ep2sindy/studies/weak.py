@@ -146,26 +146,20 @@ class Outcome:
         rows = []
         for name, fitted in self.labelled.items():
             integrated, states = fitted.integrated, self.data.state_names
-            frequency = frequency_text(integrated.frequency_Hz[states[0]])
+            f_text = frequency_text(integrated.frequency_Hz[states[0]])
+            steady = not np.isnan(fitted.f_error)
+            of_model = {
+                "f": f"{f_text} ({100 * fitted.f_error:+.0f} %)" if steady else "-",
+                "nrmse": "-" if np.isnan(integrated.nrmse) else f"{integrated.nrmse:.2f}",
+                "verdict": integrated.verdict,
+            }
             for k, state in enumerate(states):
-                steady = not np.isnan(fitted.f_error)
-                whole = {
-                    "f": f"{frequency} ({100 * fitted.f_error:+.0f} %)" if steady else "-",
-                    "nrmse": "-" if np.isnan(integrated.nrmse) else f"{integrated.nrmse:.2f}",
-                    "verdict": integrated.verdict,
-                }
-                rows.append(
-                    {
-                        "setting": "" if k else name,
-                        "state": state,
-                        **self._windows(fitted, state),
-                        "R2": f"{fitted.r2[state]:.3f}",
-                        **(dict.fromkeys(whole, "") if k else whole),
-                    }
-                )
+                windows, score = self._windows(fitted, state), f"{fitted.r2[state]:.3f}"
+                row = {"setting": "" if k else name, "state": state, **windows, "R2": score}
+                rows.append(row if k else row | of_model)
         n = len(self.data.state_names)
         return Table(
-            pd.DataFrame(rows),
+            pd.DataFrame(rows).fillna(""),
             title=f"Models {INTEGRATED}",
             breaks=range(n - 1, len(rows), n),
             note=f"The data's first state has {frequency_text(self.f_data_Hz)}. R2 is on each "

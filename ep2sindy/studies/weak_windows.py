@@ -109,11 +109,6 @@ def coefficient_errors(
     One row per noise, number and setting. Raises ValueError, before any fit, for windows that
     are longer than the trajectory, or nothing to run.
     """
-    if n_realizations < 1 or not len(noises) or not settings:
-        raise ValueError(
-            "errors need a realization, a noise level and a setting at least: "
-            f"n_realizations={n_realizations}, noises={list(noises)}, settings={list(settings)}"
-        )
     check_windows(settings, round(system.duration_s * system.rate_Hz))
     tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
     fit = partial(_realization, system, settings, seed=seed)
