@@ -1,31 +1,18 @@
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
-from hydra.utils import instantiate
-from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from ep2sindy.app.runner import run_config
+from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from experiments import libraries
-from experiments.build import check_overrides, open_prepared_field, recipe_of, selection_of
-from experiments.run import innermost
-
-ROOT = Path(__file__).resolve().parents[1]
-EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"))
-
-
-def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=list(overrides))
+from ep2sindy.studies.libraries import Study
+from tests.programs import EXPERIMENTS, ROOT, composed, computed
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -45,7 +32,7 @@ def breathing(path: Path, output: Path) -> list[str]:
 def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of one breathing experiment on known data."""
     output = tmp_path_factory.mktemp("outputs")
-    return run(composed(*breathing(predator_prey, output)))
+    return run_config(composed(*breathing(predator_prey, output))).folder
 
 
 def summary_of(folder: Path) -> dict:
@@ -93,8 +80,9 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
 def test_a_fixed_seed_gives_the_same_summary(
     breathing_run: Path, predator_prey: Path, tmp_path: Path
 ) -> None:
-    again = run(composed(*breathing(predator_prey, tmp_path)))
-    assert summary_of(again) == summary_of(breathing_run)
+    again = computed(composed(*breathing(predator_prey, tmp_path))).summary
+    first = summary_of(breathing_run)
+    assert json.loads(json.dumps(again)) == {k: first[k] for k in again}
 
 
 def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
@@ -120,11 +108,9 @@ def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
         "search=best_subset",
         f"output={tmp_path}",
     )
-    found = summary_of(run(config))["models"]["model"]["equations"]
+    found = computed(config).summary["models"]["model"]["equations"]
     assert found["x"]["terms"] == pytest.approx({"v": 1.0}, rel=0.01)
     assert found["v"]["terms"]["x"] == pytest.approx(-9.0, rel=0.05)
-
-
 
 
 @pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])
@@ -137,7 +123,7 @@ def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> 
         f"search={search}",
         f"output={tmp_path}",
     )
-    equations = summary_of(run(config))["models"]["model"]["equations"]
+    equations = computed(config).summary["models"]["model"]["equations"]
     assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
 
 
@@ -160,14 +146,9 @@ def test_every_formulation_and_selection_finds_predator_and_prey(
     config = composed(
         *breathing(predator_prey, tmp_path), f"formulation={formulation}", f"selection={selection}"
     )
-    to_trajectory = instantiate(config.trajectory, _convert_="all")
-    run = to_trajectory(open_prepared_field(config), inputs=[], label="")
-    found = discover(
-        [run],
-        polynomial(["n_i", "n_n"], degree=2),
-        recipe_of(config),
-        seed=0,
-    )
+    study = study_of(Study, config)
+    run = study.source.trajectory.trajectory(study.source.field(), inputs=[], label="")
+    found = discover(run, polynomial(["n_i", "n_n"], degree=2), study.recipe, seed=0)
     # Least exact are the differential form, as above, and boxes of a hundred samples, over which
     # the trapezoidal rule leaves 0.1 %.
     truth = {"n_i": -1.64e5, "n_i*n_n": 4.66e-14}
@@ -181,15 +162,15 @@ def test_every_formulation_and_selection_finds_predator_and_prey(
 )
 def test_a_selection_on_the_command_line_is_every_librarys(rule: str, tmp_path: Path) -> None:
     config = composed(*breathing(tmp_path, tmp_path), f"selection={rule}")
-    expected = instantiate(config.selection)
-    for case in config.libraries.values():
-        assert type(instantiate(selection_of(case, config.selection))) is type(expected)
+    study = study_of(Study, config)
+    for case in study.libraries.values():
+        assert type(case.recipe(study.recipe).selection) is type(study.recipe.selection)
 
 
 def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
     predator_prey: Path, tmp_path: Path
 ) -> None:
-    folder = libraries.run(
+    result = computed(
         composed(
             *breathing(predator_prey, tmp_path),
             "formulation=weak",
@@ -199,23 +180,22 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
             "~libraries.velocity",
         )
     )
-    found = summary_of(folder)["models"]["simple"]["equations"]
+    found = result.summary["models"]["simple"]["equations"]
     # The field was integrated to 1e-8; bumps add no error of their own.
     assert found["n_i"]["terms"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=1e-6)
-    assert found["n_i"]["r2_test"] is None
-    front = pd.read_csv(folder / "tables" / "front_simple.csv")
+    assert np.isnan(found["n_i"]["r2_test"])
+    front = result.outcome.tables()["front_simple"]
     for state, rows in front.groupby("equation"):
         assert rows.loc[rows["selected"], "EBIC"].item() == rows["EBIC"].min()
         assert found[state]["EBIC"] == pytest.approx(rows["EBIC"].min())
         assert rows["n_terms"].value_counts().max() == 2
-    log = (folder / "run.log").read_text()
     for words in ("selection: EBIC(gamma=1.0", "R2 train", "weighted: n_i' = -1.64e+05 n_i"):
-        assert words in log
+        assert words in result.log
 
 
 def test_a_library_may_have_a_knee_norm_of_its_own(breathing_run: Path) -> None:
     log = (breathing_run / "run.log").read_text()
-    assert "simple: 6 terms in n_i, n_n; selection: Knee(n_norm='library')" in log
+    assert "6 terms in n_i, n_n; selection: Knee(n_norm='library')" in log
     assert log.count("selection: Knee(n_norm='max_terms')") == 2
 
 
@@ -231,16 +211,10 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         "libraries.ionization.degree=2",
         f"output={tmp_path}",
     )
-    folder = run(config)
-    assert summary_of(folder)["data"]["n_samples"] == 201
-    assert "simulation: " in (folder / "run.log").read_text()
+    found = computed(config)
+    assert found.summary["data"]["n_samples"] == 201
+    assert "simulation: " in found.log
     assert len(list((tmp_path / "cache").iterdir())) == 1
-
-
-
-
-
-
 
 
 @pytest.mark.parametrize(
@@ -271,18 +245,32 @@ def test_settings_that_cannot_work_are_refused(
     overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
 ) -> None:
     config = composed(*breathing(predator_prey, tmp_path), *overrides)
-    with pytest.raises((ValueError, OSError, HydraException, OmegaConfBaseException)) as caught:
-        run(config)
-    assert message in str(innermost(caught.value))
-
-
+    with pytest.raises((ValueError, OSError, OmegaConfBaseException)) as caught:
+        run_config(config)
+    assert message in str(caught.value)
 
 
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:
     config = composed(*breathing(predator_prey, tmp_path), "bootstraps.n_culled=6")
     with pytest.raises(ValueError, match="n_culled"):
-        run(config)
+        run_config(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
 
 
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_composes(name: str) -> None:
+    config = composed(f"+exp={name}")
+    assert config.experiment == name
+
+
+def test_a_sweep_can_go_to_slurm() -> None:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = compose(
+            "config",
+            overrides=["+exp=parametric", "hydra/launcher=slurm"],
+            return_hydra_config=True,
+        )
+    launcher = config.hydra.launcher
+    assert launcher._target_.endswith("SlurmLauncher")
+    assert (launcher.cpus_per_task, launcher.tasks_per_node) == (8, 1)
