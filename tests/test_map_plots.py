@@ -57,6 +57,22 @@ def grouped(result: xr.Dataset) -> Regimes:
     return regimes(result, rng=np.random.default_rng(0))
 
 
+@pytest.fixture(scope="module")
+def coefficients() -> Figure:
+    """Drawn once for all tests that look at it, as the two below."""
+    return coefficient_maps(study())
+
+
+@pytest.fixture(scope="module")
+def quality() -> Figure:
+    return quality_maps(study())
+
+
+@pytest.fixture(scope="module")
+def regime() -> Figure:
+    return regime_map(grouped(study()))
+
+
 def maps(figure: Figure) -> list[tuple[Axes, np.ma.MaskedArray]]:
     """Panels with a map, and its values over (r, z), colour bars left out."""
     found = []
@@ -71,8 +87,8 @@ def legend(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_a_coefficient_shows_its_sign_and_its_exponent() -> None:
-    drawn = [values for _, values in maps(coefficient_maps(study()))]
+def test_a_coefficient_shows_its_sign_and_its_exponent(coefficients: Figure) -> None:
+    drawn = [values for _, values in maps(coefficients)]
     assert len(drawn) == 2 * len(TERMS)
     by_panel = dict(zip([(e, t) for e in ("n_i", "n_n") for t in TERMS], drawn, strict=True))
     constant = by_panel["n_n", "1"].filled(np.nan)[:, :2].T.ravel()
@@ -96,16 +112,16 @@ def test_a_coefficient_below_the_scale_is_not_drawn_as_absent(sign: float) -> No
     assert not np.allclose(mesh.to_rgba(least), to_rgba(ABSENT), atol=0.01)
 
 
-def test_masked_cells_are_blank_and_absent_terms_are_not() -> None:
-    for _, values in maps(coefficient_maps(study())):
+def test_masked_cells_are_blank_and_absent_terms_are_not(coefficients: Figure) -> None:
+    for _, values in maps(coefficients):
         assert np.ma.getmaskarray(values)[:, -1].all()
         assert not np.ma.getmaskarray(values)[:, :-1].any()
-    absent = maps(coefficient_maps(study()))[0][1]
+    absent = maps(coefficients)[0][1]
     assert (absent.compressed() == 0.0).all()
 
 
-def test_maps_have_the_proportions_of_the_thruster() -> None:
-    for figure in (coefficient_maps(study()), quality_maps(study())):
+def test_maps_have_the_proportions_of_the_thruster(coefficients: Figure, quality: Figure) -> None:
+    for figure in (coefficients, quality):
         for ax, _ in maps(figure):
             assert ax.get_aspect() == 1.0
             assert ax.get_xlim() == pytest.approx((-0.05, 2.45))  # cm: half a cell around
@@ -161,8 +177,8 @@ def test_a_regime_map_shows_labels_and_leaves_invalid_points_blank() -> None:
     assert confidence.compressed().tolist() == pytest.approx([1.0] * 16, abs=0.01)
 
 
-def test_a_regime_map_gives_every_regime_its_equations() -> None:
-    entries = legend(regime_map(grouped(study())))
+def test_a_regime_map_gives_every_regime_its_equations(regime: Figure) -> None:
+    entries = legend(regime)
     assert len(entries) == 2
     assert {entry.split("\n")[0][:20] for entry in entries} == {
         "regime 0: 8 points, ",
@@ -179,8 +195,8 @@ def test_an_equation_without_terms_reads_zero() -> None:
     assert all(r"\dot{n}_{i} = 0$" in entry for entry in legend(regime_map(grouped(result))))
 
 
-def test_r2_below_zero_is_drawn_as_zero() -> None:
-    drawn = {ax.get_title(): values for ax, values in maps(quality_maps(study()))}
+def test_r2_below_zero_is_drawn_as_zero(quality: Figure) -> None:
+    drawn = {ax.get_title(): values for ax, values in maps(quality)}
     assert (drawn[r"$\dot{n}_{i}$: $R^2$, held-out"].compressed() == 0.8).all()
     assert (drawn[r"$\dot{n}_{n}$: $R^2$, held-out"].compressed() == 0.0).all()
 
@@ -192,8 +208,8 @@ def test_quality_is_of_the_training_rows_where_none_are_held_out() -> None:
     assert (drawn[r"$\dot{n}_{n}$: $R^2$, training"].compressed() == 0.9).all()
 
 
-def test_quality_maps_count_what_became_of_the_points() -> None:
-    assert legend(quality_maps(study())) == ["fitted (16)", "no plasma (4)"]
+def test_quality_maps_count_what_became_of_the_points(quality: Figure) -> None:
+    assert legend(quality) == ["fitted (16)", "no plasma (4)"]
 
 
 def test_where_every_point_is_fitted_there_is_no_panel_for_it() -> None:
@@ -212,16 +228,15 @@ def test_the_status_of_the_points_has_its_scale(cut: dict[str, int]) -> None:
     assert any(label.get_visible() and label.get_text() for label in ax.get_xticklabels())
 
 
-def test_no_value_is_drawn_in_a_shade_near_white() -> None:
+def test_no_value_is_drawn_in_a_shade_near_white(regime: Figure) -> None:
     for scale in (SHARES, COUNTS):
         assert scale(np.linspace(0.0, 1.0, 50))[:, :3].min(axis=1).max() < 0.8
-    figure = regime_map(grouped(study()))
-    (ax, _) = maps(figure)[1]
+    (ax, _) = maps(regime)[1]
     assert ax.collections[0].get_cmap() == SHARES
 
 
-def test_the_figure_says_that_coefficients_are_medians() -> None:
-    (found,) = regime_map(grouped(study())).legends
+def test_the_figure_says_that_coefficients_are_medians(regime: Figure) -> None:
+    (found,) = regime.legends
     assert found.get_title().get_text().startswith("terms that act, with medians over the")
 
 

@@ -3,11 +3,11 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
-from distributed import LocalCluster
 
 from ep2sindy.data.zones import point
 from ep2sindy.discovery.blocks import Kept, blocks_of
@@ -68,19 +68,30 @@ def bytes_of(result: xr.Dataset) -> dict[str, bytes]:
     return {str(name): values.values.tobytes() for name, values in result.variables.items()}
 
 
-def test_every_point_gets_its_own_exact_equation() -> None:
-    result = pointwise(parabolas(), searching(), workers=Serial())
-    assert (result["status"] == 0).all()
-    coef = result["coef"].sel(equation="x")
+@pytest.fixture(scope="module")
+def exact() -> xr.Dataset:
+    """Without noise; looked at, never changed."""
+    return pointwise(parabolas(), searching(), workers=Serial())
+
+
+@pytest.fixture(scope="module")
+def noisy_bytes() -> dict[str, bytes]:
+    """With noise, on one process, in blocks of a line."""
+    return bytes_of(pointwise(noisy(), searching(), workers=Serial(), block_points=4))
+
+
+def test_every_point_gets_its_own_exact_equation(exact: xr.Dataset) -> None:
+    assert (exact["status"] == 0).all()
+    coef = exact["coef"].sel(equation="x")
     expected = {"1": (1.0 + 100.0 * Z)[:, None] + 0.0 * R, "u": -50.0 * R + 0.0 * Z[:, None]}
     for name in LIBRARY.names:
         np.testing.assert_allclose(
             coef.sel(term=name).transpose("z", "r"), expected.get(name, 0.0), rtol=1e-9
         )
-    assert (result["n_terms"] == 2).all()
-    np.testing.assert_allclose(result["r2_test"], 1.0, rtol=1e-12)
-    np.testing.assert_array_equal(result["inclusion"].sel(term=["1", "u"]), 1.0)
-    np.testing.assert_array_equal(result["inclusion"].sel(term=["x", "w", "u*w"]), 0.0)
+    assert (exact["n_terms"] == 2).all()
+    np.testing.assert_allclose(exact["r2_test"], 1.0, rtol=1e-12)
+    np.testing.assert_array_equal(exact["inclusion"].sel(term=["1", "u"]), 1.0)
+    np.testing.assert_array_equal(exact["inclusion"].sel(term=["x", "w", "u*w"]), 0.0)
 
 
 def test_weights_are_shares_of_the_root_mean_square() -> None:
@@ -113,13 +124,12 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
 
 
 @pytest.mark.parametrize("axis", ["z", "r"])
-def test_a_field_may_have_one_axis(axis: str) -> None:
+def test_a_field_may_have_one_axis(axis: str, exact: xr.Dataset) -> None:
     other = "r" if axis == "z" else "z"
     line = parabolas().isel({other: 0}, drop=True)
-    whole = pointwise(parabolas(), searching(), workers=Serial())
     result = pointwise(line, searching(), workers=Serial())
     assert result["status"].dims == (axis,)
-    np.testing.assert_array_equal(result["coef"], whole["coef"].isel({other: 0}))
+    np.testing.assert_array_equal(result["coef"], exact["coef"].isel({other: 0}))
 
 
 def test_a_grid_may_be_one_point() -> None:
@@ -128,7 +138,9 @@ def test_a_grid_may_be_one_point() -> None:
 
 
 @pytest.fixture
-def cluster() -> Iterator[LocalCluster]:
+def cluster() -> Iterator[Any]:
+    from distributed import LocalCluster  # takes a second: not while tests are collected
+
     with LocalCluster(
         n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
     ) as cluster:
@@ -136,21 +148,19 @@ def cluster() -> Iterator[LocalCluster]:
 
 
 @pytest.mark.parametrize("block_points", [1, 5, 1000])
-def test_blocks_do_not_show_in_the_result(block_points: int) -> None:
-    whole = pointwise(noisy(), searching(), workers=Serial(), block_points=4)
+def test_blocks_do_not_show_in_the_result(block_points: int, noisy_bytes: dict[str, bytes]) -> None:
     result = pointwise(noisy(), searching(), workers=Serial(), block_points=block_points)
-    assert bytes_of(result) == bytes_of(whole)
+    assert bytes_of(result) == noisy_bytes
 
 
-def test_processes_give_the_same_bits() -> None:
-    serial = pointwise(noisy(), searching(), workers=Serial(), block_points=2)
-    assert bytes_of(
-        pointwise(noisy(), searching(), workers=Loky(n_jobs=2), block_points=2)
-    ) == bytes_of(serial)
+def test_processes_give_the_same_bits(noisy_bytes: dict[str, bytes]) -> None:
+    result = pointwise(noisy(), searching(), workers=Loky(n_jobs=2), block_points=2)
+    assert bytes_of(result) == noisy_bytes
 
 
-def test_a_cluster_gives_the_same_bits_even_if_a_worker_is_killed(cluster: LocalCluster) -> None:
-    serial = pointwise(noisy(), searching(), workers=Serial(), block_points=1)
+def test_a_cluster_gives_the_same_bits_even_if_a_worker_is_killed(
+    cluster: Any, noisy_bytes: dict[str, bytes]
+) -> None:
     pids = [worker.pid for worker in cluster.workers.values()]
 
     def kill_one(_: int) -> None:
@@ -162,7 +172,7 @@ def test_a_cluster_gives_the_same_bits_even_if_a_worker_is_killed(cluster: Local
         noisy(), searching(), workers=Dask(cluster.scheduler_address), block_points=1,
         progress=kill_one,
     )  # fmt: skip
-    assert bytes_of(spread) == bytes_of(serial)
+    assert bytes_of(spread) == noisy_bytes
 
 
 def test_what_cannot_be_fitted_is_flagged_and_never_zero() -> None:
@@ -209,13 +219,14 @@ def test_a_field_without_plasma_is_an_error() -> None:
         pointwise(empty, searching(), workers=Serial())
 
 
-def test_units_of_coefficients_follow_the_field() -> None:
-    result = pointwise(parabolas(), searching(), workers=Serial())
-    assert result["coef_units"].sel(equation="x", term="u").item() == "m^-4"
-    assert result["coef_units"].sel(equation="x", term="x").item() == "s^-1"
+def test_units_of_coefficients_follow_the_field(exact: xr.Dataset) -> None:
+    assert exact["coef_units"].sel(equation="x", term="u").item() == "m^-4"
+    assert exact["coef_units"].sel(equation="x", term="x").item() == "s^-1"
 
 
-def test_a_broken_run_goes_on_with_its_finished_blocks(tmp_path: Path) -> None:
+def test_a_broken_run_goes_on_with_its_finished_blocks(
+    tmp_path: Path, noisy_bytes: dict[str, bytes]
+) -> None:
     kept, done = Kept(tmp_path / "blocks"), []
 
     def stop_after_three(n_points: int) -> None:
@@ -234,8 +245,7 @@ def test_a_broken_run_goes_on_with_its_finished_blocks(tmp_path: Path) -> None:
     assert len(finished) == 3
     result = run(lambda n_points: None)
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
-    undisturbed = pointwise(noisy(), searching(), workers=Serial(), block_points=2)
-    assert bytes_of(result) == bytes_of(undisturbed)
+    assert bytes_of(result) == noisy_bytes
     (kept.folder / "of_another_run").touch()
     kept.clear()
     assert [path.name for path in kept.folder.iterdir()] == ["of_another_run"]

@@ -15,7 +15,7 @@ from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
 
-SIZES = {"fast": (12, 11, 1000), "full": (20, 15, 1500)}
+SIZES = {"fast": (8, 7, 600), "full": (20, 15, 1500)}
 ONE_EQUATION = dict.fromkeys(REGIONS, REGIONS["exit"])
 # The points that are invalid on purpose in the results below.
 HOLES = ((0, 0), (2, 1))
@@ -239,8 +239,8 @@ def points(n: int = 60) -> tuple[np.ndarray, np.ndarray]:
 def test_the_order_of_the_points_does_not_matter() -> None:
     # No groups at all, so that the mixture's random starts decide where regimes end.
     rng = np.random.default_rng(3)
-    weights = rng.uniform(-1.0, 1.0, (150, 4))
-    draws = weights + 0.02 * rng.standard_normal((8, 150, 4))
+    weights = rng.uniform(-1.0, 1.0, (60, 4))
+    draws = weights + 0.02 * rng.standard_normal((8, 60, 4))
     labels, confidence = group_points(weights, draws, rng=np.random.default_rng(0))
     assert labels.max() > 0
     order = rng.permutation(len(weights))

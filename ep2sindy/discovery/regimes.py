@@ -23,6 +23,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float, Int
 from sklearn.mixture import GaussianMixture
+from threadpoolctl import threadpool_limits
 
 from ep2sindy.data.fields import SPACE
 
@@ -184,12 +185,14 @@ def _mixture(
     if n_most == 1:
         return None
     sizes = np.arange(1, n_most + 1)
-    candidates = [
-        GaussianMixture(
-            n, covariance_type="spherical", reg_covar=floor, n_init=N_STARTS, random_state=seed
-        ).fit(points)
-        for n in sizes.tolist()
-    ]
+    # On one thread: a step is so short that threads would wait for each other most of the time.
+    with threadpool_limits(limits=1):
+        candidates = [
+            GaussianMixture(
+                n, covariance_type="spherical", reg_covar=floor, n_init=N_STARTS, random_state=seed
+            ).fit(points)
+            for n in sizes.tolist()
+        ]
     n_effective = len(points) / (1.0 + len(points) / COARSENING)
     # A mean, a variance and a share each; the shares sum to one.
     n_parameters = sizes * (points.shape[1] + 2) - 1

@@ -140,7 +140,8 @@ def blocks_key(settings: Mapping[str, Any]) -> str:
     decisive = {key: value for key, value in settings.items() if key not in AFTERWARDS}
     decisive["files"] = [
         (str(path), each.stat().st_size, each.stat().st_mtime_ns)
-        for path in files_named([settings["data"], settings["prepare"]])
+        for key, text in texts([settings["data"], settings["prepare"]])
+        if key != "cache" and text and (path := Path(text)).exists()
         for each in (path, *sorted(path.rglob("*")))  # a Zarr store is a folder
     ]
     found = json.dumps(decisive, sort_keys=True)
@@ -149,30 +150,22 @@ def blocks_key(settings: Mapping[str, Any]) -> str:
     return found
 
 
-def files_named(settings: object) -> list[Path]:
-    """Every text among some settings that is the path of a file or folder, but the cache."""
-    if isinstance(settings, dict):
-        settings = [value for key, value in settings.items() if key != "cache"]
-    if isinstance(settings, list):
-        return [path for each in settings for path in files_named(each)]
-    is_path = isinstance(settings, str) and settings and Path(settings).exists()
-    return [Path(str(settings))] if is_path else []
-
-
 def own_sources(settings: Mapping[str, Any]) -> list[Path]:
     """Modules and packages other than ours that the settings name: the user's own code."""
-    names = {*targets(settings), str(settings["study"])}
-    modules = {name.split(".")[0] for name in names if "." in name} - {"ep2sindy"}
+    names = [text for key, text in texts(settings) if key in ("_target_", "study") and "." in text]
+    modules = {name.split(".")[0] for name in names} - {"ep2sindy"}
     origins = [spec.origin for name in sorted(modules) if (spec := find_spec(name))]
     paths = [Path(origin) for origin in origins if origin]
     return [path.parent if path.name == "__init__.py" else path for path in paths]
 
 
-def targets(settings: object) -> Iterator[str]:
-    """Every `_target_`, at any depth."""
-    if isinstance(settings, dict):
-        yield from (str(settings[key]) for key in settings if key == "_target_")
-        settings = list(settings.values())
-    if isinstance(settings, list):
+def texts(settings: object, key: str = "") -> Iterator[tuple[str, str]]:
+    """Every text among some settings, at any depth, after the key that it stands under."""
+    if isinstance(settings, Mapping):
+        for name, value in settings.items():
+            yield from texts(value, str(name))
+    elif isinstance(settings, list):
         for each in settings:
-            yield from targets(each)
+            yield from texts(each, key)
+    elif isinstance(settings, str):
+        yield key, settings
