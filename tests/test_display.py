@@ -7,6 +7,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.refine import Refinement, refine
@@ -38,11 +39,8 @@ def crowded(n_states: int = 3, *, known: bool = False) -> SparseModel:
 @pytest.fixture(scope="module")
 def discovery() -> Discovery:
     system = lotka_volterra()
-    return discover(
-        [system.trajectory()], system.model.library, formulation=Differential(),
-        search=BestSubset(), bootstraps=Bootstraps(n=2), selection=EBIC(),
-        rng=np.random.default_rng(0),
-    )  # fmt: skip
+    recipe = Recipe(Differential(), BestSubset(), Bootstraps(n=2), EBIC())
+    return discover(system.trajectory(), system.model.library, recipe)
 
 
 @pytest.fixture(scope="module")

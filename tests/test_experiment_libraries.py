@@ -227,7 +227,7 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["+seeds=1"], "unknown keys ['seeds']; there are "),
         (["seed=abc"], "seed must be a whole number"),
         (["depth=0"], "depth must be a whole number, one or more: 0 came"),
-        (["depth=1.5"], "depth must be a whole number, one or more: 1.5 came"),
+        (["depth=1.5"], "depth must be a whole number: 1.5 came"),
         (["libraries.simple.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["rollout_s=-1"], "rollout_s must be a positive number"),
         (["trajectory.zone.z=[0.5,0.6]"], "a zone must hold grid points"),

@@ -3,14 +3,12 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
 from ep2sindy.library.equations import equation_html
 from ep2sindy.machine.files import fingerprint, replacing, write_text
 from ep2sindy.report.folder import RunFolder
-from ep2sindy.report.page import table_html
 
 NOW = datetime(2026, 1, 2, 3, 4, 5)
 
@@ -71,7 +69,8 @@ def test_figures_are_written_as_png_and_pdf(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path, "x", now=NOW)
     figure = Figure()
     figure.subplots().plot(np.arange(3))
-    folder.write_figures({"line": figure})
+    path = folder.write_figure("line", figure)
+    assert path.read_bytes().startswith(b"\x89PNG")
     names = sorted(p.name for p in (folder.path / "figures").iterdir())
     assert names == ["line.pdf", "line.png"]
 
@@ -81,7 +80,7 @@ def test_a_written_figure_keeps_its_layout(tmp_path: Path) -> None:
     axes = figure.subplots(1, 2)
     axes[0].set_ylabel("a label that takes room")
     before = axes[0].get_position().bounds
-    RunFolder.create(tmp_path, "x", now=NOW).write_figures({"line": figure})
+    RunFolder.create(tmp_path, "x", now=NOW).write_figure("line", figure)
     solved = axes[0].get_position().bounds
     assert solved != before
     axes[0].set_ylabel("another\nthat takes\nmore")
@@ -107,9 +106,3 @@ def test_equations_read_in_html() -> None:
     assert equation_html("x", {}) == "d<i>x</i>/dt = 0"
     assert "10<sup>&minus;14</sup>" in equation_html("x", {"x": 4e-14})
     assert "&lang;<i>n</i><sub>i</sub> <i>R</i>&rang;" in equation_html("x", {"<n_i*R>": 1.0})
-
-
-def test_tables_mark_the_selected_row() -> None:
-    table = pd.DataFrame({"n_terms": [1, 2], "r2": [0.5, float("nan")]})
-    html = table_html(table, bold=[False, True])
-    assert '<tr class="selected"><td>2</td><td>&ndash;</td></tr>' in html

@@ -7,7 +7,6 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.series import (
     derivative_figure,
     phase_figure,
-    rollout_figures,
     spectrum_figure,
     trajectory_figure,
 )
@@ -16,6 +15,7 @@ from ep2sindy.library.library import named_terms
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.smoothers import NoSmoothing
+from ep2sindy.studies.shown import Shown, rollout_drawings
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +26,16 @@ def oscillation() -> Trajectory:
     return Trajectory(t, states, ("x", "v"), units={"x": "m", "v": "m/s"})
 
 
+def rolled(t: np.ndarray, states: np.ndarray, *, diverged: bool = False) -> Rollout:
+    names = ("x", "v")[: states.shape[1]]
+    return Rollout(t, states, diverged, "", names, np.empty((len(t), 0)), (), {})
+
+
 def rollouts(run: Trajectory, n: int) -> dict[str, Rollout]:
     """The data again, each a little larger; the last runs away."""
-    grown = {f"model {k}": Rollout(run.t, (1 + 0.1 * k) * run.states, False, "") for k in range(n)}
+    grown = {f"model {k}": rolled(run.t, (1 + 0.1 * k) * run.states) for k in range(n)}
     away = run.states[:200] * np.exp(run.t[:200, None])
-    return grown | {f"model {n - 1}": Rollout(run.t[:200], away, True, "grew")}
+    return grown | {f"model {n - 1}": rolled(run.t[:200], away, diverged=True)}
 
 
 @pytest.mark.parametrize("n_models", [1, 3, 8])
@@ -88,6 +93,6 @@ def test_a_model_that_runs_away_does_not_shrink_the_rest() -> None:
 
 def test_one_state_has_no_phase_portrait(oscillation: Trajectory) -> None:
     one = Trajectory(oscillation.t, oscillation.states[:, :1], ("x",))
-    rollout = Rollout(one.t, one.states, False, "")
-    figures = rollout_figures(one, {"model": rollout}, duration_s=20.0, f_max_Hz=None)
+    rollout = rolled(one.t, one.states)
+    figures = rollout_drawings(one, {"model": rollout}, Shown(20.0, None))
     assert set(figures) == {"trajectories", "spectra"}

@@ -60,27 +60,6 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figur
     return figure
 
 
-def rollout_figures(
-    run: Trajectory,
-    rollouts: Mapping[str, Rollout],
-    *,
-    duration_s: float,
-    f_max_Hz: float | None,
-) -> dict[str, Figure]:
-    """Trajectories, spectra and, of two states or more, phase portraits.
-
-    f_max_Hz: None goes as far as the samples can tell.
-    """
-    figures = {
-        "trajectories": trajectory_figure(run, rollouts, duration_s=duration_s),
-        "spectra": spectrum_figure(run, rollouts, f_max_Hz=f_max_Hz or 0.5 / run.dt_s),
-    }
-    if len(run.state_names) > 1:
-        plane = run.state_names[:2]
-        figures["phase"] = phase_figure(run, rollouts, plane=plane, duration_s=duration_s)
-    return figures
-
-
 def trajectory_figure(
     run: Trajectory, rollouts: Mapping[str, Rollout], *, duration_s: float
 ) -> Figure:

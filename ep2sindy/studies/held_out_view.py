@@ -100,7 +100,7 @@ class Outcome:
         shown = pictures([*CAPTIONS, *self.more_figures])
         return [
             Section("Equations", [*relations, *intervals]),
-            *equation_sections(models),
+            *equation_sections(models, page_only=True),
             Section("Held-out time", [self._table(), *shown]),
         ]
 

@@ -86,7 +86,9 @@ def intervals_text(model: SparseModel, state: str) -> str:
     return "; ".join(f"{term}: {low:.4g} to {high:.4g}" for term, (low, high) in ends.items())
 
 
-def equation_sections(models: Mapping[str, SparseModel]) -> list[Section]:
+def equation_sections(
+    models: Mapping[str, SparseModel], *, page_only: bool = False
+) -> list[Section]:
     """Under the name of each model its equations, with intervals where they are known."""
     found = []
     for name, model in models.items():
@@ -94,6 +96,6 @@ def equation_sections(models: Mapping[str, SparseModel]) -> list[Section]:
         for state in model.states:
             blocks.append(Equation(state, model.terms(state), on_screen=True))
             if model.covariance is not None:
-                blocks.append(Text(f"95 %: {intervals_text(model, state)}"))
+                blocks.append(Text(f"95 %: {intervals_text(model, state)}", page_only=page_only))
         found.append(Section(name, blocks, level=3))
     return found
