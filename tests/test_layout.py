@@ -1,7 +1,8 @@
 """The house rule: imports go one way, rooms stay small, and heavy guests stay in their rooms."""
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -51,17 +52,19 @@ def named(path: Path) -> str:
 PATHS = {named(path): path for path in MODULES}
 
 
-def imports(path: Path, *, at_once: bool) -> Iterator[str]:
+@cache
+def imports(path: Path, *, at_once: bool) -> frozenset[str]:
     """Modules that a file imports; at_once: only what importing the file itself loads."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
+    found: set[str] = set()
     for node in _loaded(tree) if at_once else ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path.name}: write imports in full"
             assert node.module is not None
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return frozenset(found)
 
 
 def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
@@ -75,13 +78,14 @@ def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
         yield from _loaded(node)
 
 
-def own(names: Iterator[str]) -> set[str]:
+def own(names: Iterable[str]) -> set[str]:
     """Those of our modules, without the package's name; a name from a module is that module."""
     inside = {name.removeprefix("ep2sindy.") for name in names if name.startswith("ep2sindy.")}
     return inside & set(PATHS)
 
 
-def loaded(module: str) -> set[str]:
+@cache
+def loaded(module: str) -> frozenset[str]:
     """Every module of ours that importing this one loads, itself included."""
     found = {module}
     stack = [module]
@@ -89,7 +93,7 @@ def loaded(module: str) -> set[str]:
         for name in own(imports(PATHS[stack.pop()], at_once=True)) - found:
             found.add(name)
             stack.append(name)
-    return found
+    return frozenset(found)
 
 
 @pytest.mark.parametrize("module", PATHS)
