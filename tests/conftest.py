@@ -1,28 +1,20 @@
-"""Shapes and types of the whole package are checked while the tests run."""
+"""What all tests share."""
 
-import pkgutil
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from jaxtyping import install_import_hook
+from threadpoolctl import threadpool_limits
 
+from tests import type_checks
 from tests.warm import compile_kernels
 
-PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
-# Compiled by numba, which cannot look inside a checking wrapper.
-COMPILED = ("kernels", "gram_fits")
-
-
-def checked_modules() -> list[str]:
-    """Every module of the package but the compiled ones; hooking a package hooks all below it."""
-    names = [m.name for m in pkgutil.walk_packages([str(PACKAGE)], prefix="ep2sindy.")]
-    packages = {n for n in names if any(other.startswith(n + ".") for other in names)}
-    return [n for n in names if n not in packages and n.rsplit(".", 1)[-1] not in COMPILED]
-
-
-install_import_hook(checked_modules(), "beartype.beartype")
+type_checks.install()
+# Workers share the cores: threads of their own would only get in each other's way.
+threadpool_limits(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of PyTorch, which is imported later
 
 
 def pytest_configure(config: pytest.Config) -> None:

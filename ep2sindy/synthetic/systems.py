@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -42,23 +43,49 @@ class System:
             raise ValueError(
                 f"noise must be zero, or positive together with an rng: noise={noise}, rng={rng}"
             )
-        t = np.arange(round(self.duration_s * self.rate_Hz)) / self.rate_Hz
         start = self.initial if initial is None else initial
-        solution = solve_ivp(
-            lambda _, x: self.model.derivative(x, np.empty(0)),
-            (0.0, t[-1]),
-            start,
-            method="DOP853",
-            t_eval=t,
-            rtol=1e-10,
-            atol=1e-10,
-        )
-        states = solution.y.T
+        t, states = _integrated(_Start.of(self, np.asarray(start, dtype=np.float64)))
         if rng is not None:
             generator = np.random.default_rng(rng)
             rms = np.sqrt(np.square(states).mean(axis=0))
             states = states + noise * rms * generator.standard_normal(states.shape)
         return Trajectory(t=t, states=states, state_names=self.model.states, label=self.name)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A system and where it starts: equal where all that decides the integration is."""
+
+    key: tuple[object, ...]
+    system: System = field(compare=False)
+    initial: Float[np.ndarray, " n_states"] = field(compare=False)
+
+    @staticmethod
+    def of(system: System, initial: Float[np.ndarray, " n_states"]) -> _Start:
+        model = system.model
+        numbers = model.coef.tobytes(), initial.tobytes(), system.duration_s, system.rate_Hz
+        key = (*model.states, *model.library.variables, *model.library.names, *numbers)
+        return _Start(key, system, initial)
+
+
+@lru_cache(maxsize=64)  # realizations differ in their noise, and seldom in what it falls on
+def _integrated(
+    start: _Start,
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]]:
+    system = start.system
+    t = np.arange(round(system.duration_s * system.rate_Hz)) / system.rate_Hz
+    solution = solve_ivp(
+        lambda _, x: system.model.derivative(x, np.empty(0)),
+        (0.0, t[-1]),
+        start.initial,
+        method="DOP853",
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-10,
+    )
+    states = solution.y.T  # in this layout: sums over samples depend on it in the last digit
+    states.flags.writeable = False
+    return t, states
 
 
 def damped_oscillator(*, zeta: float = 0.1, omega: float = 3.0) -> System:
