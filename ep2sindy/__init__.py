@@ -44,6 +44,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.regimes import regimes as regimes
     from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
     from ep2sindy.discovery.shared_support import discover_jointly as discover_jointly
+    from ep2sindy.library.equations import equation_text as equation_text
     from ep2sindy.library.library import Library as Library
     from ep2sindy.library.library import named_terms as named_terms
     from ep2sindy.library.library import polynomial as polynomial
@@ -53,6 +54,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.model.integrated import Integrated as Integrated
     from ep2sindy.model.integrated import integrate as integrate
     from ep2sindy.model.model import SparseModel as SparseModel
+    from ep2sindy.model.model import coef_matrix as coef_matrix
     from ep2sindy.model.rollout import Rollout as Rollout
     from ep2sindy.model.scores import r2 as r2
     from ep2sindy.refinement.correction import Corrected as Corrected
@@ -79,11 +81,13 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.regression.weak import Weak as Weak
     from ep2sindy.regression.weighted_weak import WeightedWeak as WeightedWeak
     from ep2sindy.search.bootstraps import Bootstraps as Bootstraps
+    from ep2sindy.search.bootstraps import pooled_supports as pooled_supports
     from ep2sindy.search.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
     from ep2sindy.search.estimators import STLSQRegressor as STLSQRegressor
     from ep2sindy.search.front import Candidate as Candidate
     from ep2sindy.search.front import ParetoFront as ParetoFront
     from ep2sindy.search.front import fit_support as fit_support
+    from ep2sindy.search.front import pareto_front as pareto_front
     from ep2sindy.search.searches import STLSQ as STLSQ
     from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso
     from ep2sindy.search.searches import BestSubset as BestSubset
@@ -96,6 +100,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.selection.refined import RefinedScore as RefinedScore
     from ep2sindy.selection.resampled import CrossValidation as CrossValidation
     from ep2sindy.selection.resampled import Stability as Stability
+    from ep2sindy.selection.rule import selected as selected
     from ep2sindy.signals.kalman import KalmanSmoother as KalmanSmoother
     from ep2sindy.signals.smoothers import NoSmoothing as NoSmoothing
     from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay
@@ -148,10 +153,11 @@ _FACE = {
     "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",
     "discovery.shared_support": "JointDiscovery discover_jointly",
+    "library.equations": "equation_text",
     "library.library": "Library polynomial named_terms",
     "machine.parallel": "Serial Loky Dask",
     "model.integrated": "Integrated integrate",
-    "model.model": "SparseModel",
+    "model.model": "SparseModel coef_matrix",
     "model.rollout": "Rollout",
     "model.scores": "r2",
     "refinement.correction": "Corrected refine_with_correction",
@@ -169,15 +175,16 @@ _FACE = {
     "regression.test_functions": "Boxes Bumps",
     "regression.weak": "Weak",
     "regression.weighted_weak": "WeightedWeak",
-    "search.bootstraps": "Bootstraps",
+    "search.bootstraps": "Bootstraps pooled_supports",
     "search.estimators": "AdaptiveLassoRegressor STLSQRegressor",
-    "search.front": "Candidate ParetoFront fit_support",
+    "search.front": "Candidate ParetoFront fit_support pareto_front",
     "search.searches": "AdaptiveLasso STLSQ BestSubset",
     "selection.criteria": "AICc BIC EBIC",
     "selection.integral": "IntegralScore",
     "selection.knees": "Knee LogKnee",
     "selection.refined": "RefinedScore",
     "selection.resampled": "Stability CrossValidation",
+    "selection.rule": "selected",
     "signals.kalman": "KalmanSmoother",
     "signals.smoothers": "SavitzkyGolay NoSmoothing",
     "signals.spectrum": "power_spectrum dominant_frequency",

@@ -3,6 +3,7 @@
 import ast
 from collections.abc import Iterable, Iterator
 from functools import cache
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,9 @@ def test_files_and_functions_stay_short(module: str) -> None:
         if isinstance(node, ast.FunctionDef):
             n_lines = (node.end_lineno or node.lineno) - node.lineno + 1
             assert n_lines <= 50, f"{module}.{node.name} takes {n_lines} lines"
+
+
+def test_the_drawing_of_the_house_is_what_the_imports_say() -> None:
+    path = PACKAGE.parent / "docs" / "house.py"
+    module = SourceFileLoader("house", str(path)).load_module()
+    assert module.DRAWING.read_text("utf-8") == module.drawing(), "run python docs/house.py"
