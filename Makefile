@@ -26,6 +26,7 @@ test-slow: lint
 	$(BIN)/python -m pytest -q
 
 benchmark: .venv/installed
+	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.search
 	$(BIN)/python -m benchmarks.simulator
 	$(BIN)/python -m benchmarks.operating_points

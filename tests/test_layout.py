@@ -3,8 +3,8 @@
 import ast
 from collections.abc import Iterable, Iterator
 from functools import cache
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from runpy import run_path
 
 import pytest
 
@@ -147,6 +147,5 @@ def test_files_and_functions_stay_short(module: str) -> None:
 
 
 def test_the_drawing_of_the_house_is_what_the_imports_say() -> None:
-    path = PACKAGE.parent / "docs" / "house.py"
-    module = SourceFileLoader("house", str(path)).load_module()
-    assert module.DRAWING.read_text("utf-8") == module.drawing(), "run python docs/house.py"
+    house = run_path(str(PACKAGE.parent / "docs" / "house.py"))
+    assert house["DRAWING"].read_text("utf-8") == house["drawing"](), "run python docs/house.py"

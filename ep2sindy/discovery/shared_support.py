@@ -16,7 +16,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
 from ep2sindy.regression.rows import Regression
-from ep2sindy.search.front import ParetoFront, fit_supports, front_order
+from ep2sindy.search.front import ParetoFront, errors_of, fit_supports, front_order
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection
@@ -169,7 +169,7 @@ def _joint_front(
     fits = {
         p: fit_supports(each, equation, _determined(each, masks)) for p, each in problems.items()
     }
-    by_point = [ParetoFront(equation, fits[p], each).errors for p, each in problems.items()]
+    by_point = [errors_of(fits[p]) for p in problems]
     errors = np.exp(np.log(np.maximum(by_point, ROUNDING)).mean(axis=0))
     order = front_order(masks.sum(axis=1), errors, depth=depth)
     names = np.array(any_problem.term_names)

@@ -66,7 +66,7 @@ class ParetoFront:
     @property
     def errors(self) -> Float[np.ndarray, " candidates"]:
         """1 - R2 on held-out rows, or on the training rows where none are held out."""
-        return np.array([1.0 - _score(c) for c in self.candidates])
+        return errors_of(self.candidates)
 
     @property
     def sizes(self) -> Float[np.ndarray, " candidates"]:
@@ -91,6 +91,11 @@ class ParetoFront:
             for c in self.candidates
         ]
         return html_table(["terms", "R2", "equation"], rows)
+
+
+def errors_of(candidates: Sequence[Candidate]) -> Float[np.ndarray, " candidates"]:
+    """1 - R2 on held-out rows, or on the training rows where none are held out."""
+    return np.array([1.0 - _score(candidate) for candidate in candidates])
 
 
 def _score(candidate: Candidate) -> float:
