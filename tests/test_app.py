@@ -14,11 +14,13 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
 from ep2sindy.app import main as program
+from ep2sindy.app import sweep
 from ep2sindy.app.build import deferred
 from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_config, study_class
 from ep2sindy.app.schema import keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
 from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.machine.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.kinds import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
 
@@ -122,7 +124,15 @@ def test_a_recipe_stands_for_its_groups() -> None:
         ("rows=[{width: wide}]", r"rows\[0\].width must be a number: 'wide' came"),
         ("rows=1", "rows must be a list: 1 came"),
         ("switch=1", "switch must be true or false: 1 came"),
-        ("rule.gama=1", "unexpected keyword argument 'gama'"),
+        ("rule.gama=1", r"rule, EBIC: .* unexpected keyword argument 'gama'; it takes \['gamma"),
+        ("rule=ebic", "rule must be a Selection, named by its _target_: 'ebic' came"),
+        ("search=null", "search must be a Search, named by its _target_: None came"),
+        ("search._target_=ep2sindy.Nope", "search: Error loading 'ep2sindy.Nope'"),
+        ("search._target_=null", "search: Expected a callable target"),
+        ("search.max_terms=???", r"^search.max_terms must be set: it is still '\?\?\?'"),
+        ("names=[a,'???']", r"names\[1\] must be set: it is still '\?\?\?'"),
+        ("switch=???", r"switch must be set: it is still '\?\?\?'"),
+        ("many.one=null", "many.one may have .*: None came"),
         ("selection._target_=ep2sindy.BestSubset", "selection must name a _target_ that is a Sele"),
         ("later=1", "later must name a _target_: 1 came"),
         ("search.max_terms=0", "max_terms must be at least 1: 0 came"),
@@ -189,6 +199,25 @@ def test_a_value_of_two_kinds_is_taken_as_the_first_that_fits() -> None:
     assert value_of(int | str, 3, "x") == 3
     assert value_of(int | str, "a", "x") == "a"
     assert value_of(float | None, None, "x") is None
+    later = OmegaConf.create({"_target_": "ep2sindy.Knee"})
+    assert isinstance(value_of(Deferred | None, later, "x"), Deferred)
+    assert value_of(ep.Knee | ep.EBIC, later, "x") == ep.Knee()
+    with pytest.raises(ValueError, match="x must name a _target_ that is a Mapping"):
+        value_of(Mapping[str, Any], later, "x")
+
+
+def test_free_keys_may_name_a_target() -> None:
+    """A point of a parametric study may have other data than the rest."""
+    free = study_of(Toy, config("free.data={_target_: ep2sindy.open_field}")).free["data"]
+    assert free == {"_target_": "ep2sindy.open_field"}
+
+
+def test_interpolations_are_followed_at_any_depth() -> None:
+    changes = ["names=['${experiment}',b]", "many.one=${inner}", "free.anything=['${n}']"]
+    study = study_of(Toy, config(*changes))
+    assert study.names == ["toy", "b"]
+    assert study.many == {"one": Inner(1.0)}
+    assert study.free == {"anything": [3]}
 
 
 def test_a_package_without_its_configs_says_so(
@@ -234,6 +263,38 @@ def test_an_index_has_every_job_in_order(tmp_path: Path) -> None:
     assert "seed=-1" in text
     assert "+exp=toy" not in text  # what all jobs share is left out
     assert text.endswith("index.csv")
+
+
+def test_an_index_shows_lists_and_what_is_no_number_as_they_are(tmp_path: Path) -> None:
+    for job, names in enumerate(("[ours,b]", "[ours]")):
+        record = {"job": job, "overrides": [f"variants={names}"], "status": "done", "folder": "x"}
+        write_json(tmp_path / "jobs" / f"{job}.json", record | {"headline": {"r2": float("nan")}})
+    write_index(tmp_path)
+    assert pd.read_csv(tmp_path / "index.csv")["r2"].isna().all()
+    text = index_text(tmp_path)
+    assert "variants=[ours,b]" in text
+    assert "nan" not in text
+
+
+def test_an_index_without_records_says_so(tmp_path: Path) -> None:
+    assert index_text(tmp_path) == f"no job of the sweep noted its end in {tmp_path}"
+
+
+def test_an_index_knows_a_job_that_ended_while_it_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    records(tmp_path)
+    late = tmp_path / "jobs" / "0.json"
+    text = late.read_text()
+    late.unlink()
+
+    def written_meanwhile(path: Path, index: str) -> None:
+        write_text(path, index)
+        late.write_text(text)
+
+    monkeypatch.setattr(sweep, "write_text", written_meanwhile)
+    write_index(tmp_path)
+    assert pd.read_csv(tmp_path / "index.csv")["job"].tolist() == [0, 1]
 
 
 def run_program(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:

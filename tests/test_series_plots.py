@@ -12,10 +12,11 @@ from ep2sindy.figures.series import (
 )
 from ep2sindy.figures.style import framing
 from ep2sindy.library.library import named_terms
+from ep2sindy.model.integrated import Integrated
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.smoothers import NoSmoothing
-from ep2sindy.studies.shown import Shown, rollout_drawings
+from ep2sindy.studies.shown import Shown, run_figures
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +94,7 @@ def test_a_model_that_runs_away_does_not_shrink_the_rest() -> None:
 
 def test_one_state_has_no_phase_portrait(oscillation: Trajectory) -> None:
     one = Trajectory(oscillation.t, oscillation.states[:, :1], ("x",))
-    rollout = rolled(one.t, one.states)
-    figures = rollout_drawings(one, {"model": rollout}, Shown(20.0, None))
-    assert set(figures) == {"trajectories", "spectra"}
+    model = SparseModel(named_terms(("x",), ("x",)), ("x",), np.array([[-1.0]]))
+    integrated = {"model": Integrated(model, rolled(one.t, one.states), {}, 0.0)}
+    figures = run_figures(("phase", "spectra"), one, integrated, Shown(20.0, None))
+    assert list(figures) == ["spectra"]

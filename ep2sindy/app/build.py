@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
-from types import UnionType
+from functools import partial
 from typing import Any
 
 from hydra.errors import HydraException
@@ -23,23 +23,41 @@ def innermost(error: BaseException) -> BaseException:
     return error
 
 
-def instantiated(node: DictConfig, **how: Any) -> Any:
-    """What `_target_` makes of the rest of the node, with the errors that it raised itself."""
+def call_of(node: Any, place: str, *first: Any) -> partial[Any]:
+    """What a node's `_target_` names, with the rest of the node, built, as its arguments.
+
+    place: the node's dotted path, for errors. first: arguments that it is given when called.
+    Raises ValueError where it cannot be called so, or what a nested target raised itself.
+    """
+    if not isinstance(node, DictConfig) or "_target_" not in node:
+        raise ValueError(f"{place} must name a _target_: {node!r} came")
+    if missing := sorted(OmegaConf.missing_keys(node)):
+        raise ValueError(f"{missing[0]} must be set: it is still '???'")
     try:
-        return instantiate(node, _convert_="all", **how)
+        call = instantiate(node, _convert_="all", _partial_=True)
     except HydraException as error:
         cause = innermost(error)
-        if isinstance(cause, TypeError):  # an argument that the target does not know
-            raise ValueError(str(cause)) from error
+        if isinstance(cause, HydraException | ImportError | TypeError):
+            raise ValueError(f"{place}: {cause}") from error
         raise cause from error
+    try:
+        takes = inspect.signature(call.func)
+    except ValueError:  # compiled, it does not say what it takes
+        return call
+    try:
+        takes.bind(*first, *call.args, **call.keywords)
+    except TypeError as error:
+        name = getattr(call.func, "__name__", call.func)
+        names = list(takes.parameters)[len(first) :]
+        raise ValueError(f"{place}, {name}: {error}; it takes {names}") from error
+    return call
 
 
-def instance_of(node: DictConfig, kind: Any, place: str) -> Any:
+def instance_of(node: DictConfig, kind: type, place: str) -> Any:
     """The object that a node names, if it is of this kind."""
-    value = instantiated(node)
-    if isinstance(kind, type | UnionType) and not isinstance(value, kind):
-        name = getattr(kind, "__name__", str(kind))
-        raise ValueError(f"{place} must name a _target_ that is a {name}: {value!r} came")
+    value = call_of(node, place)()
+    if not isinstance(value, kind):
+        raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: {value!r} came")
     return value
 
 
@@ -49,12 +67,7 @@ def step_of(node: Any, place: str) -> Step:
         raise ValueError(
             f"{place} must be like {{_target_: ep2sindy.crop, start_s: 0}}: {node!r} came"
         )
-    step = instantiated(node, _partial_=True)
-    try:
-        inspect.signature(step.func).bind(None, **step.keywords)
-    except TypeError as error:
-        raise ValueError(f"{place}, {step.func.__name__}: {error}") from error
-    return step
+    return call_of(node, place, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +84,7 @@ class Configured:
         return {str(key): value for key, value in plain.items()}
 
     def build(self) -> Any:
-        return instantiated(self.node)
+        return call_of(self.node, self.place)()
 
     def changed(
         self, places: Mapping[str, Any], more: Mapping[str, Any] | None = None

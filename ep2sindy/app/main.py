@@ -40,7 +40,7 @@ def main() -> None:
             run_job(config, conf)
 
         job()
-    except (JobError, HydraException, OmegaConfBaseException, OSError) as error:
+    except (JobError, HydraException, OmegaConfBaseException, OSError, ValueError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("interrupted: files under their final names are whole")

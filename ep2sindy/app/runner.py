@@ -11,6 +11,7 @@ from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
+from traceback import format_exc
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -39,21 +40,21 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     overrides: what was set on the command line; one that the study does not use is an error.
     """
     check_common(config)
-    kind = study_class(config.study)
+    kind = study_class(config.get("study"))
     check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
+    study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
     with started_run(config) as run:
-        study: Experiment = study_of(kind, config)
         outcome = study.compute(run)
         headline = write(run, outcome, hparams_of(run.settings, keys_of(kind)))
     return Finished(run.folder.path, headline)
 
 
-def study_class(name: str) -> type:
+def study_class(name: object) -> type:
     """The class `Study` of a module of `ep2sindy.studies`, or of one's own by its dotted name.
 
     A folder holds it in its module `study`.
     """
-    module = name if "." in name else f"ep2sindy.studies.{name}"
+    module = str(name) if "." in str(name) else f"ep2sindy.studies.{name}"
     try:
         found = import_module(module)
         if hasattr(found, "__path__") and not hasattr(found, "Study"):
@@ -112,7 +113,7 @@ def started_run(config: DictConfig) -> Iterator[Run]:
     try:
         yield Run(config.experiment, config.seed, folder, screen, board, settings)
     except BaseException as error:
-        screen.log(f"ended early: {type(error).__name__}: {error}")
+        screen.log(f"ended early: {type(error).__name__}: {error}\n{format_exc()}")
         raise
     finally:
         board.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -52,8 +52,8 @@ def _filled(study: type, config: DictConfig) -> Any:
     for name, kind in _hints(study).items():
         if kind in GATHERED:
             arguments[name] = _filled(kind, config)
-        elif name in config:
-            arguments[name] = value_of(kind, _node(config, name), name)
+        elif name in config or OmegaConf.is_missing(config, name):
+            arguments[name] = value_of(kind, _node(config, name, name), name)
         elif _is_required(study, name):
             raise ValueError(f"the config of this experiment must have {name!r}")
     return study(**arguments)
@@ -61,42 +61,39 @@ def _filled(study: type, config: DictConfig) -> Any:
 
 def value_of(kind: Any, node: Any, place: str) -> Any:
     """A value of this kind from a node of the config; place: its dotted path, for errors."""
-    if get_origin(kind) is Annotated:
-        base, rule = get_args(kind)
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
         value = _plain(node)
-        if isinstance(rule, Kind) and not rule.fits(value):
-            raise ValueError(f"{place} must be {rule.says}: {value!r} came")
-        return value_of(base, node, place)
+        if isinstance(parts[1], Kind) and not parts[1].fits(value):
+            raise ValueError(f"{place} must be {parts[1].says}: {value!r} came")
+        return value_of(parts[0], node, place)
+    if kind is Any:
+        return _plain(node)
     if kind is Deferred:
         return deferred(node, place)
     if kind == Step:
         return step_of(node, place)
-    if isinstance(node, DictConfig) and "_target_" in node:
-        return instance_of(node, kind, place)
-    if is_dataclass(kind) and isinstance(kind, type):
-        return _dataclass(kind, node, place)
-    return _container_or_scalar(kind, node, place)
-
-
-def _container_or_scalar(kind: Any, node: Any, place: str) -> Any:
-    origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return _one_of(parts, node, place)
-    if origin is Literal:
-        if _plain(node) not in parts:
-            raise ValueError(f"{place} must be one of {list(parts)}: {_plain(node)!r} came")
-        return node
-    if origin is not None and issubclass(origin, Mapping):
-        if not isinstance(node, DictConfig):
-            raise ValueError(f"{place} must be like {{name: ...}}: {_plain(node)!r} came")
-        items = {str(key): _node(node, key) for key in node}
-        return {key: value_of(parts[1], each, f"{place}.{key}") for key, each in items.items()}
-    if origin is not None and issubclass(origin, Sequence):
-        if not OmegaConf.is_list(node):
-            raise ValueError(f"{place} must be a list: {_plain(node)!r} came")
-        nodes = [_node(node, k) for k in range(len(node))]
-        return [value_of(parts[0], each, f"{place}[{k}]") for k, each in enumerate(nodes)]
+    if isinstance(node, DictConfig) and "_target_" in node:
+        return instance_of(node, origin or kind, place)
+    if isinstance(kind, type) and is_dataclass(kind):
+        return _dataclass(kind, node, place)
+    if origin is not None:
+        return _container(origin, parts, node, place)
     return _scalar(kind, node, place)
+
+
+def _container(origin: type, parts: Sequence[Any], node: Any, place: str) -> Any:
+    if issubclass(origin, Mapping):
+        if not OmegaConf.is_dict(node):
+            raise ValueError(f"{place} must be like {{name: ...}}: {_plain(node)!r} came")
+        places = {key: f"{place}.{key}" for key in node}
+        return {str(k): value_of(parts[1], _node(node, k, at), at) for k, at in places.items()}
+    if not OmegaConf.is_list(node):
+        raise ValueError(f"{place} must be a list: {_plain(node)!r} came")
+    places = {k: f"{place}[{k}]" for k in range(len(node))}
+    return [value_of(parts[0], _node(node, k, at), at) for k, at in places.items()]
 
 
 def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
@@ -116,16 +113,9 @@ NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "
 
 
 def _scalar(kind: Any, node: Any, place: str) -> Any:
+    """A plain value. One that names no `_target_` is never of a type that is not plain."""
     value = _plain(node)
-    if kind is Any or not isinstance(kind, type):
-        return value
-    fits = {
-        float: type(value) in (int, float),
-        int: type(value) is int,
-        bool: type(value) is bool,
-        str: isinstance(value, str),
-    }
-    if not fits.get(kind, isinstance(value, kind) or getattr(kind, "_is_protocol", False)):
+    if type(value) is not kind and (kind, type(value)) != (float, int):
         wanted = NAMES.get(kind, f"a {kind.__name__}, named by its _target_")
         raise ValueError(f"{place} must be {wanted}: {value!r} came")
     return float(value) if kind is float else value
@@ -145,7 +135,11 @@ def _dataclass(kind: type, node: Any, place: str) -> Any:
         )
     hints = _hints(kind)
     return kind(
-        **{n: value_of(hints[n], _node(node, n), f"{place}.{n}") for n in names if n in given}
+        **{
+            name: value_of(hints[name], _node(node, name, at), at)
+            for name, at in ((name, f"{place}.{name}") for name in names)
+            if name in given
+        }
     )
 
 
@@ -164,8 +158,10 @@ def _is_required(kind: type, name: str) -> bool:
     return field.default is MISSING and field.default_factory is MISSING
 
 
-def _node(parent: Any, key: Any) -> Any:
-    """A child as a node, interpolations resolved by OmegaConf when its values are read."""
+def _node(parent: Any, key: Any, place: str) -> Any:
+    """A child, interpolations resolved."""
+    if OmegaConf.is_missing(parent, key):
+        raise ValueError(f"{place} must be set: it is still '???'")
     return parent[key]
 
 

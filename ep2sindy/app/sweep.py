@@ -7,7 +7,7 @@ index is made anew from all records there are.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from ep2sindy.machine.files import write_text
+from ep2sindy.machine.files import write_json, write_text
 
 RECORDS = "jobs"
 
@@ -44,7 +44,7 @@ def noted_job() -> Iterator[Callable[[Path, Mapping[str, float]], None]]:
         print(f"job {job} failed: {record['error']}", flush=True)
         raise
     finally:
-        write_text(sweep / RECORDS / f"{job}.json", json.dumps(record, indent=2) + "\n")
+        write_json(sweep / RECORDS / f"{job}.json", record)
         write_index(sweep)
 
 
@@ -55,7 +55,17 @@ def records_of(sweep: Path) -> list[dict[str, Any]]:
 
 
 def write_index(sweep: Path) -> None:
-    """`index.csv` of a sweep's folder: a row per job, a column per headline figure."""
+    """`index.csv` of a sweep's folder: a row per job, a column per headline figure.
+
+    Written again if another job has noted its end meanwhile: the last to write knows them all.
+    """
+    records: list[dict[str, Any]] = []
+    while len(now := records_of(sweep)) > len(records):
+        records = now
+        write_text(sweep / "index.csv", _index(records))
+
+
+def _index(records: Sequence[Mapping[str, Any]]) -> str:
     import pandas as pd
 
     rows = [
@@ -67,12 +77,12 @@ def write_index(sweep: Path) -> None:
             "folder": record.get("folder", ""),
             "error": record.get("error", ""),
         }
-        for record in records_of(sweep)
+        for record in records
     ]
     table = pd.DataFrame(rows)
     last = ["folder", "error"]
     ordered = [*(name for name in table.columns if name not in last), *last]
-    write_text(sweep / "index.csv", table[ordered].to_csv(index=False))
+    return table[ordered].to_csv(index=False)
 
 
 def index_text(sweep: Path, *, n_figures: int = 4) -> str:
@@ -81,6 +91,8 @@ def index_text(sweep: Path, *, n_figures: int = 4) -> str:
     from rich.table import Table
 
     records = records_of(sweep)
+    if not records:
+        return f"no job of the sweep noted its end in {sweep}"
     everywhere = set.intersection(*(set(record["overrides"]) for record in records))
     figures = list(dict.fromkeys(name for r in records for name in r.get("headline", {})))
     table = Table(title=f"sweep of {len(records)} jobs", title_justify="left", show_edge=False)
@@ -89,9 +101,10 @@ def index_text(sweep: Path, *, n_figures: int = 4) -> str:
     for record in records:
         headline = record.get("headline", {})
         varied = [text for text in record["overrides"] if text not in everywhere]
-        values = [f"{headline[k]:.4g}" if k in headline else "-" for k in figures[:n_figures]]
+        values = [headline.get(name) for name in figures[:n_figures]]
+        texts = ["-" if value is None else f"{value:.4g}" for value in values]
         where = record.get("folder") or record.get("error", "")
-        table.add_row(str(record["job"]), " ".join(varied), record["status"], *values, where)
+        table.add_row(str(record["job"]), " ".join(varied), record["status"], *texts, where)
     console = Console(width=120)
     with console.capture() as captured:
         console.print(table, markup=False)

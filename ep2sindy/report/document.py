@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -84,5 +84,10 @@ def cell_text(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def pictures(names: Sequence[str]) -> list[Picture]:
+def places(value: float, n: int) -> str:
+    """A number to so many places, NaN as a dash."""
+    return "-" if value != value else f"{value:.{n}f}"
+
+
+def pictures(names: Iterable[str]) -> list[Picture]:
     return [Picture(name) for name in names]

@@ -6,8 +6,6 @@ models/*.json  tables/*.csv  figures/*.png, *.pdf  tensorboard/
 
 from __future__ import annotations
 
-import json
-import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ep2sindy.machine.files import replacing, write_text
+from ep2sindy.machine.files import replacing, write_json, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.provenance import commit, versions
 
@@ -60,9 +58,7 @@ class RunFolder:
         write_text(self.path / name, text)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """NaN becomes null: JSON has no word for it."""
-        text = json.dumps(_without_nan(content), indent=2, allow_nan=False)
-        self.write_text(name, text + "\n")
+        write_json(self.path / name, content)
 
     def write_model(self, name: str, model: SparseModel) -> None:
         model.save(self.path / "models" / f"{name}.json")
@@ -100,13 +96,3 @@ def _freeze_layout(figure: Figure) -> None:
         figure.set_dpi(DPI)
         engine.execute(figure)
         figure.set_layout_engine(None)  # not "none": that placeholder still draws twice
-
-
-def _without_nan(content: Any) -> Any:
-    if isinstance(content, Mapping):
-        return {key: _without_nan(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_without_nan(value) for value in content]
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content

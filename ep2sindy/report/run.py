@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ep2sindy.machine.files import replacing
+from ep2sindy.report.document import Text
 from ep2sindy.report.folder import RunFolder
-from ep2sindy.report.screen import Screen
+from ep2sindy.report.screen import Screen, rendered
 from ep2sindy.report.tensorboard import Board
 
 
@@ -28,9 +29,9 @@ class Run:
     board: Board
     settings: Mapping[str, Any] = field(default_factory=dict)
 
-    def say(self, text: str) -> None:
+    def say(self, text: str, *, warning: bool = False) -> None:
         """A line for those who watch, at once: on the screen and in run.log."""
-        self.screen.print(text)
+        self.screen.print(*rendered(Text(text, warning=warning)))
 
     def write(self, name: str, writer: Callable[[Path], None]) -> None:
         """A file of the study's own into the run folder, whole or not at all."""

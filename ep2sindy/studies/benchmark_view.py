@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.figures.identified import MERITS, merit_table
-from ep2sindy.report.document import Block, Picture, Section, Table, Text
+from ep2sindy.report.document import Block, Picture, Section, Table, Text, places
 from ep2sindy.synthetic.draws import DRAWS
 
 FIGURE = (
@@ -78,7 +78,7 @@ def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table
             continue  # it leaves the selection to the user
         row = {"variant": f"{name}, thesis" if is_published else name}
         for system in cells["system"].unique():
-            row[_heading(system, merit)] = "/".join(_number(v, digits) for v in values[system])
+            row[_heading(system, merit)] = "/".join(places(v, digits) for v in values[system])
         rows.append(row | {"CPU (ms)": "" if is_published else f"{cpu_ms[name]:.1f}"})
     return Table(pd.DataFrame(rows), italic=italic)
 
@@ -88,7 +88,3 @@ def _heading(system: str, merit: str) -> str:
         return system
     model = DRAWS[system](np.random.default_rng(0)).system.model
     return f"{system} ({np.count_nonzero(model.coef)})"
-
-
-def _number(value: float, digits: int) -> str:
-    return "-" if np.isnan(value) else f"{value:.{digits}f}"

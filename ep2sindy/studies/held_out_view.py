@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.series import trajectory_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
@@ -21,8 +19,11 @@ from ep2sindy.studies.shown import (
     Shown,
     coefficients,
     equation_sections,
-    rollout_drawings,
-    rollout_table,
+    intervals,
+    model_summary,
+    rollout_tables,
+    run_figures,
+    trajectories,
 )
 from ep2sindy.studies.source import data_summary
 
@@ -35,10 +36,8 @@ CAPTIONS = {
     "trajectories": "Models integrated over held-out time from its first sample (colour) over the "
     "data (grey).",
     "trajectories_started": "The same from a start fitted to the first one and a half periods.",
-    "phase": "Phase portraits of the integrated models (colour) over the data (grey).",
-    "spectra": "Power spectra of the integrated models (colour) and of the data over the same time "
-    "(grey); the dashed line marks the data's dominant frequency, the number is the model's.",
 }
+FIGURES = ("phase", "spectra")
 COMPARED = ("f_error", "nrmse", "amplitude_ratio")
 
 
@@ -73,31 +72,31 @@ class Outcome:
         return {name: each.model for name, each in self.judged.items()}
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        rollouts = {
-            f"rollout_{name}": rollout_table(self.held, each.from_sample.integrated)
-            for name, each in self.judged.items()
+        integrated = {name: each.from_sample.integrated for name, each in self.judged.items()}
+        rows = [row for name, each in self.judged.items() for row in _rows(name, each)]
+        return {
+            **rollout_tables(self.held, integrated),
+            "methods": pd.DataFrame(rows),
+            "coefficients": coefficients(self.models(), heading="method"),
+            **self.more_tables,
         }
-        methods = pd.DataFrame([r for name, each in self.judged.items() for r in _rows(name, each)])
-        fitted = coefficients(self.models(), heading="method")
-        return {**rollouts, "methods": methods, "coefficients": fitted, **self.more_tables}
 
     def figures(self) -> dict[str, Captioned]:
-        judged, span_s = self.labelled, self.shown.span_s(self.held)
-        rollouts = {name: each.from_sample.integrated.rollout for name, each in judged.items()}
-        started = {name: each.from_fit.integrated.rollout for name, each in judged.items()}
-        drawn = rollout_drawings(self.held, rollouts, self.shown)
-        drawn["trajectories_started"] = partial(
-            trajectory_figure, self.held, started, duration_s=span_s
-        )
-        captioned = {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()}
-        return {**captioned, **self.more_figures}
+        sample = {name: each.from_sample.integrated for name, each in self.labelled.items()}
+        fit = {name: each.from_fit.integrated for name, each in self.labelled.items()}
+        runs = {
+            name: trajectories(self.held, models, self.shown, caption)
+            for (name, caption), models in zip(CAPTIONS.items(), (sample, fit), strict=True)
+        }
+        more = run_figures(FIGURES, self.held, sample, self.shown)
+        return {**runs, **more, **self.more_figures}
 
     def sections(self) -> list[Section]:
         models = {label: each.model for label, each in self.labelled.items()}
         known = any(model.covariance is not None for model in models.values())
         relations = [Text(f"relation: {text}") for text in self.relations]
         intervals = [Text(INTERVALS, page_only=True)] if known else []
-        shown = pictures([*CAPTIONS, *self.more_figures])
+        shown = pictures([*CAPTIONS, *FIGURES, *self.more_figures])
         return [
             Section("Equations", [*relations, *intervals]),
             *equation_sections(models, page_only=True),
@@ -173,16 +172,13 @@ def _or_verdict(run: HeldOutRun, text: str) -> str:
 
 def judged_summary(judged: Judged) -> dict[str, Any]:
     """f_kHz, f_error, nrmse, amplitude_ratio: of the first state, from the first sample."""
-    model = judged.model
-    known = model.covariance is not None
     return {
-        "text": model.text(),
-        "equations": {state: model.terms(state) for state in model.states},
+        **model_summary(judged.model),
         **run_summary(judged.from_sample),
         "fitted_start": run_summary(judged.from_fit),
         "status": judged.status,
         "loss": judged.loss,
-        "ci95": {state: model.intervals(state) for state in model.states} if known else None,
+        "ci95": intervals(judged.model),
         "cpu_s": judged.cpu_s,
     }
 

@@ -20,7 +20,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll
 from ep2sindy.studies.libraries_view import comparison, drawings, front_tables, sections, summary
 from ep2sindy.studies.library_result import LibraryResult, result_of
-from ep2sindy.studies.shown import Shown, rollout_table
+from ep2sindy.studies.shown import Shown, rollout_tables
 from ep2sindy.studies.source import Source
 
 
@@ -112,9 +112,11 @@ class Outcome:
                 [(a.exact, " ".join(a.terms), a.message) for a in result.discovery.ambiguities],
                 columns=["exact", "terms", "message"],
             )
-        for name, integrated in self.integrated.items():
-            slug = name.replace(", ", "_").replace("'s ", "_").replace(" ", "_")
-            found[f"rollout_{slug}"] = rollout_table(self.data, integrated)
+        files = {
+            name.replace(", ", "_").replace("'s ", "_").replace(" ", "_"): each
+            for name, each in self.integrated.items()
+        }
+        found |= rollout_tables(self.data, files)
         return found | {"comparison": comparison(self.data, self.integrated)}
 
     def figures(self) -> dict[str, Captioned]:

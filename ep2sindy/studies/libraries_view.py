@@ -10,25 +10,30 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures import series
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.model.integrated import Integrated
-from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Equation,
+    Picture,
+    Section,
+    Table,
+    Text,
+    pictures,
+    places,
+)
 from ep2sindy.search.front import Candidate
 from ep2sindy.selection.rule import selected
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.library_result import LibraryResult
-from ep2sindy.studies.shown import INTEGRATED, Shown
+from ep2sindy.studies.shown import INTEGRATED, Shown, run_figures, trajectories
 from ep2sindy.studies.source import data_summary
 
-CAPTIONS = {
-    "data": "States (start of the record) and their power spectra; the line marks the peak.",
-    "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
-    "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
-    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
-    "phase": "Phase portraits of the integrated models (colour) over the data (grey).",
-}
+FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
+THESIS = "The same with the thesis's terms, fitted to these data."
+FRONT = "Error against number of terms; the star is selected."
 
 
 def candidate_text(candidate: Candidate) -> str:
@@ -75,7 +80,7 @@ def sections(
 ) -> list[Section]:
     found = [_library_section(name, result) for name, result in results.items()]
     integrated: list[Block] = [_comparison_table(data, models)]
-    integrated += [Picture(name) for name in CAPTIONS]
+    integrated += pictures(FIGURES)
     return [*found, Section("Integrated", integrated)]
 
 
@@ -111,7 +116,7 @@ def _readable_front(result: LibraryResult, state: str) -> Table:
     table = _front_table(result, state)
     rows = []
     for row in table.to_dict("records"):
-        numbers = _places(row[r2], 3), _places(row[label], 3), _places(row["share"], 2)
+        numbers = places(row[r2], 3), places(row[label], 3), places(row["share"], 2)
         mark = "  <- selected" if row["selected"] else ""
         rows.append((str(row["n_terms"]), *numbers, row["text"] + mark))
     terms = result.discovery.model.terms(state)
@@ -124,13 +129,9 @@ def _readable_front(result: LibraryResult, state: str) -> Table:
         italic = [len(rows), len(rows) + 1]
         rows.append(("", "", "", "", f"thesis: {equation_text(state, result.given[state])}"))
         text = f"its terms here: {candidate_text(here)}"
-        rows.append((str(here.n_terms), _places(score, 3), "", "", text))
+        rows.append((str(here.n_terms), places(score, 3), "", "", text))
     bold = np.flatnonzero(table["selected"]).tolist()
     return Table(pd.DataFrame(rows, columns=columns), bold=bold, italic=italic)
-
-
-def _places(value: float, n: int) -> str:
-    return "-" if np.isnan(value) else f"{value:.{n}f}"
 
 
 def _comparison_table(data: Trajectory, models: Mapping[str, Integrated]) -> Table:
@@ -143,7 +144,7 @@ def _comparison_table(data: Trajectory, models: Mapping[str, Integrated]) -> Tab
                     "state": state,
                     "f data": frequency_text(row[f"f_data_{state}_Hz"]),
                     "f model": frequency_text(row[f"f_model_{state}_Hz"]),
-                    "nrmse": "" if k else _places(row["nrmse"], 3),
+                    "nrmse": "" if k else places(row["nrmse"], 3),
                     "verdict": "" if k else row["verdict"],
                 }
             )
@@ -153,38 +154,17 @@ def _comparison_table(data: Trajectory, models: Mapping[str, Integrated]) -> Tab
 def drawings(
     data: Trajectory, results: Mapping[str, LibraryResult], shown: Shown
 ) -> dict[str, Captioned]:
-    span_s = shown.span_s(data)
-    models = {name: r.discovery.model for name, r in results.items()}
-    rollouts = {name: r.selected.rollout for name, r in results.items()}
-    published = {n: r.published.rollout for n, r in results.items() if r.published is not None}
-    formulation: Any = next(iter(results.values())).recipe.formulation
-    smoother = formulation.smoother
-    drawn = {
-        "data": partial(series.data_figure, data, duration_s=span_s, f_max_Hz=shown.up_to_Hz(data)),
-        "trajectories": partial(series.trajectory_figure, data, rollouts, duration_s=span_s),
-        "derivatives": partial(
-            series.derivative_figure, data, models, smoother=smoother, duration_s=span_s
-        ),
-    }
+    models = {name: r.selected for name, r in results.items()}
+    published = {n: r.published for n, r in results.items() if r.published is not None}
+    formulation = next(iter(results.values())).recipe.formulation
+    drawn = run_figures(FIGURES, data, models, shown, formulation=formulation)
     if published:
-        drawn["trajectories_thesis"] = partial(
-            series.trajectory_figure, data, published, duration_s=span_s
-        )
-    if len(data.state_names) > 1:
-        plane = data.state_names[:2]
-        drawn["phase"] = partial(
-            series.phase_figure, data, rollouts, plane=plane, duration_s=span_s
-        )
-    fronts = {
-        f"front_{name}": Captioned(
-            partial(
-                front_figure, r.discovery.fronts, r.discovery.scores, label=r.recipe.selection.label
-            ),
-            "Error against number of terms; the star is selected.",
-        )
-        for name, r in results.items()
-    }
-    return {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()} | fronts
+        drawn["trajectories_thesis"] = trajectories(data, published, shown, THESIS)
+    for name, r in results.items():
+        found, label = r.discovery, r.recipe.selection.label
+        front = partial(front_figure, found.fronts, found.scores, label=label)
+        drawn[f"front_{name}"] = Captioned(front, FRONT)
+    return drawn
 
 
 def summary(data: Trajectory, results: Mapping[str, LibraryResult]) -> dict[str, Any]:

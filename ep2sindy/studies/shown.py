@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +14,21 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
 from ep2sindy.model.integrated import Integrated
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.rollout import Rollout
-from ep2sindy.report.document import Block, Equation, Section, Text
+from ep2sindy.report.document import Block, Captioned, Equation, Section, Text
 from ep2sindy.studies.kinds import PositiveOrAll
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
+CAPTIONS = {
+    "data": "States (start of the record) and their power spectra; the line marks the peak.",
+    "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
+    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
+    "phase": "Phase portraits of the integrated models (colour) over the data (grey).",
+    "spectra": "Power spectra of the integrated models (colour) and of the data over the same time "
+    "(grey); the dashed line marks the data's dominant frequency, the number is the model's.",
+}
 
 
 @dataclass(frozen=True)
@@ -38,30 +45,68 @@ class Shown:
         return self.f_max_Hz or 0.5 / data.dt_s
 
 
-def rollout_table(data: Trajectory, integrated: Integrated) -> pd.DataFrame:
-    """Model and data, sample by sample, so that the figure can be drawn again."""
-    rollout, states = integrated.rollout, integrated.model.states
-    samples = data.columns(states)[: len(rollout.t)]
-    columns: dict[str, Any] = {"t_s": rollout.t}
-    for k, state in enumerate(states):
-        columns |= {f"{state}_data": samples[:, k], f"{state}_model": rollout.states[:, k]}
-    return pd.DataFrame(columns)
+def rollout_tables(data: Trajectory, models: Mapping[str, Integrated]) -> dict[str, pd.DataFrame]:
+    """Model and data, sample by sample, so that the figures can be drawn again."""
+    found = {}
+    for name, integrated in models.items():
+        rollout, states = integrated.rollout, integrated.model.states
+        samples = data.columns(states)[: len(rollout.t)]
+        columns: dict[str, Any] = {"t_s": rollout.t}
+        for k, state in enumerate(states):
+            columns |= {f"{state}_data": samples[:, k], f"{state}_model": rollout.states[:, k]}
+        found[f"rollout_{name}"] = pd.DataFrame(columns)
+    return found
 
 
-def rollout_drawings(
-    data: Trajectory, rollouts: Mapping[str, Rollout], shown: Shown
-) -> dict[str, Callable[[], Figure]]:
-    """Trajectories, spectra and, of two states or more, phase portraits; each drawn when called."""
-    span_s, plane = shown.span_s(data), data.state_names[:2]
+def run_figures(
+    names: Sequence[str],
+    data: Trajectory,
+    models: Mapping[str, Integrated],
+    shown: Shown,
+    *,
+    formulation: object = None,
+) -> dict[str, Captioned]:
+    """Those of CAPTIONS that are named; phase portraits only of two states or more.
+
+    formulation: its smoother takes the data's derivative; without one there are no derivatives.
+    """
+    span, up_to = {"duration_s": shown.span_s(data)}, {"f_max_Hz": shown.up_to_Hz(data)}
+    rollouts = {name: integrated.rollout for name, integrated in models.items()}
     drawn: dict[str, Callable[[], Figure]] = {
-        "trajectories": partial(series.trajectory_figure, data, rollouts, duration_s=span_s),
-        "spectra": partial(series.spectrum_figure, data, rollouts, f_max_Hz=shown.up_to_Hz(data)),
+        "data": partial(series.data_figure, data, **span, **up_to),
+        "trajectories": partial(series.trajectory_figure, data, rollouts, **span),
+        "spectra": partial(series.spectrum_figure, data, rollouts, **up_to),
     }
-    if len(plane) > 1:
-        drawn["phase"] = partial(
-            series.phase_figure, data, rollouts, plane=plane, duration_s=span_s
+    if smoother := getattr(formulation, "smoother", None):
+        sides = {name: integrated.model for name, integrated in models.items()}
+        drawn["derivatives"] = partial(
+            series.derivative_figure, data, sides, smoother=smoother, **span
         )
-    return drawn
+    if len(plane := data.state_names[:2]) > 1:
+        drawn["phase"] = partial(series.phase_figure, data, rollouts, plane=plane, **span)
+    return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
+
+
+def trajectories(
+    data: Trajectory, models: Mapping[str, Integrated], shown: Shown, caption: str
+) -> Captioned:
+    """Trajectories of other models, or from other starts."""
+    (figure,) = run_figures(["trajectories"], data, models, shown).values()
+    return replace(figure, caption=caption)
+
+
+def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] | None:
+    """95 % intervals by state and term; None where they are not known."""
+    if model.covariance is None:
+        return None
+    return {state: model.intervals(state) for state in model.states}
+
+
+def model_summary(model: SparseModel) -> dict[str, Any]:
+    return {
+        "text": model.text(),
+        "equations": {state: model.terms(state) for state in model.states},
+    }
 
 
 def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataFrame:
@@ -71,19 +116,13 @@ def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataF
     """
     rows = []
     for name, model in models.items():
+        known = intervals(model) or {}
         for state in model.states:
-            ends = model.intervals(state) if model.covariance is not None else {}
             for term, value in model.terms(state).items():
-                lower, upper = ends.get(term, (np.nan, np.nan))
+                lower, upper = known.get(state, {}).get(term, (np.nan, np.nan))
                 row: dict[str, Any] = {heading: name, "state": state, "term": term}
                 rows.append(row | {"coef": value, "lower": lower, "upper": upper})
     return pd.DataFrame(rows)
-
-
-def intervals_text(model: SparseModel, state: str) -> str:
-    """`n_i: -6.77e+05 to -6.74e+05`, term by term."""
-    ends = model.intervals(state)
-    return "; ".join(f"{term}: {low:.4g} to {high:.4g}" for term, (low, high) in ends.items())
 
 
 def equation_sections(
@@ -92,10 +131,12 @@ def equation_sections(
     """Under the name of each model its equations, with intervals where they are known."""
     found = []
     for name, model in models.items():
+        known = intervals(model) or {}
         blocks: list[Block] = []
         for state in model.states:
             blocks.append(Equation(state, model.terms(state), on_screen=True))
-            if model.covariance is not None:
-                blocks.append(Text(f"95 %: {intervals_text(model, state)}", page_only=page_only))
+            ends = [f"{term}: {a:.4g} to {b:.4g}" for term, (a, b) in known.get(state, {}).items()]
+            if ends:
+                blocks.append(Text(f"95 %: {'; '.join(ends)}", page_only=page_only))
         found.append(Section(name, blocks, level=3))
     return found

@@ -78,7 +78,7 @@ def say_data(run: Run, data: Trajectory, attributes: Mapping[str, Any]) -> None:
             f"mass out/in {attributes['mass_balance']:.4f}"
         )
         if attributes["status"] != "oscillating":
-            run.say("[bold red]this case does not sustain its oscillation[/bold red]")
+            run.say("this case does not sustain its oscillation", warning=True)
     frequencies = ", ".join(
         f"{name} {frequency_text(dominant_frequency(data.t, column))}"
         for name, column in zip(data.state_names, data.states.T, strict=True)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.series import derivative_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import prefixed
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures
+from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures, places
 from ep2sindy.report.run import Run
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.kinds import Coefficients, Count, Counts, Deferred, PositiveOrAll
@@ -26,19 +24,15 @@ from ep2sindy.studies.shown import (
     Shown,
     coefficients,
     equation_sections,
-    rollout_drawings,
-    rollout_table,
+    intervals,
+    model_summary,
+    rollout_tables,
+    run_figures,
 )
 from ep2sindy.studies.source import Source, data_summary
 from ep2sindy.studies.weak_forms import Fitted, fit_settings, settings_of
 
-CAPTIONS = {
-    "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
-    "phase": "Phase portraits of the integrated models (colour) over the data (grey).",
-    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
-    "spectra": "Power spectra of the integrated models (colour) and of the data over the same time "
-    "(grey); the dashed line marks the data's dominant frequency, the number is the model's.",
-}
+FIGURES = ("trajectories", "phase", "derivatives", "spectra")
 INTERVALS = (
     "The intervals say how far the noise of the samples moves the coefficients if these terms are "
     "the whole law; what the terms lack, they do not count."
@@ -106,29 +100,17 @@ class Outcome:
         return {name: fitted.integrated.model for name, fitted in self.fitted.items()}
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        rollouts = {
-            f"rollout_{name}": rollout_table(self.data, fitted.integrated)
-            for name, fitted in self.fitted.items()
-        }
+        models = {name: fitted.integrated for name, fitted in self.fitted.items()}
         return {
-            **rollouts,
+            **rollout_tables(self.data, models),
             "settings": settings_table(self.fitted, self.data.dt_s),
             "coefficients": coefficients(self.models(), heading="setting"),
         }
 
     def figures(self) -> dict[str, Captioned]:
-        shown, labelled = self.study.figures, self.labelled
-        rollouts = {name: fitted.integrated.rollout for name, fitted in labelled.items()}
-        drawn = rollout_drawings(self.data, rollouts, shown)
-        differential: Any = self.study.formulation
-        drawn["derivatives"] = partial(
-            derivative_figure,
-            self.data,
-            {name: fitted.integrated.model for name, fitted in labelled.items()},
-            smoother=differential.smoother,
-            duration_s=shown.span_s(self.data),
-        )
-        return {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()}
+        models = {name: fitted.integrated for name, fitted in self.labelled.items()}
+        shown, formulation = self.study.figures, self.study.formulation
+        return run_figures(FIGURES, self.data, models, shown, formulation=formulation)
 
     def sections(self) -> list[Section]:
         published = [
@@ -139,7 +121,7 @@ class Outcome:
         return [
             Section("Equations", [*published, Text(INTERVALS, page_only=True)]),
             *equation_sections(models),
-            Section("Integrated", [self._table(), *pictures(list(CAPTIONS))]),
+            Section("Integrated", [self._table(), *pictures(FIGURES)]),
         ]
 
     def _table(self) -> Table:
@@ -150,7 +132,7 @@ class Outcome:
             steady = not np.isnan(fitted.f_error)
             of_model = {
                 "f": f"{f_text} ({100 * fitted.f_error:+.0f} %)" if steady else "-",
-                "nrmse": "-" if np.isnan(integrated.nrmse) else f"{integrated.nrmse:.2f}",
+                "nrmse": places(integrated.nrmse, 2),
                 "verdict": integrated.verdict,
             }
             for k, state in enumerate(states):
@@ -236,12 +218,11 @@ def _summary(fitted: Fitted, dt_s: float) -> dict[str, Any]:
             "half_width": dict(fitted.half_width),
             "half_width_s": {state: n * dt_s for state, n in fitted.half_width.items()},
         }
-    known = model.covariance is not None
+    if (known := intervals(model)) is not None:
+        windows["intervals"] = known
     return {
-        "text": model.text(),
+        **model_summary(model),
         **windows,
-        "equations": {state: model.terms(state) for state in model.states},
-        **({"intervals": {s: model.intervals(s) for s in model.states}} if known else {}),
         "r2": dict(fitted.r2),
         "f_kHz": 1e-3 * integrated.frequency_Hz[model.states[0]],
         "f_error": fitted.f_error,
