@@ -236,7 +236,7 @@ def test_configs_below_the_folder_one_stands_in_are_found(
     monkeypatch.chdir(tmp_path)
     given = ["--config-dir", "elsewhere", "+exp=mine"] if named else ["+exp=mine"]
     monkeypatch.setattr(sys, "argv", ["ep2sindy", *given])
-    program.add_own_configs(ROOT / "conf")
+    program.prepare_arguments(ROOT / "conf")
     own = ["--config-dir", str(tmp_path / "conf"), "+exp=mine"]
     assert sys.argv[1:] == (given if named else own)
 

@@ -16,12 +16,9 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 PACKAGE = Path(__file__).resolve().parents[1]
-
-
-class JobError(Exception):
-    """A job that ended early, for a reason that is in the message."""
 
 
 def main() -> None:
@@ -29,19 +26,22 @@ def main() -> None:
     gc.set_threshold(100_000, 50, 100)  # imports make objects that stay: looking costs 0.6 s a run
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
     sweeps: list[Path] = []
+    failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
     try:
         conf = conf_folder()
-        add_own_configs(conf)
+        prepare_arguments(conf)
 
         @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")
         def job(config: DictConfig) -> None:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
-            run_job(config, conf)
+            failed.extend(run_job(config, conf))
 
         job()
-    except (JobError, HydraException, OmegaConfBaseException, OSError, ValueError) as error:
+    except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
         sys.exit(f"error: {error}")
+    except OSError as error:
+        sys.exit(f"error: {error}; a folder that can be written is chosen with output=PATH")
     except KeyboardInterrupt:
         sys.exit("interrupted: files under their final names are whole")
     finally:
@@ -49,6 +49,8 @@ def main() -> None:
             from ep2sindy.app.sweep import index_text
 
             print(index_text(sweep))
+    if failed:
+        sys.exit(f"error: {failed[0]}" if len(failed) == 1 else f"error: {len(failed)} jobs failed")
 
 
 def conf_folder() -> Path:
@@ -63,29 +65,36 @@ def conf_folder() -> Path:
     )
 
 
-def add_own_configs(conf: Path) -> None:
-    """Configs in ./conf are found beside the package's own, as with `--config-dir ./conf`."""
+def prepare_arguments(conf: Path) -> None:
+    """Flags may stand anywhere, and configs in ./conf are found as with `--config-dir ./conf`."""
+    flags = [text for text in sys.argv[1:] if text in ("-m", "--multirun")]
+    sys.argv[1:] = [*flags, *(text for text in sys.argv[1:] if text not in flags)]
     own = Path.cwd() / "conf"
     named = any(text.startswith(("--config-dir", "-cd")) for text in sys.argv[1:])
     if own.is_dir() and own.resolve() != conf.resolve() and not named:
         sys.argv[1:] = ["--config-dir", str(own), *sys.argv[1:]]
 
 
-def run_job(config: DictConfig, conf: Path) -> None:
-    """One run; in a sweep its end is noted in the index, and the other jobs go on."""
+def run_job(config: DictConfig, conf: Path) -> list[str]:
+    """One run, and why it ended early, if it did; a sweep notes that and goes on."""
     from ep2sindy.app.sweep import noted_job
 
-    with noted_job() as done:
+    with noted_job() as (done, ended_early):
         try:
             if config.experiment is None:
-                raise ValueError(f"choose an experiment with +exp=NAME; there are {known(conf)}")
+                raise ValueError(
+                    f"choose an experiment with +exp=NAME; there are {known(conf)}. A config of "
+                    "your own begins with the line '# @package _global_'"
+                )
             from ep2sindy.app.runner import run_config
 
             finished = run_config(config, overrides=HydraConfig.get().overrides.task)
         except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
-            raise JobError(str(error)) from error
+            ended_early(error)
+            return [str(error)]
         done(finished.folder, finished.headline)
     print(finished.folder)
+    return []
 
 
 def known(conf: Path) -> str:

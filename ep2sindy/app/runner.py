@@ -40,6 +40,8 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     overrides: what was set on the command line; one that the study does not use is an error.
     """
     check_common(config)
+    if missing := next(_missing(OmegaConf.to_container(config), ""), None):
+        raise ValueError(f"{missing} must be set, for it has no default: {missing}=VALUE")
     kind = study_class(config.get("study"))
     check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
     study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
@@ -47,6 +49,15 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
         outcome = study.compute(run)
         headline = write(run, outcome, hparams_of(run.settings, keys_of(kind)))
     return Finished(run.folder.path, headline)
+
+
+def _missing(settings: Any, place: str) -> Iterator[str]:
+    """Dotted paths of what has no value yet, interpolations left as they are."""
+    if settings == "???":
+        yield place
+    items = settings.items() if isinstance(settings, dict) else ()
+    for key, value in items:
+        yield from _missing(value, f"{place}.{key}" if place else str(key))
 
 
 def study_class(name: object) -> type:

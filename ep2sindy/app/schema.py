@@ -51,12 +51,22 @@ def _filled(study: type, config: DictConfig) -> Any:
     arguments = {}
     for name, kind in _hints(study).items():
         if kind in GATHERED:
-            arguments[name] = _filled(kind, config)
+            arguments[name] = _gathered(kind, config)
         elif name in config or OmegaConf.is_missing(config, name):
             arguments[name] = value_of(kind, _node(config, name, name), name)
         elif _is_required(study, name):
             raise ValueError(f"the config of this experiment must have {name!r}")
     return study(**arguments)
+
+
+def _gathered(kind: type, config: DictConfig) -> Any:
+    """A recipe or source from its groups: one left out (`~search`) must not turn into a default."""
+    if lacking := [name for name in _hints(kind) if name not in config]:
+        raise ValueError(
+            f"the config of this experiment must have {lacking[0]!r}: choose one with "
+            f"{lacking[0]}=NAME, see --help"
+        )
+    return _filled(kind, config)
 
 
 def value_of(kind: Any, node: Any, place: str) -> Any:

@@ -21,13 +21,16 @@ RECORDS = "jobs"
 
 
 @contextmanager
-def noted_job() -> Iterator[Callable[[Path, Mapping[str, float]], None]]:
+def noted_job() -> Iterator[
+    tuple[Callable[[Path, Mapping[str, float]], None], Callable[[BaseException], None]]
+]:
     """In a sweep: say which job begins, and note how it ended; otherwise do nothing.
 
-    What comes is told the run folder and the headline figures of a job that came to its end.
+    The first of what comes is told the run folder and the headline figures of a job that came to
+    its end, the second the error of one that did not.
     """
     if HydraConfig.get().mode != RunMode.MULTIRUN:
-        yield lambda folder, headline: None
+        yield (lambda folder, headline: None), (lambda error: None)
         return
     job, overrides = HydraConfig.get().job.num, list(HydraConfig.get().overrides.task)
     sweep = Path(HydraConfig.get().sweep.dir)
@@ -37,11 +40,14 @@ def noted_job() -> Iterator[Callable[[Path, Mapping[str, float]], None]]:
     def done(folder: Path, headline: Mapping[str, float]) -> None:
         record.update(status="done", folder=str(folder), headline=dict(headline))
 
-    try:
-        yield done
-    except BaseException as error:
+    def ended_early(error: BaseException) -> None:
         record["error"] = f"{error}" or type(error).__name__
         print(f"job {job} failed: {record['error']}", flush=True)
+
+    try:
+        yield done, ended_early
+    except BaseException as error:
+        ended_early(error)
         raise
     finally:
         write_json(sweep / RECORDS / f"{job}.json", record)

@@ -61,7 +61,8 @@ def _from_table(table: pd.DataFrame) -> Trajectory:
     kinds = {str(name): table[name].dtype for name in (times[0], *states)}
     wrong = {name: str(kind) for name, kind in kinds.items() if kind.kind not in "iuf"}
     if wrong:
-        raise ValueError(f"columns of a table must hold real numbers: {wrong} came; drop them")
+        way_out = "give time in s, as numbers" if str(times[0]) in wrong else "drop them"
+        raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
     values = table[states].to_numpy(dtype=np.float64)
     return Trajectory(table[times[0]].to_numpy(dtype=np.float64), values, list(map(str, states)))
 

@@ -73,6 +73,12 @@ def discover(
     recipe: None means Recipe(), the route for noisy data that we know to be best.
     """
     trajectories = trajectories_of(runs)
+    for name, value, kind in (("library", library, Library), ("recipe", recipe, Recipe)):
+        if value is not None and not isinstance(value, kind):
+            raise ValueError(
+                f"{name} must be a {kind.__name__}: {value!r} came; "
+                "discover(runs, library, recipe, seed=0)"
+            )
     library = library or polynomial(trajectories[0].names, degree=2)
     recipe = recipe or Recipe()
     equations = recipe.searched(trajectories, library, rng=np.random.default_rng(seed))

@@ -46,6 +46,14 @@ class Finding:
     selected: Mapping[str, frozenset[str]] | None
 
 
+_EXAMPLES = {
+    "formulation": "ep.WeightedWeak()",
+    "search": "ep.BestSubset()",
+    "bootstraps": "ep.Bootstraps(n=0)",
+    "selection": "ep.EBIC()",
+}
+
+
 @dataclass(frozen=True)
 class Recipe:
     """Rows, search, bootstraps, the rule that selects, and how many candidates it sees per size.
@@ -62,7 +70,17 @@ class Recipe:
     depth: int = 1
 
     def __post_init__(self) -> None:
-        if not isinstance(self.depth, int) or self.depth < 1:
+        kinds = {
+            "formulation": Formulation, "search": Search, "bootstraps": Bootstraps,
+            "selection": Selection,
+        }  # fmt: skip
+        for name, kind in kinds.items():
+            value = getattr(self, name)
+            if isinstance(value, type) or not isinstance(value, kind):
+                raise ValueError(
+                    f"{name} must be a {kind.__name__}, such as {_EXAMPLES[name]}: {value!r} came"
+                )
+        if type(self.depth) is not int or self.depth < 1:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")
 
     def searched(
