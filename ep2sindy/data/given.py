@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 
@@ -34,12 +34,23 @@ def trajectories_of(runs: object) -> list[Trajectory]:
     return [_trajectory(runs, "")]
 
 
+def is_run(value: object) -> bool:
+    """Whether a value is samples with their times: a trajectory or a table."""
+    pandas = sys.modules.get("pandas")  # who has a table has imported it
+    table = pandas is not None and isinstance(value, pandas.DataFrame)
+    return table or isinstance(value, Trajectory)
+
+
+def trajectory_of(run: object) -> Trajectory:
+    """One run as a trajectory; see `trajectories_of`."""
+    return _trajectory(run, "")
+
+
 def _trajectory(run: object, which: str) -> Trajectory:
     if isinstance(run, Trajectory):
         return run
-    pandas = sys.modules.get("pandas")  # who has a table has imported it
-    if pandas is not None and isinstance(run, pandas.DataFrame):
-        return _from_table(run)
+    if is_run(run):
+        return _from_table(cast("pd.DataFrame", run))
     if isinstance(run, tuple) and len(run) == 2:
         return _from_arrays(*run)
     raise ValueError(

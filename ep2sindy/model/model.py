@@ -14,7 +14,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.data.given import Run, is_run, trajectory_of
+from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.machine.files import write_text
@@ -111,7 +112,7 @@ class SparseModel:
 
     def rollout(
         self,
-        trajectory: Trajectory,
+        trajectory: Run,
         *,
         start: int = 0,
         n_samples: int | None = None,
@@ -121,6 +122,7 @@ class SparseModel:
     ) -> Rollout:
         """Integrate from one sample of a trajectory, driven by its inputs (cubic splines).
 
+        trajectory: or a table or arrays (t, x), as `discover` takes them.
         initial: the state at that sample, in SI; None takes the data's.
         The states are scaled by their largest value in the window, so that one tolerance fits
         all. A state that exceeds `blow_up` times that value ends the run as diverged.
@@ -128,7 +130,7 @@ class SparseModel:
         """
         return rollout(
             self,
-            trajectory,
+            trajectory_of(trajectory),
             start=start,
             n_samples=n_samples,
             initial=initial,
@@ -157,20 +159,22 @@ class SparseModel:
         return simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol)
 
     def predict(
-        self, x: ArrayLike | Trajectory, inputs: ArrayLike | Mapping[str, Any] | None = None
+        self, x: ArrayLike | Run, inputs: ArrayLike | Mapping[str, Any] | None = None
     ) -> Float[np.ndarray, "... n_states"]:
         """Right-hand side at many samples at once, in SI per second.
 
-        x: (samples, n_states), or one sample (n_states,), or a Trajectory, which brings its own
-        inputs. inputs: of the same number of samples, in the order of `inputs`, or by name.
+        x: (samples, n_states), or one sample (n_states,), or a Trajectory (or a table with a time
+        column), which brings its own inputs. inputs: of the same number of samples, in the order
+        of `inputs`, or by name.
         Raises ValueError for a missing or unknown variable and for wrong shapes.
         """
-        if isinstance(x, Trajectory):
+        if is_run(x):
+            run = trajectory_of(x)
             if inputs is not None:
                 raise ValueError(
                     "a Trajectory brings its own inputs: pass its states, or no inputs"
                 )
-            return self.derivative(x.columns(self.states), x.columns(self.inputs))
+            return self.derivative(run.columns(self.states), run.columns(self.inputs))
         states = np.asarray(x, dtype=np.float64)
         if states.ndim == 0 or states.shape[-1] != len(self.states):
             raise ValueError(
@@ -180,19 +184,22 @@ class SparseModel:
 
     def score(
         self,
-        run: Trajectory,
+        run: Run,
         *,
         x_dot: Float[np.ndarray, "samples n_states"] | None = None,
         smoother: Smoother | None = None,
     ) -> float:
         """R2 of the derivative over a trajectory, the mean over the states; one is perfect.
 
+        run: as `discover` takes it.
         The derivative and the samples at which the right-hand side is taken come from `smoother`,
         by default SavitzkyGolay(), as in `Differential`; with x_dot, (samples, n_states) in SI
         and in the order of the model's states, that is the truth, and samples are taken raw.
         Raises ValueError for a missing variable, a wrong shape or a derivative that is constant.
         """
-        return derivative_r2(self, run, x_dot=x_dot, smoother=smoother or SavitzkyGolay())
+        return derivative_r2(
+            self, trajectory_of(run), x_dot=x_dot, smoother=smoother or SavitzkyGolay()
+        )
 
     def text(self, *, digits: int = 3) -> str:
         """One line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""

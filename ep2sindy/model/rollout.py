@@ -107,13 +107,14 @@ def simulate(
     rtol: float,
 ) -> Rollout:
     """Integrate freely from one state: see `SparseModel.simulate`."""
-    times = np.asarray(t, dtype=np.float64)
-    check_time(times)
-    start = np.asarray(x0, dtype=np.float64)
+    times, start = np.asarray(t, dtype=np.float64), np.asarray(x0, dtype=np.float64)
     if start.shape != (len(model.states),) or not np.isfinite(start).all():
+        came = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"
         raise ValueError(
-            f"x0 must give a finite number for each of {list(model.states)}: {start.tolist()} came"
+            f"x0 must give a finite number for each of {list(model.states)}: {came} came; the "
+            "order is simulate(t, x0)"
         )
+    check_time(times)
     drive, samples = driven(model.inputs, inputs, times)
     values, terms = model.library.at_points([*model.states, *model.inputs])
     values[:] = np.append(start, samples[0])

@@ -91,8 +91,9 @@ class RunFolder:
 
 def _freeze_layout(figure: Figure) -> None:
     """Solve the layout once: every saving would solve it again, and draw twice."""
-    engine = figure.get_layout_engine()
+    engine: Any = figure.get_layout_engine()
     if engine is not None:
+        engine.set(w_pad=0.12, h_pad=0.08)  # inches: one pass leaves labels that far off
         figure.set_dpi(DPI)
         engine.execute(figure)
         figure.set_layout_engine(None)  # not "none": that placeholder still draws twice
