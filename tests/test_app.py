@@ -151,6 +151,14 @@ def test_a_key_that_is_missing_is_named() -> None:
         study_of(Toy, without)
 
 
+@pytest.mark.parametrize("group", ["search", "formulation", "depth"])
+def test_a_group_left_out_does_not_become_another(group: str) -> None:
+    without = config()
+    del without[group]
+    with pytest.raises(ValueError, match=f"must have '{group}': choose one with {group}=NAME"):
+        study_of(Toy, without)
+
+
 def test_what_is_built_later_can_be_changed_by_place() -> None:
     point = {"voltage": 300.0, "mass_flow_mg_s": 5.0}
     node = OmegaConf.create({"_target_": "ep2sindy.OperatingPoint", **point})
@@ -239,6 +247,13 @@ def test_configs_below_the_folder_one_stands_in_are_found(
     program.prepare_arguments(ROOT / "conf")
     own = ["--config-dir", str(tmp_path / "conf"), "+exp=mine"]
     assert sys.argv[1:] == (given if named else own)
+
+
+def test_flags_may_stand_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ep2sindy", "+exp=discover", "-m", "seed=0,1"])
+    program.prepare_arguments(ROOT / "conf")
+    assert sys.argv[1:] == ["-m", "+exp=discover", "seed=0,1"]
 
 
 def records(folder: Path) -> None:
@@ -332,6 +347,8 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(tmp_path: Path) -> None:
     [
         ([], "error: choose an experiment with +exp=NAME; there are benchmark, breathing"),
         (["+exp=breathing", "sede=1"], "Could not override 'sede'"),
+        (["+exp=discover", "data=file", "data.path=x"], "trajectory.states must be set, for it"),
+        (["+exp=breathing", "search=null"], "Config group override must be a string"),
         (["+exp=breathing", "--config-dir", "nowhere"], "nowhere"),
         (["+exp=breathing", "output=/proc/none"], "choose another with output=PATH"),
     ],

@@ -4,6 +4,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.given import trajectories_of
+from ep2sindy.discovery.recipe import check_kind
+from ep2sindy.selection.rule import Selection
 
 T = np.linspace(0.0, 3.0, 31)
 X = np.column_stack([np.exp(-T), np.sin(T)])
@@ -43,7 +45,8 @@ def test_a_list_holds_several_runs_of_any_kind() -> None:
         (X, "run is of type ndarray; several runs go into a list"),
         (pd.DataFrame({"x": T}), r"must have one time column, .* its columns are \['x'\]"),
         (pd.DataFrame({"t": T, "time": T, "x": T}), "must have one time column"),
-        (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': "),
+        (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': .*; drop"),
+        (pd.DataFrame({"t": pd.to_datetime(T), "x": T}), "{'t': 'datetime.* give time in s"),
         ((T, X.T), r"must have shapes .*: \(31,\) and \(2, 31\) came"),
         ((T, X + 1j), "must hold real numbers: float64 and complex128 came"),
     ],
@@ -70,3 +73,19 @@ def test_a_seed_and_its_generator_give_the_same() -> None:
     one = ep.discover(run, recipe=recipe, seed=3)
     other = ep.discover(run, recipe=recipe, seed=np.random.default_rng(3))
     assert np.array_equal(one.model.coef, other.model.coef)
+
+
+def test_a_model_takes_runs_as_discover_does() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    table = pd.DataFrame({"t": run.t, "x": run.states[:, 0], "y": run.states[:, 1]})
+    model = ep.discover(table).model
+    assert model.score(table) == model.score(run)
+    assert np.array_equal(model.predict(table), model.predict(run))
+    assert np.array_equal(model.rollout(table).states, model.rollout(run).states)
+
+
+@pytest.mark.parametrize("value", [ep.BestSubset(), ep.EBIC, "ebic", None])
+def test_what_is_no_selection_is_refused_with_an_example(value: object) -> None:
+    check_kind("selection", ep.EBIC(), Selection, "ep.EBIC()")
+    with pytest.raises(ValueError, match=r"selection must be a Selection, such as ep.EBIC\(\): "):
+        check_kind("selection", value, Selection, "ep.EBIC()")

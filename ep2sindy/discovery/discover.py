@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.discovery.last_fit import assemble_model, last_fit
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.recipe import Recipe, check_kind
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.screen import N_LINES, one_screen
 from ep2sindy.model.display import model_html, model_lines
@@ -73,14 +73,10 @@ def discover(
     recipe: None means Recipe(), the route for noisy data that we know to be best.
     """
     trajectories = trajectories_of(runs)
-    for name, value, kind in (("library", library, Library), ("recipe", recipe, Recipe)):
-        if value is not None and not isinstance(value, kind):
-            raise ValueError(
-                f"{name} must be a {kind.__name__}: {value!r} came; "
-                "discover(runs, library, recipe, seed=0)"
-            )
-    library = library or polynomial(trajectories[0].names, degree=2)
-    recipe = recipe or Recipe()
+    library = polynomial(trajectories[0].names, degree=2) if library is None else library
+    recipe = Recipe() if recipe is None else recipe
+    check_kind("library", library, Library, "ep.polynomial(['x', 'y'], degree=2)")
+    check_kind("recipe", recipe, Recipe, "ep.Recipe(selection=ep.EBIC())")
     equations = recipe.searched(trajectories, library, rng=np.random.default_rng(seed))
     fronts = {equation.front.equation: equation.front for equation in equations}
     scores, selected = recipe.choice(list(fronts.values()))

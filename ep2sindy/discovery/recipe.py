@@ -46,12 +46,10 @@ class Finding:
     selected: Mapping[str, frozenset[str]] | None
 
 
-_EXAMPLES = {
-    "formulation": "ep.WeightedWeak()",
-    "search": "ep.BestSubset()",
-    "bootstraps": "ep.Bootstraps(n=0)",
-    "selection": "ep.EBIC()",
-}
+def check_kind(name: str, value: object, kind: type, example: str) -> None:
+    """Raise ValueError for a value of another kind, or a class where a value is meant."""
+    if isinstance(value, type) or not isinstance(value, kind):
+        raise ValueError(f"{name} must be a {kind.__name__}, such as {example}: {value!r} came")
 
 
 @dataclass(frozen=True)
@@ -70,16 +68,10 @@ class Recipe:
     depth: int = 1
 
     def __post_init__(self) -> None:
-        kinds = {
-            "formulation": Formulation, "search": Search, "bootstraps": Bootstraps,
-            "selection": Selection,
-        }  # fmt: skip
-        for name, kind in kinds.items():
-            value = getattr(self, name)
-            if isinstance(value, type) or not isinstance(value, kind):
-                raise ValueError(
-                    f"{name} must be a {kind.__name__}, such as {_EXAMPLES[name]}: {value!r} came"
-                )
+        check_kind("formulation", self.formulation, Formulation, "ep.WeightedWeak()")
+        check_kind("search", self.search, Search, "ep.BestSubset()")
+        check_kind("bootstraps", self.bootstraps, Bootstraps, "ep.Bootstraps(n=0)")
+        check_kind("selection", self.selection, Selection, "ep.EBIC()")
         if type(self.depth) is not int or self.depth < 1:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")
 
