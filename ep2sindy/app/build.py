@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from importlib import import_module
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from hydra.errors import HydraException
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from ep2sindy.studies.source import Step
 
@@ -21,6 +23,53 @@ def innermost(error: BaseException) -> BaseException:
     while isinstance(error, HydraException) and error.__cause__ is not None:
         error = error.__cause__
     return error
+
+
+PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+
+
+def is_plain(value: object, kind: type) -> bool:
+    """Whether a value is of a plain kind; a whole number is a number too, true is none."""
+    return type(value) is kind or (kind, type(value)) == (float, int)
+
+
+def check_arguments(node: Any, place: str) -> None:
+    """Raise ValueError for an argument, at any depth, that is not of the plain kind it must be."""
+    if isinstance(node, ListConfig):
+        for k in range(len(node)):
+            check_arguments(node[k], f"{place}[{k}]")
+    if not isinstance(node, DictConfig):
+        return
+    kinds = _plain_kinds(node, place) if "_target_" in node else {}
+    for name in map(str, node):
+        value, wanted = node[name], kinds.get(name, ())
+        if wanted and value is not None and not any(is_plain(value, kind) for kind in wanted):
+            words = " or ".join(PLAIN[kind] for kind in wanted)
+            raise ValueError(f"{place}.{name} must be {words}: {value!r} came")
+        check_arguments(value, f"{place}.{name}")
+
+
+def _plain_kinds(node: DictConfig, place: str) -> dict[str, tuple[type, ...]]:
+    """Arguments of a target that can only be plain values, or None: by name, their kinds."""
+    try:
+        module, _, name = node["_target_"].rpartition(".")
+        target: Any = getattr(import_module(module), name)
+        hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
+    except NameError:  # an annotation that is not there while the program runs
+        return {}
+    except Exception as error:
+        raise ValueError(
+            f"{place} must name a _target_ that there is, such as ep2sindy.EBIC: "
+            f"{node['_target_']!r} came"
+        ) from error
+    found = {name: _alternatives(hint) for name, hint in hints.items()}
+    return {name: kinds for name, kinds in found.items() if set(kinds) <= set(PLAIN)}
+
+
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    """The kinds of a union but None; of another hint itself."""
+    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return tuple(part for part in parts if part is not type(None))
 
 
 def call_of(node: Any, place: str, *first: Any) -> partial[Any]:
@@ -33,6 +82,7 @@ def call_of(node: Any, place: str, *first: Any) -> partial[Any]:
         raise ValueError(f"{place} must name a _target_: {node!r} came")
     if missing := sorted(OmegaConf.missing_keys(node)):
         raise ValueError(f"{missing[0]} must be set: it is still '???'")
+    check_arguments(node, place)
     try:
         call = instantiate(node, _convert_="all", _partial_=True)
     except HydraException as error:

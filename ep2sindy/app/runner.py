@@ -40,10 +40,11 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     overrides: what was set on the command line; one that the study does not use is an error.
     """
     check_common(config)
-    if missing := next(_missing(OmegaConf.to_container(config), ""), None):
-        raise ValueError(f"{missing} must be set, for it has no default: {missing}=VALUE")
     kind = study_class(config.get("study"))
     check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
+    taken = {key: config[key] for key in config if key in keys_of(kind)}
+    if missing := next(_missing(OmegaConf.to_container(OmegaConf.create(taken)), ""), None):
+        raise ValueError(f"{missing} must be set, for it has no default: {missing}=VALUE")
     study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
     with started_run(config) as run:
         outcome = study.compute(run)

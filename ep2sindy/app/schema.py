@@ -9,7 +9,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy.app.build import deferred, instance_of, step_of
+from ep2sindy.app.build import PLAIN, deferred, instance_of, is_plain, step_of
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.studies.kinds import Deferred, Kind
 from ep2sindy.studies.source import FieldSource, Source, Step
@@ -119,14 +119,11 @@ def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
     return value_of(kinds[-1], node, place)
 
 
-NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
-
-
 def _scalar(kind: Any, node: Any, place: str) -> Any:
     """A plain value. One that names no `_target_` is never of a type that is not plain."""
     value = _plain(node)
-    if type(value) is not kind and (kind, type(value)) != (float, int):
-        wanted = NAMES.get(kind, f"a {kind.__name__}, named by its _target_")
+    if not is_plain(value, kind):
+        wanted = PLAIN.get(kind, f"a {kind.__name__}, named by its _target_")
         raise ValueError(f"{place} must be {wanted}: {value!r} came")
     return float(value) if kind is float else value
 
