@@ -8,6 +8,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.identified import frontier_figure
 from ep2sindy.figures.windows import window_error_figure
+from ep2sindy.machine.parallel import Serial
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Boxes, Bumps
@@ -15,7 +16,7 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.frontier import identification_frontier
+from ep2sindy.studies.frontier import Study
 from ep2sindy.studies.weak_forms import Setting, boxes_grid, fit_settings, fitted_terms
 from ep2sindy.studies.weak_windows import (
     coefficient_error,
@@ -194,7 +195,11 @@ def frontier(**settings: object) -> pd.DataFrame:
         "durations_s": [2.0, 50.0],
     }
     arguments = defaults | settings
-    return identification_frontier(lotka_volterra(), arguments.pop("variants"), **arguments)
+    variants = arguments.pop("variants")
+    study = Study(
+        lotka_volterra(), **arguments, variants=list(variants), definitions={}, parallel=Serial()
+    )
+    return study.points(variants)
 
 
 def test_long_and_fast_samples_identify_and_few_do_not() -> None:
