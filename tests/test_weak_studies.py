@@ -1,9 +1,12 @@
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 
+from ep2sindy.app.build import Configured
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.identified import frontier_figure
@@ -16,11 +19,11 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.frontier import Study
+from ep2sindy.studies import frontier as frontiers
+from ep2sindy.studies import weak_windows
 from ep2sindy.studies.weak_forms import Setting, boxes_grid, fit_settings, fitted_terms
 from ep2sindy.studies.weak_windows import (
     coefficient_error,
-    coefficient_errors,
     true_library,
     window_cells,
 )
@@ -42,6 +45,23 @@ def sampled(*, rate_Hz: float = 30.0, duration_s: float = 40.0) -> System:
 
 def boxes(n_windows: int, n_points: int) -> Setting:
     return Setting(replace(BOXES, test_functions=Boxes(n_windows=n_windows, n_points=n_points)))
+
+
+def coefficient_errors(
+    system: System,
+    settings: Mapping[str, Setting],
+    *,
+    noises: Sequence[float],
+    n_realizations: int,
+    seed: int = 0,
+) -> pd.DataFrame:
+    forms = {"formulation": Differential(), "automatic": AUTOMATIC, "parallel": Serial()}
+    deferred = Configured(OmegaConf.create({"_target_": "ep2sindy.Weak"}), "boxes")
+    study = weak_windows.Study(
+        system=system, rate_Hz=system.rate_Hz, boxes=deferred, n_windows=[1], n_points=[2],
+        noises=noises, n_realizations=n_realizations, **forms,
+    )  # fmt: skip
+    return study.errors(settings, seed=seed)
 
 
 TERMS = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
@@ -196,7 +216,7 @@ def frontier(**settings: object) -> pd.DataFrame:
     }
     arguments = defaults | settings
     variants = arguments.pop("variants")
-    study = Study(
+    study = frontiers.Study(
         lotka_volterra(), **arguments, variants=list(variants), definitions={}, parallel=Serial()
     )
     return study.points(variants)

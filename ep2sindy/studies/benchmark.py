@@ -15,12 +15,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure
 from ep2sindy.machine.parallel import Workers, rows_in_order
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Section
 from ep2sindy.report.run import Run
-from ep2sindy.studies.benchmark_view import FIGURE, published_cells, sections
+from ep2sindy.studies.benchmark_view import Outcome, published_cells
 from ep2sindy.studies.kinds import Count, Deferred, Levels, Names
 from ep2sindy.studies.variants import Variant, built_variants, merits
 from ep2sindy.synthetic.draws import check_systems, realization
@@ -108,54 +105,3 @@ def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
         n=("number", "count"),
         cpu_s_per_search=("cpu_s", "median"),
     ).reset_index()
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Every outcome, and counts of them.
-
-    published: the thesis's cells, as `cells` without the time.
-    """
-
-    variants: Mapping[str, Variant]
-    outcomes: pd.DataFrame
-    cells: pd.DataFrame
-    published: pd.DataFrame
-
-    def models(self) -> dict[str, SparseModel]:
-        return {}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        """Outcomes, and our cells beside what the thesis found in the same ones."""
-        columns = {merit: f"thesis_{merit}" for merit in MERITS}
-        keys = ["system", "noise", "variant"]
-        beside = self.published.rename(columns=columns)[[*keys, *columns.values()]]
-        return {"outcomes": self.outcomes, "cells": self.cells.merge(beside, how="left", on=keys)}
-
-    def figures(self) -> dict[str, Captioned]:
-        draw = partial(benchmark_figure, self.cells, thesis=self.published)
-        return {"benchmark": Captioned(draw, FIGURE)}
-
-    def sections(self) -> list[Section]:
-        return sections(self.variants, self.cells, self.published)
-
-    def summary(self) -> dict[str, Any]:
-        """Counts as whole numbers; null where a variant selects nothing."""
-        rows = self.cells.astype({"on_front": int}).to_dict("records")
-        return {
-            "cells": [
-                row | {"selected": None if np.isnan(row["selected"]) else int(row["selected"])}
-                for row in rows
-            ]
-        }
-
-    def headline(self) -> dict[str, float]:
-        """Means over systems and noise levels; what selects nothing has 0 % selected, NaN terms."""
-        scalars = {}
-        for name, rows in self.cells.groupby("variant", sort=False):
-            for merit in COUNTS:
-                percent = 100.0 * rows[merit].sum() / rows["n"].sum()
-                scalars[f"{name}/{merit}_percent"] = float(percent)
-            scalars[f"{name}/mean_correct_terms"] = float(rows["mean_correct_terms"].mean())
-            scalars[f"{name}/cpu_ms"] = float(1e3 * rows["cpu_s_per_search"].mean())
-        return scalars

@@ -15,7 +15,7 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Kind
-from ep2sindy.studies.known_terms import terms_of
+from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.opening import PointSource, point_sources
 from ep2sindy.studies.parametric.points import (
@@ -98,7 +98,7 @@ class Study:
     parallel: Workers
     parameters: Mapping[str, str | None]
     points: Sequence[Mapping[str, Any]]
-    model: Mapping[str, Any]
+    model: Terms
     cases: Cases
     bootstrap: TimeBootstrap
     refining: Refining
