@@ -56,9 +56,9 @@ def coefficient_errors(
     seed: int = 0,
 ) -> pd.DataFrame:
     forms = {"formulation": Differential(), "automatic": AUTOMATIC, "parallel": Serial()}
-    deferred = Configured(OmegaConf.create({"_target_": "ep2sindy.Weak"}), "boxes")
+    form = Configured(OmegaConf.create({"_target_": "ep2sindy.Weak"}), "boxes")
     study = weak_windows.Study(
-        system=system, rate_Hz=system.rate_Hz, boxes=deferred, n_windows=[1], n_points=[2],
+        system=system, rate_Hz=system.rate_Hz, boxes=form, n_windows=[1], n_points=[2],
         noises=noises, n_realizations=n_realizations, **forms,
     )  # fmt: skip
     return study.errors(settings, seed=seed)

@@ -44,7 +44,7 @@ class Study:
         published = published_cells(self.thesis)
         variants = built_variants(self.variants, self.definitions)
         n_pieces = len(self.systems) * len(self.noises) * self.n_realizations
-        with run.counted(n_pieces, "realization") as progress:
+        with run.progress(n_pieces, "realization") as progress:
             outcomes = self.outcomes(variants, seed=run.seed, progress=progress)
         return Outcome(variants, outcomes, cells(outcomes), published)
 

@@ -46,7 +46,7 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         variants = built_variants(self.variants, self.definitions)
-        with run.counted(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
+        with run.progress(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
             points = self.points(variants, seed=run.seed, progress=progress)
         return Outcome(self.system, points)
 

@@ -63,7 +63,7 @@ class Study:
             n_points=self.n_points,
         )
         n_pieces = len(self.noises) * self.n_realizations
-        with run.counted(n_pieces, "realization") as progress:
+        with run.progress(n_pieces, "realization") as progress:
             errors = self.errors(settings, seed=run.seed, progress=progress)
         return Outcome(self.sampled, settings, errors, window_cells(errors, settings))
 
