@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 import ep2sindy as ep
 from ep2sindy.app import main as program
 from ep2sindy.app import sweep
-from ep2sindy.app.build import deferred
+from ep2sindy.app.build import Configured
 from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_config, study_class
 from ep2sindy.app.schema import keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
@@ -169,7 +169,7 @@ def test_a_group_left_out_does_not_become_another(group: str) -> None:
 def test_what_is_built_later_can_be_changed_by_place() -> None:
     point = {"voltage": 300.0, "mass_flow_mg_s": 5.0}
     node = OmegaConf.create({"_target_": "ep2sindy.OperatingPoint", **point})
-    later = deferred(node, "data")
+    later = Configured(node, "data")
     changed = later.changed({"voltage": 200.0}, {"neutral_speed": 190.0})
     assert changed.build().voltage == 200.0
     assert changed.build().neutral_speed == 190.0

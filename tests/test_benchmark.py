@@ -1,5 +1,5 @@
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,14 +10,15 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Finding, Recipe
 from ep2sindy.figures.identified import benchmark_figure, merit_table
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Loky
+from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
 from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.benchmark import cells, run_benchmark
-from ep2sindy.studies.variants import Variant, judged
+from ep2sindy.studies.benchmark import Study, cells
+from ep2sindy.studies.variants import Variant, merits
 from ep2sindy.synthetic.draws import realization
+from ep2sindy.synthetic.systems import damped_oscillator
 
 TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
 # Draws random bootstraps and a random split: its outcome hangs on its stream.
@@ -39,10 +40,22 @@ class Scripted:
         return self.findings.pop(0)
 
 
+def benchmark(
+    variants: Mapping[str, Variant],
+    *,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda n_more: None,
+    **settings,
+) -> pd.DataFrame:
+    defaults = {"n_trajectories": 1, "parallel": Serial(), "definitions": {}, "thesis": {}}
+    study = Study(variants=list(variants), **(defaults | settings))
+    return study.outcomes(variants, seed=seed, progress=progress)
+
+
 def outcomes_of(**settings) -> pd.DataFrame:
     """Without the time, which no seed fixes."""
     defaults = {"systems": ["lotka_volterra"], "noises": [0.2], "n_realizations": 2}
-    return run_benchmark(**(defaults | settings)).drop(columns="cpu_s")
+    return benchmark(**(defaults | settings)).drop(columns="cpu_s")
 
 
 @pytest.mark.parametrize("name", ["oscillator", "lotka_volterra"])
@@ -88,7 +101,7 @@ def test_leaving_a_variant_out_changes_no_other() -> None:
 def test_the_number_of_processes_changes_nothing() -> None:
     settings = {"variants": {"BALASSO": BALASSO, "STLSQ": STLSQ_}}
     pd.testing.assert_frame_equal(
-        outcomes_of(**settings, workers=Loky(n_jobs=2)), outcomes_of(**settings)
+        outcomes_of(**settings, parallel=Loky(n_jobs=2)), outcomes_of(**settings)
     )
 
 
@@ -105,7 +118,7 @@ def test_known_findings_give_exact_counts() -> None:
         ]
     )
     n_done: list[int] = []
-    outcomes = run_benchmark(
+    outcomes = benchmark(
         {"scripted": scripted},
         systems=["oscillator"],
         noises=[0.0],
@@ -127,12 +140,12 @@ def test_known_findings_give_exact_counts() -> None:
 
 
 def test_a_variant_that_selects_nothing_has_no_number_there() -> None:
-    found = judged(Finding({s: [t] for s, t in TRUTH.items()}, None), TRUTH)
+    found = merits(Finding({s: [t] for s, t in TRUTH.items()}, None), damped_oscillator())
     assert found["on_front"] == 1.0
     assert np.isnan([found["selected"], found["correct_terms"]]).all()
     finding = Finding({s: [t] for s, t in TRUTH.items()}, None)
     table = cells(
-        run_benchmark(
+        benchmark(
             {"free": Scripted([finding] * 2)},
             systems=["oscillator"],
             noises=[0.0],
@@ -147,8 +160,7 @@ def test_this_packages_path_is_a_variant_and_keeps_the_empty_support() -> None:
     assert isinstance(BALASSO, Variant)
     system, runs = realization("lotka_volterra", 0.0, 0)
     found = BALASSO.find(runs, system.model.library, rng=np.random.default_rng(0))
-    truth = {state: frozenset(system.model.terms(state)) for state in ("x", "y")}
-    assert judged(found, truth) == {"on_front": 1.0, "selected": 1.0, "correct_terms": 4.0}
+    assert merits(found, system) == {"on_front": 1.0, "selected": 1.0, "correct_terms": 4.0}
     assert all(kept[0] == frozenset() for kept in found.kept.values())
 
 

@@ -1,13 +1,17 @@
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 
+from ep2sindy.app.build import Configured
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.identified import frontier_figure
 from ep2sindy.figures.windows import window_error_figure
+from ep2sindy.machine.parallel import Serial
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Boxes, Bumps
@@ -15,11 +19,11 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.frontier import identification_frontier
+from ep2sindy.studies import frontier as frontiers
+from ep2sindy.studies import weak_windows
 from ep2sindy.studies.weak_forms import Setting, boxes_grid, fit_settings, fitted_terms
 from ep2sindy.studies.weak_windows import (
     coefficient_error,
-    coefficient_errors,
     true_library,
     window_cells,
 )
@@ -41,6 +45,23 @@ def sampled(*, rate_Hz: float = 30.0, duration_s: float = 40.0) -> System:
 
 def boxes(n_windows: int, n_points: int) -> Setting:
     return Setting(replace(BOXES, test_functions=Boxes(n_windows=n_windows, n_points=n_points)))
+
+
+def coefficient_errors(
+    system: System,
+    settings: Mapping[str, Setting],
+    *,
+    noises: Sequence[float],
+    n_realizations: int,
+    seed: int = 0,
+) -> pd.DataFrame:
+    forms = {"formulation": Differential(), "automatic": AUTOMATIC, "parallel": Serial()}
+    form = Configured(OmegaConf.create({"_target_": "ep2sindy.Weak"}), "boxes")
+    study = weak_windows.Study(
+        system=system, rate_Hz=system.rate_Hz, boxes=form, n_windows=[1], n_points=[2],
+        noises=noises, n_realizations=n_realizations, **forms,
+    )  # fmt: skip
+    return study.errors(settings, seed=seed)
 
 
 TERMS = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
@@ -194,7 +215,11 @@ def frontier(**settings: object) -> pd.DataFrame:
         "durations_s": [2.0, 50.0],
     }
     arguments = defaults | settings
-    return identification_frontier(lotka_volterra(), arguments.pop("variants"), **arguments)
+    variants = arguments.pop("variants")
+    study = frontiers.Study(
+        lotka_volterra(), **arguments, variants=list(variants), definitions={}, parallel=Serial()
+    )
+    return study.points(variants)
 
 
 def test_long_and_fast_samples_identify_and_few_do_not() -> None:

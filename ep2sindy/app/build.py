@@ -72,14 +72,12 @@ def _alternatives(hint: Any) -> tuple[Any, ...]:
     return tuple(part for part in parts if part is not type(None))
 
 
-def call_of(node: Any, place: str, *first: Any) -> partial[Any]:
+def call_of(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     """What a node's `_target_` names, with the rest of the node, built, as its arguments.
 
     place: the node's dotted path, for errors. first: arguments that it is given when called.
     Raises ValueError where it cannot be called so, or what a nested target raised itself.
     """
-    if not isinstance(node, DictConfig) or "_target_" not in node:
-        raise ValueError(f"{place} must name a _target_: {node!r} came")
     if missing := sorted(OmegaConf.missing_keys(node)):
         raise ValueError(f"{missing[0]} must be set: it is still '???'")
     check_arguments(node, place)
@@ -124,13 +122,16 @@ def step_of(node: Any, place: str) -> Step:
 class Configured:
     """A node that names a `_target_`, built when asked for: see `Deferred`."""
 
-    node: DictConfig
+    node: Any
     place: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.node, DictConfig) or "_target_" not in self.node:
+            raise ValueError(f"{self.place} must name a _target_: {self.node!r} came")
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        plain = OmegaConf.to_container(self.node, resolve=True)
-        assert isinstance(plain, dict)
+        plain: Any = OmegaConf.to_container(self.node, resolve=True)
         return {str(key): value for key, value in plain.items()}
 
     def build(self) -> Any:
@@ -145,15 +146,8 @@ class Configured:
             if OmegaConf.select(node, place, default=missing) is missing:
                 raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
             OmegaConf.update(node, place, value)
-        merged = OmegaConf.merge(node, dict(more or {}))
-        assert isinstance(merged, DictConfig)
+        merged: Any = OmegaConf.merge(node, dict(more or {}))
         return Configured(merged, self.place)
 
     def __str__(self) -> str:
         return OmegaConf.to_yaml(self.node, resolve=True, sort_keys=True)
-
-
-def deferred(node: Any, place: str) -> Configured:
-    if not isinstance(node, DictConfig) or "_target_" not in node:
-        raise ValueError(f"{place} must name a _target_: {node!r} came")
-    return Configured(node, place)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy.app.build import PLAIN, deferred, instance_of, is_plain, step_of
+from ep2sindy.app.build import PLAIN, Configured, instance_of, is_plain, step_of
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.studies.kinds import Deferred, Kind
 from ep2sindy.studies.source import FieldSource, Source, Step
@@ -80,7 +80,7 @@ def value_of(kind: Any, node: Any, place: str) -> Any:
     if kind is Any:
         return _plain(node)
     if kind is Deferred:
-        return deferred(node, place)
+        return Configured(node, place)
     if kind == Step:
         return step_of(node, place)
     if origin in (Union, types.UnionType):

@@ -58,7 +58,7 @@ def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.
 def frontier_figure(points: pd.DataFrame) -> Figure:
     """A panel per variant: sampling rate against duration, filled where it found the system.
 
-    points: as `studies.frontier.identification_frontier` gives them.
+    points: as `Study.points` of `studies.frontier` gives them.
     """
     variants = list(points["variant"].unique())
     figure = Figure(figsize=(2.6 * len(variants) + 0.4, 3.5), layout="constrained")

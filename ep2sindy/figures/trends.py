@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,7 +45,7 @@ def trends_figure(
     fits = list(dict.fromkeys([*estimates["fit"], *published["fit"]]))
     for row, panel in zip(axes, panels, strict=True):
         for ax, (along, at) in zip(row, trends, strict=True):
-            here = [_at(table, at) for table in (estimates, published)]
+            here = [rows_at(table, at) for table in (estimates, published)]
             for k, fit in enumerate(fits):
                 offset = APART * (k - 0.5 * (len(fits) - 1))
                 _series(
@@ -69,7 +70,8 @@ def trends_figure(
     return figure
 
 
-def _at(table: pd.DataFrame, held: Mapping[str, float]) -> pd.DataFrame:
+def rows_at(table: pd.DataFrame, held: Mapping[str, Any]) -> pd.DataFrame:
+    """The rows that have these values."""
     for name, value in held.items():
         table = table[table[name] == value]
     return table

@@ -11,7 +11,7 @@ from typing import Any
 from ep2sindy.machine.files import replacing
 from ep2sindy.report.document import Text
 from ep2sindy.report.folder import RunFolder
-from ep2sindy.report.screen import Screen, rendered
+from ep2sindy.report.screen import Screen, renderables
 from ep2sindy.report.tensorboard import Board
 
 
@@ -31,7 +31,7 @@ class Run:
 
     def say(self, text: str, *, warning: bool = False) -> None:
         """A line for those who watch, at once: on the screen and in run.log."""
-        self.screen.print(*rendered(Text(text, warning=warning)))
+        self.screen.print(*renderables(Text(text, warning=warning)))
 
     def write(self, name: str, writer: Callable[[Path], None]) -> None:
         """A file of the study's own into the run folder, whole or not at all."""
@@ -39,7 +39,7 @@ class Run:
             writer(temporary)
 
     @contextmanager
-    def counted(self, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+    def progress(self, total: int, unit: str) -> Iterator[Callable[[int], None]]:
         """A progress bar; what comes takes the number of pieces done since it was last called."""
         from tqdm import tqdm
 

@@ -37,7 +37,7 @@ class Screen:
     def show(self, sections: Sequence[Section]) -> None:
         """Every section that has something for the screen."""
         for section in sections:
-            shown = [each for block in section.blocks for each in rendered(block)]
+            shown = [each for block in section.blocks for each in renderables(block)]
             if shown:
                 self.print(f"\n[bold]{escape(section.title)}[/bold]")
                 for each in shown:
@@ -47,7 +47,7 @@ class Screen:
         self._log.close()
 
 
-def rendered(block: Block) -> Iterator[RenderableType]:
+def renderables(block: Block) -> Iterator[RenderableType]:
     """What a terminal shows of a block."""
     match block:
         case Text(page_only=False):

@@ -6,22 +6,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure
-from ep2sindy.machine.parallel import ONE_BY_ONE, Workers, rows_in_order
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Section
+from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.report.run import Run
-from ep2sindy.studies.benchmark_view import FIGURE, published_cells, sections
+from ep2sindy.studies.benchmark_view import Outcome, published_cells
 from ep2sindy.studies.kinds import Count, Deferred, Levels, Names
-from ep2sindy.studies.variants import Variant, built_variants, judged
+from ep2sindy.studies.variants import Variant, built_variants, merits
 from ep2sindy.synthetic.draws import check_systems, realization
 
 
@@ -46,42 +44,27 @@ class Study:
         published = published_cells(self.thesis)
         variants = built_variants(self.variants, self.definitions)
         n_pieces = len(self.systems) * len(self.noises) * self.n_realizations
-        with run.counted(n_pieces, "realization") as progress:
-            outcomes = run_benchmark(
-                variants,
-                systems=self.systems,
-                noises=self.noises,
-                n_realizations=self.n_realizations,
-                n_trajectories=self.n_trajectories,
-                workers=self.parallel,
-                seed=run.seed,
-                progress=progress,
-            )
+        with run.progress(n_pieces, "realization") as progress:
+            outcomes = self.outcomes(variants, seed=run.seed, progress=progress)
         return Outcome(variants, outcomes, cells(outcomes), published)
 
+    def outcomes(
+        self,
+        variants: Mapping[str, Variant],
+        *,
+        seed: int = 0,
+        progress: Callable[[int], None] = lambda n_more: None,
+    ) -> pd.DataFrame:
+        """Every variant on every realization, realizations being the workers' pieces.
 
-def run_benchmark(
-    variants: Mapping[str, Variant],
-    *,
-    systems: Sequence[str],
-    noises: Sequence[float],
-    n_realizations: int,
-    n_trajectories: int = 1,
-    workers: Workers = ONE_BY_ONE,
-    seed: int = 0,
-    progress: Callable[[int], None] = lambda n_more: None,
-) -> pd.DataFrame:
-    """Every variant on every realization, realizations being the workers' pieces.
-
-    One row per system, noise, number and variant: on_front and selected (is the whole system
-    right), correct_terms (true terms among those selected), cpu_s. A variant that selects nothing
-    has NaN there. Raises ValueError for an unknown system, or nothing to run.
-    """
-    check_systems(systems)
-    numbers = range(n_realizations)
-    tasks = [(name, noise, k) for name in systems for noise in sorted(noises) for k in numbers]
-    judge = partial(_outcomes, variants, n_trajectories=n_trajectories, seed=seed)
-    return pd.DataFrame(rows_in_order(workers, judge, tasks, progress))
+        One row per system, noise, number and variant: on_front and selected (is the whole system
+        right), correct_terms (true terms among those selected), cpu_s. A variant that selects
+        nothing has NaN there. Raises ValueError for an unknown system, or nothing to run.
+        """
+        check_systems(self.systems)
+        tasks = list(product(self.systems, sorted(self.noises), range(self.n_realizations)))
+        judge = partial(_outcomes, variants, n_trajectories=self.n_trajectories, seed=seed)
+        return pd.DataFrame(rows_in_order(self.parallel, judge, tasks, progress))
 
 
 def _outcomes(
@@ -93,7 +76,6 @@ def _outcomes(
 ) -> list[dict[str, object]]:
     name, noise, number = task
     system, runs = realization(name, noise, number, n_trajectories=n_trajectories, seed=seed)
-    truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
     rows: list[dict[str, object]] = []
     for label, variant in variants.items():
         # A stream of its own, so that leaving a variant out changes no other.
@@ -103,7 +85,7 @@ def _outcomes(
         cpu_s = time.process_time() - start
         rows.append(
             {"system": name, "noise": noise, "number": number, "variant": label}
-            | judged(finding, truth)
+            | merits(finding, system)
             | {"cpu_s": cpu_s}
         )
     return rows
@@ -123,54 +105,3 @@ def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
         n=("number", "count"),
         cpu_s_per_search=("cpu_s", "median"),
     ).reset_index()
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Every outcome, and counts of them.
-
-    published: the thesis's cells, as `cells` without the time.
-    """
-
-    variants: Mapping[str, Variant]
-    outcomes: pd.DataFrame
-    cells: pd.DataFrame
-    published: pd.DataFrame
-
-    def models(self) -> dict[str, SparseModel]:
-        return {}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        """Outcomes, and our cells beside what the thesis found in the same ones."""
-        columns = {merit: f"thesis_{merit}" for merit in MERITS}
-        keys = ["system", "noise", "variant"]
-        beside = self.published.rename(columns=columns)[[*keys, *columns.values()]]
-        return {"outcomes": self.outcomes, "cells": self.cells.merge(beside, how="left", on=keys)}
-
-    def figures(self) -> dict[str, Captioned]:
-        draw = partial(benchmark_figure, self.cells, thesis=self.published)
-        return {"benchmark": Captioned(draw, FIGURE)}
-
-    def sections(self) -> list[Section]:
-        return sections(self.variants, self.cells, self.published)
-
-    def summary(self) -> dict[str, Any]:
-        """Counts as whole numbers; null where a variant selects nothing."""
-        rows = self.cells.astype({"on_front": int}).to_dict("records")
-        return {
-            "cells": [
-                row | {"selected": None if np.isnan(row["selected"]) else int(row["selected"])}
-                for row in rows
-            ]
-        }
-
-    def headline(self) -> dict[str, float]:
-        """Means over systems and noise levels; what selects nothing has 0 % selected, NaN terms."""
-        scalars = {}
-        for name, rows in self.cells.groupby("variant", sort=False):
-            for merit in COUNTS:
-                percent = 100.0 * rows[merit].sum() / rows["n"].sum()
-                scalars[f"{name}/{merit}_percent"] = float(percent)
-            scalars[f"{name}/mean_correct_terms"] = float(rows["mean_correct_terms"].mean())
-            scalars[f"{name}/cpu_ms"] = float(1e3 * rows["cpu_s_per_search"].mean())
-        return scalars

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from ep2sindy.figures.identified import MERITS, merit_table
-from ep2sindy.report.document import Block, Picture, Section, Table, Text, places
+from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure, merit_table
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Block, Captioned, Picture, Section, Table, Text, places
+from ep2sindy.studies.variants import Variant
 from ep2sindy.synthetic.draws import DRAWS
 
 FIGURE = (
@@ -48,19 +52,68 @@ def published_cells(thesis: Mapping[str, Any]) -> pd.DataFrame:
     return table.assign(n=thesis["n"])
 
 
-def sections(
-    variants: Mapping[str, object], cells: pd.DataFrame, published: pd.DataFrame
-) -> list[Section]:
-    n = int(cells["n"].iloc[0])
-    levels = "/".join(f"{100 * noise:g}" for noise in cells["noise"].unique())
-    counted = f"{n} realizations of every system and noise level."
-    texts: list[Block] = [Text(counted), Text(INTRODUCTION, page_only=True), Picture("benchmark")]
-    tables = [
-        Section(f"{TITLES[merit]}; noise {levels} %", [_readable(cells, published, merit)])
-        for merit in MERITS
-    ]
-    described = [Text(f"{name}: {variant}", page_only=True) for name, variant in variants.items()]
-    return [Section("Realizations", texts), *tables, Section("Variants", described)]
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Every outcome, and counts of them.
+
+    published: the thesis's cells, as `cells` without the time.
+    """
+
+    variants: Mapping[str, Variant]
+    outcomes: pd.DataFrame
+    cells: pd.DataFrame
+    published: pd.DataFrame
+
+    def models(self) -> dict[str, SparseModel]:
+        return {}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """Outcomes, and our cells beside what the thesis found in the same ones."""
+        columns = {merit: f"thesis_{merit}" for merit in MERITS}
+        keys = ["system", "noise", "variant"]
+        beside = self.published.rename(columns=columns)[[*keys, *columns.values()]]
+        return {"outcomes": self.outcomes, "cells": self.cells.merge(beside, how="left", on=keys)}
+
+    def figures(self) -> dict[str, Captioned]:
+        draw = partial(benchmark_figure, self.cells, thesis=self.published)
+        return {"benchmark": Captioned(draw, FIGURE)}
+
+    def sections(self) -> list[Section]:
+        n = int(self.cells["n"].iloc[0])
+        levels = "/".join(f"{100 * noise:g}" for noise in self.cells["noise"].unique())
+        counted = f"{n} realizations of every system and noise level."
+        about: list[Block] = [Text(counted), Text(INTRODUCTION, page_only=True)]
+        tables = [
+            Section(f"{TITLES[m]}; noise {levels} %", [_readable(self.cells, self.published, m)])
+            for m in MERITS
+        ]
+        variants = [Text(f"{n}: {v}", page_only=True) for n, v in self.variants.items()]
+        return [
+            Section("Realizations", [*about, Picture("benchmark")]),
+            *tables,
+            Section("Variants", variants),
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        """Counts as whole numbers; null where a variant selects nothing."""
+        rows = self.cells.astype({"on_front": int}).to_dict("records")
+        return {
+            "cells": [
+                row | {"selected": None if np.isnan(row["selected"]) else int(row["selected"])}
+                for row in rows
+            ]
+        }
+
+    def headline(self) -> dict[str, float]:
+        """Means over systems and noise levels; what selects nothing has 0 % selected, NaN terms."""
+        scalars = {}
+        for name, rows in self.cells.groupby("variant", sort=False):
+            for merit in COUNTS:
+                percent = 100.0 * rows[merit].sum() / rows["n"].sum()
+                scalars[f"{name}/{merit}_percent"] = float(percent)
+            scalars[f"{name}/mean_correct_terms"] = float(rows["mean_correct_terms"].mean())
+            scalars[f"{name}/cpu_ms"] = float(1e3 * rows["cpu_s_per_search"].mean())
+        return scalars
 
 
 def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table:

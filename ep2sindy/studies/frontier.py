@@ -5,21 +5,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.figures.identified import frontier_figure
-from ep2sindy.machine.parallel import ONE_BY_ONE, Workers, rows_in_order
+from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Deferred, Names, Positives
-from ep2sindy.studies.variants import Variant, built_variants, judged
+from ep2sindy.studies.variants import Variant, built_variants, merits
 from ep2sindy.synthetic.systems import System
 
 TITLE = "Lowest sampling rate (Hz) from which on all rates identify the system, by duration"
@@ -45,44 +46,32 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         variants = built_variants(self.variants, self.definitions)
-        with run.counted(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
-            points = identification_frontier(
-                self.system,
-                variants,
-                rates_Hz=self.rates_Hz,
-                durations_s=self.durations_s,
-                workers=self.parallel,
-                seed=run.seed,
-                progress=progress,
-            )
+        with run.progress(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
+            points = self.points(variants, seed=run.seed, progress=progress)
         return Outcome(self.system, points)
 
+    def points(
+        self,
+        variants: Mapping[str, Variant],
+        *,
+        seed: int = 0,
+        progress: Callable[[int], None] = lambda n_more: None,
+    ) -> pd.DataFrame:
+        """Every variant on one noise-free trajectory per sampling rate and duration.
 
-def identification_frontier(
-    system: System,
-    variants: Mapping[str, Variant],
-    *,
-    rates_Hz: Sequence[float],
-    durations_s: Sequence[float],
-    workers: Workers = ONE_BY_ONE,
-    seed: int = 0,
-    progress: Callable[[int], None] = lambda n_more: None,
-) -> pd.DataFrame:
-    """Every variant on one noise-free trajectory per sampling rate and duration.
-
-    All trajectories start from the system's initial state. One row per variant, rate and
-    duration: n_samples, identified (is the whole system on the fronts), and reason, why a variant
-    could not run on so few samples, or an empty string.
-    Raises ValueError for nothing to run, and where a variant cannot run on the longest and
-    fastest of all: that is no matter of samples.
-    """
-    # The largest comes first: a variant that cannot run at all fails before the work is done.
-    points = sorted(((r, d) for r in rates_Hz for d in durations_s), reverse=True)
-    judge = partial(_point, system, variants, seed=seed, largest=points[:1])
-    rows: list[dict[str, Any]] = rows_in_order(workers, judge, points, progress)
-    place = {name: k for k, name in enumerate(variants)}
-    rows.sort(key=lambda row: (place[row["variant"]], row["rate_Hz"], row["duration_s"]))
-    return pd.DataFrame(rows)
+        All trajectories start from the system's initial state. One row per variant, rate and
+        duration: n_samples, identified (is the whole system on the fronts), and reason, why a
+        variant could not run on so few samples, or an empty string.
+        Raises ValueError for nothing to run, and where a variant cannot run on the longest and
+        fastest of all: that is no matter of samples.
+        """
+        # The largest comes first: a variant that cannot run at all fails before the work is done.
+        points = sorted(product(self.rates_Hz, self.durations_s), reverse=True)
+        judge = partial(_point, self.system, variants, seed=seed, largest=points[:1])
+        rows: list[dict[str, Any]] = rows_in_order(self.parallel, judge, points, progress)
+        place = {name: k for k, name in enumerate(variants)}
+        rows.sort(key=lambda row: (place[row["variant"]], row["rate_Hz"], row["duration_s"]))
+        return pd.DataFrame(rows)
 
 
 def _point(
@@ -96,7 +85,6 @@ def _point(
     rate_Hz, duration_s = point
     n_samples = round(rate_Hz * duration_s)
     sampled = replace(system, rate_Hz=rate_Hz, duration_s=duration_s)
-    truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
     rows: list[dict[str, object]] = []
     for name, variant in variants.items():
         # A stream of its own, so that leaving a variant out changes no other.
@@ -107,7 +95,7 @@ def _point(
                 raise ValueError(f"a trajectory needs two samples: {n_samples} fit in")
             run = sampled.trajectory()
             finding = variant.find([run], system.model.library, rng=rng)
-            identified = judged(finding, truth)["on_front"] == 1.0
+            identified = merits(finding, system)["on_front"] == 1.0
         except ValueError as error:
             if [point] == largest:
                 raise
@@ -143,7 +131,7 @@ def lowest_rates(points: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """points: as `identification_frontier` gives them."""
+    """points: as `Study.points` gives them."""
 
     system: System
     points: pd.DataFrame

@@ -43,22 +43,24 @@ def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and isfinite(value)
 
 
-Count = Annotated[
-    int, Kind("a whole number, one or more", lambda value: type(value) is int and value >= 1)
-]
-Share = Annotated[
-    float, Kind("a number between 0 and 1", lambda value: _is_number(value) and 0 < value < 1)
-]
-Positive = Annotated[
-    float, Kind("a positive number", lambda value: _is_number(value) and value > 0)
-]
+def _is_positive(value: Any) -> bool:
+    return _is_number(value) and value > 0
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 1
+
+
+Count = Annotated[int, Kind("a whole number, one or more", _is_count)]
+Share = Annotated[float, Kind("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
+Positive = Annotated[float, Kind("a positive number", _is_positive)]
 PositiveOrAll = Annotated[
     float | None,
-    Kind(
-        "a positive number, or null for all",
-        lambda value: value is None or (_is_number(value) and value > 0),
-    ),
+    Kind("a positive number, or null for all", lambda x: x is None or _is_positive(x)),
 ]
+_Counts = Annotated[int, Kind("whole numbers, above zero", _is_count)]
+_Levels = Annotated[float, Kind("numbers, zero or more", lambda x: _is_number(x) and x >= 0)]
+_Positives = Annotated[float, Kind("numbers, above zero", _is_positive)]
 
 
 def _each_once(values: Any) -> bool:
@@ -69,27 +71,7 @@ def _each_once(values: Any) -> bool:
 
 A_LIST = Kind("a list such as [a,b], each once", _each_once)
 Names = Annotated[Sequence[str], A_LIST]
-Counts = Annotated[
-    Sequence[
-        Annotated[
-            int,
-            Kind("whole numbers, above zero", lambda value: type(value) is int and value > 0),
-        ]
-    ],
-    A_LIST,
-]
-Levels = Annotated[
-    Sequence[
-        Annotated[
-            float, Kind("numbers, zero or more", lambda value: _is_number(value) and value >= 0)
-        ]
-    ],
-    A_LIST,
-]
-Positives = Annotated[
-    Sequence[
-        Annotated[float, Kind("numbers, above zero", lambda value: _is_number(value) and value > 0)]
-    ],
-    A_LIST,
-]
+Counts = Annotated[Sequence[_Counts], A_LIST]
+Levels = Annotated[Sequence[_Levels], A_LIST]
+Positives = Annotated[Sequence[_Positives], A_LIST]
 Coefficients = Mapping[str, Mapping[str, float]]  # state -> term -> SI coefficient

@@ -7,20 +7,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
-from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.model.integrated import Integrated
-from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Captioned, Section
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll
-from ep2sindy.studies.libraries_view import comparison, drawings, front_tables, sections, summary
-from ep2sindy.studies.library_result import LibraryResult, result_of
-from ep2sindy.studies.shown import Shown, rollout_tables
+from ep2sindy.studies.libraries_view import Outcome
+from ep2sindy.studies.library_result import result_of
+from ep2sindy.studies.shown import Shown
 from ep2sindy.studies.source import Source
 
 
@@ -79,64 +74,4 @@ class Study:
             )
             for (name, library), rng in zip(libraries.items(), streams, strict=True)
         }
-        return Outcome(self, data, results)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What every library found in the same data."""
-
-    study: Study
-    data: Trajectory
-    results: Mapping[str, LibraryResult]
-
-    @property
-    def integrated(self) -> dict[str, Integrated]:
-        """Selected models by library, then those of published terms."""
-        selected = {name: r.selected for name, r in self.results.items()}
-        published = {
-            f"{name}, thesis's terms": r.published
-            for name, r in self.results.items()
-            if r.published is not None
-        }
-        return selected | published
-
-    def models(self) -> dict[str, SparseModel]:
-        return {name: result.discovery.model for name, result in self.results.items()}
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        found = {}
-        for name, result in self.results.items():
-            found[f"front_{name}"] = front_tables(result)
-            found[f"ambiguities_{name}"] = pd.DataFrame(
-                [(a.exact, " ".join(a.terms), a.message) for a in result.discovery.ambiguities],
-                columns=["exact", "terms", "message"],
-            )
-        files = {
-            name.replace(", ", "_").replace("'s ", "_").replace(" ", "_"): each
-            for name, each in self.integrated.items()
-        }
-        found |= rollout_tables(self.data, files)
-        return found | {"comparison": comparison(self.data, self.integrated)}
-
-    def figures(self) -> dict[str, Captioned]:
-        return drawings(self.data, self.results, self.study.figures)
-
-    def sections(self) -> list[Section]:
-        return sections(self.data, self.results, self.integrated)
-
-    def summary(self) -> dict[str, Any]:
-        return summary(self.data, self.results)
-
-    def headline(self) -> dict[str, float]:
-        scalars = {}
-        for name, result in self.results.items():
-            first = self.data.state_names[0]
-            scalars[f"{name}/f_kHz"] = 1e-3 * result.selected.frequency_Hz[first]
-            scalars[f"{name}/nrmse"] = result.selected.nrmse
-            for state, chosen in result.discovery.chosen.items():
-                scalars[f"{name}/{state}/r2_test"] = chosen.r2_test
-                scalars[f"{name}/{state}/n_terms"] = float(chosen.n_terms)
-                score = float(result.discovery.scores[state].min())
-                scalars[f"{name}/{state}/{result.recipe.selection.label}"] = score
-        return scalars
+        return Outcome(data, results, self.figures)

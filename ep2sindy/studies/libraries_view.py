@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.model.integrated import Integrated
+from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -28,7 +30,7 @@ from ep2sindy.search.front import Candidate
 from ep2sindy.selection.rule import selected
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.library_result import LibraryResult
-from ep2sindy.studies.shown import INTEGRATED, Shown, run_figures, trajectories
+from ep2sindy.studies.shown import INTEGRATED, Shown, rollout_tables, run_figures, trajectories
 from ep2sindy.studies.source import data_summary
 
 FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
@@ -36,17 +38,117 @@ THESIS = "The same with the thesis's terms, fitted to these data."
 FRONT = "Error against number of terms; the star is selected."
 
 
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What every library found in the same data."""
+
+    data: Trajectory
+    results: Mapping[str, LibraryResult]
+    shown: Shown
+
+    @property
+    def published(self) -> dict[str, Integrated]:
+        """Models of published terms, where they could be fitted to our data."""
+        return {n: r.published for n, r in self.results.items() if r.published is not None}
+
+    @property
+    def selected(self) -> dict[str, Integrated]:
+        return {name: result.selected for name, result in self.results.items()}
+
+    def models(self) -> dict[str, SparseModel]:
+        return {name: result.discovery.model for name, result in self.results.items()}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        found = {}
+        for name, result in self.results.items():
+            fronts = [_front_table(result, state) for state in result.discovery.fronts]
+            found[f"front_{name}"] = pd.concat(fronts)
+            found[f"ambiguities_{name}"] = pd.DataFrame(
+                [(a.exact, " ".join(a.terms), a.message) for a in result.discovery.ambiguities],
+                columns=["exact", "terms", "message"],
+            )
+        published = {f"{name}_thesis_terms": each for name, each in self.published.items()}
+        found |= rollout_tables(self.data, self.selected | published)
+        return found | {"comparison": self.comparison()}
+
+    def comparison(self) -> pd.DataFrame:
+        """One row per model: frequencies in Hz, trajectory error, and a word on the trajectory."""
+        published = {f"{name}, thesis's terms": each for name, each in self.published.items()}
+        rows = []
+        for name, model in (self.selected | published).items():
+            row: dict[str, Any] = {"model": name}
+            for state, column in zip(self.data.state_names, self.data.states.T, strict=True):
+                row[f"f_data_{state}_Hz"] = dominant_frequency(self.data.t, column)
+                row[f"f_model_{state}_Hz"] = model.frequency_Hz[state]
+            rows.append(row | {"nrmse": model.nrmse, "verdict": model.verdict})
+        return pd.DataFrame(rows)
+
+    def figures(self) -> dict[str, Captioned]:
+        formulation = next(iter(self.results.values())).recipe.formulation
+        drawn = run_figures(FIGURES, self.data, self.selected, self.shown, formulation=formulation)
+        if self.published:
+            drawn["trajectories_thesis"] = trajectories(
+                self.data, self.published, self.shown, THESIS
+            )
+        for name, result in self.results.items():
+            found, label = result.discovery, result.recipe.selection.label
+            front = partial(front_figure, found.fronts, found.scores, label=label)
+            drawn[f"front_{name}"] = Captioned(front, FRONT)
+        return drawn
+
+    def sections(self) -> list[Section]:
+        found = [_library_section(name, result) for name, result in self.results.items()]
+        return [*found, Section("Integrated", [self._comparison_table(), *pictures(FIGURES)])]
+
+    def _comparison_table(self) -> Table:
+        rows = []
+        for row in self.comparison().to_dict("records"):
+            for k, state in enumerate(self.data.state_names):
+                rows.append(
+                    {
+                        "model": "" if k else row["model"],
+                        "state": state,
+                        "f data": frequency_text(row[f"f_data_{state}_Hz"]),
+                        "f model": frequency_text(row[f"f_model_{state}_Hz"]),
+                        "nrmse": "" if k else places(row["nrmse"], 3),
+                        "verdict": "" if k else row["verdict"],
+                    }
+                )
+        return Table(pd.DataFrame(rows), title=INTEGRATED)
+
+    def summary(self) -> dict[str, Any]:
+        first = self.data.state_names[0]
+        models = {
+            name: {
+                "equations": {s: _equation_summary(result, s) for s in result.discovery.fronts},
+                "trajectory": _trajectory_summary(result.selected, first),
+                "thesis_terms": _published_summary(result, first),
+            }
+            for name, result in self.results.items()
+        }
+        return {"data": data_summary(self.data), "models": models}
+
+    def headline(self) -> dict[str, float]:
+        scalars = {}
+        for name, result in self.results.items():
+            first = self.data.state_names[0]
+            scalars[f"{name}/f_kHz"] = 1e-3 * result.selected.frequency_Hz[first]
+            scalars[f"{name}/nrmse"] = result.selected.nrmse
+            for state, chosen in result.discovery.chosen.items():
+                scalars[f"{name}/{state}/r2_test"] = chosen.r2_test
+                scalars[f"{name}/{state}/n_terms"] = float(chosen.n_terms)
+                score = float(result.discovery.scores[state].min())
+                scalars[f"{name}/{state}/{result.recipe.selection.label}"] = score
+        return scalars
+
+
 def candidate_text(candidate: Candidate) -> str:
     """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
     return equation_text(candidate.equation, candidate.coef_by_term)
 
 
-def front_tables(result: LibraryResult) -> pd.DataFrame:
-    """Fronts as the thesis's Tables I-III: one row per candidate, with its equation."""
-    return pd.concat([_front_table(result, state) for state in result.discovery.fronts])
-
-
 def _front_table(result: LibraryResult, state: str) -> pd.DataFrame:
+    """A front as in the thesis's Tables I-III: one row per candidate, with its equation."""
     front, scores = result.discovery.fronts[state], result.discovery.scores[state]
     chosen = selected(front, scores)
     return pd.DataFrame(
@@ -61,27 +163,6 @@ def _front_table(result: LibraryResult, state: str) -> pd.DataFrame:
             "text": [candidate_text(c) for c in front.candidates],
         }
     )
-
-
-def comparison(data: Trajectory, models: Mapping[str, Integrated]) -> pd.DataFrame:
-    """One row per model: frequencies in Hz, trajectory error, and a word on the trajectory."""
-    rows = []
-    for name, model in models.items():
-        row: dict[str, Any] = {"model": name}
-        for state, column in zip(data.state_names, data.states.T, strict=True):
-            row[f"f_data_{state}_Hz"] = dominant_frequency(data.t, column)
-            row[f"f_model_{state}_Hz"] = model.frequency_Hz[state]
-        rows.append(row | {"nrmse": model.nrmse, "verdict": model.verdict})
-    return pd.DataFrame(rows)
-
-
-def sections(
-    data: Trajectory, results: Mapping[str, LibraryResult], models: Mapping[str, Integrated]
-) -> list[Section]:
-    found = [_library_section(name, result) for name, result in results.items()]
-    integrated: list[Block] = [_comparison_table(data, models)]
-    integrated += pictures(FIGURES)
-    return [*found, Section("Integrated", integrated)]
 
 
 def _library_section(name: str, result: LibraryResult) -> Section:
@@ -132,54 +213,6 @@ def _readable_front(result: LibraryResult, state: str) -> Table:
         rows.append((str(here.n_terms), places(score, 3), "", "", text))
     bold = np.flatnonzero(table["selected"]).tolist()
     return Table(pd.DataFrame(rows, columns=columns), bold=bold, italic=italic)
-
-
-def _comparison_table(data: Trajectory, models: Mapping[str, Integrated]) -> Table:
-    rows = []
-    for row in comparison(data, models).to_dict("records"):
-        for k, state in enumerate(data.state_names):
-            rows.append(
-                {
-                    "model": "" if k else row["model"],
-                    "state": state,
-                    "f data": frequency_text(row[f"f_data_{state}_Hz"]),
-                    "f model": frequency_text(row[f"f_model_{state}_Hz"]),
-                    "nrmse": "" if k else places(row["nrmse"], 3),
-                    "verdict": "" if k else row["verdict"],
-                }
-            )
-    return Table(pd.DataFrame(rows), title=INTEGRATED)
-
-
-def drawings(
-    data: Trajectory, results: Mapping[str, LibraryResult], shown: Shown
-) -> dict[str, Captioned]:
-    models = {name: r.selected for name, r in results.items()}
-    published = {n: r.published for n, r in results.items() if r.published is not None}
-    formulation = next(iter(results.values())).recipe.formulation
-    drawn = run_figures(FIGURES, data, models, shown, formulation=formulation)
-    if published:
-        drawn["trajectories_thesis"] = trajectories(data, published, shown, THESIS)
-    for name, r in results.items():
-        found, label = r.discovery, r.recipe.selection.label
-        front = partial(front_figure, found.fronts, found.scores, label=label)
-        drawn[f"front_{name}"] = Captioned(front, FRONT)
-    return drawn
-
-
-def summary(data: Trajectory, results: Mapping[str, LibraryResult]) -> dict[str, Any]:
-    first = data.state_names[0]
-    return {
-        "data": data_summary(data),
-        "models": {
-            name: {
-                "equations": {s: _equation_summary(result, s) for s in result.discovery.fronts},
-                "trajectory": _trajectory_summary(result.selected, first),
-                "thesis_terms": _published_summary(result, first),
-            }
-            for name, result in results.items()
-        },
-    }
 
 
 def _trajectory_summary(integrated: Integrated, state: str) -> dict[str, Any]:

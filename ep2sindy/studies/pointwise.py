@@ -98,7 +98,7 @@ class Study:
         if n_before:
             run.say(f"going on with {n_before} of {n_points} points that a broken run had done")
         try:
-            with watched(run, n_points, n_before) as progress:
+            with progress_of(run, n_points, n_before) as progress:
                 result = pointwise(
                     field,
                     search,
@@ -116,14 +116,14 @@ class Study:
 
 
 @contextmanager
-def watched(run: Run, n_points: int, n_before: int) -> Iterator[Callable[[int], None]]:
+def progress_of(run: Run, n_points: int, n_before: int) -> Iterator[Callable[[int], None]]:
     """A bar with points per second, and the same in TensorBoard while the run goes on.
 
     n_before: points that were done already, and come first.
     """
     begin = time.perf_counter()
     done = 0
-    with run.counted(n_points, "point") as count:
+    with run.progress(n_points, "point") as count:
 
         def progress(n_more: int) -> None:
             nonlocal done

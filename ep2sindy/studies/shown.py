@@ -54,7 +54,7 @@ def rollout_tables(data: Trajectory, models: Mapping[str, Integrated]) -> dict[s
         columns: dict[str, Any] = {"t_s": rollout.t}
         for k, state in enumerate(states):
             columns |= {f"{state}_data": samples[:, k], f"{state}_model": rollout.states[:, k]}
-        found[f"rollout_{name}"] = pd.DataFrame(columns)
+        found[f"rollout_{name.replace(' ', '_')}"] = pd.DataFrame(columns)
     return found
 
 

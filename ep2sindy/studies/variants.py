@@ -12,6 +12,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Finding
 from ep2sindy.library.library import Library
 from ep2sindy.studies.kinds import Deferred
+from ep2sindy.synthetic.systems import System
 
 
 @runtime_checkable
@@ -48,8 +49,9 @@ def built_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) ->
     return variants
 
 
-def judged(finding: Finding, truth: Mapping[str, frozenset[str]]) -> dict[str, float]:
+def merits(finding: Finding, system: System) -> dict[str, float]:
     """The three figures of merit for one realization, as numbers; NaN where none was selected."""
+    truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
     found = {"on_front": float(all(truth[state] in finding.kept[state] for state in truth))}
     if finding.selected is None:
         return found | {"selected": np.nan, "correct_terms": np.nan}

@@ -13,7 +13,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.integrated import Integrated, integrate, samples_in
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.rows import Formulation, Regression
-from ep2sindy.regression.test_functions import Boxes, Bumps
+from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.studies.kinds import Deferred
@@ -35,16 +35,14 @@ class Setting:
             )
 
     @property
-    def boxes(self) -> Boxes | None:
-        """The random windows of this form, if it has any."""
-        functions = self.formulation.test_functions if isinstance(self.formulation, Weak) else None
-        return functions if isinstance(functions, Boxes) else None
+    def windows(self) -> WindowFunctions | None:
+        """The test functions of this form, if it is a weak one."""
+        return self.formulation.test_functions if isinstance(self.formulation, Weak) else None
 
     @property
-    def bumps(self) -> Bumps | None:
-        """The smooth windows of this form, if it has any."""
-        functions = self.formulation.test_functions if isinstance(self.formulation, Weak) else None
-        return functions if isinstance(functions, Bumps) else None
+    def boxes(self) -> Boxes | None:
+        """The random windows of this form, if it has any."""
+        return self.windows if isinstance(self.windows, Boxes) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +155,7 @@ def fit_settings(
     Raises ValueError, before any fit, for windows longer than the data.
     """
     check_windows(settings, run.n_samples)
-    widths = {name: _half_widths(run, setting.bumps, rng) for name, setting in settings.items()}
+    widths = {name: _half_widths(run, setting.windows, rng) for name, setting in settings.items()}
     n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
     results = {}
     for (name, setting), stream in zip(settings.items(), rng.spawn(len(settings)), strict=True):
@@ -179,10 +177,13 @@ def fit_settings(
     return results
 
 
-def _half_widths(run: Trajectory, bumps: Bumps | None, rng: np.random.Generator) -> dict[str, int]:
-    if bumps is None:
+def _half_widths(
+    run: Trajectory, functions: WindowFunctions | None, rng: np.random.Generator
+) -> dict[str, int]:
+    """Of smooth windows, by state."""
+    if not isinstance(functions, Bumps):
         return {}
-    windows = [bumps.windows(run.t, x, rng=rng) for x in run.states.T]
+    windows = [functions.windows(run.t, x, rng=rng) for x in run.states.T]
     return {
         state: int(w.last[0] - w.first[0]) // 2
         for state, w in zip(run.state_names, windows, strict=True)

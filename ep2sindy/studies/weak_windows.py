@@ -6,9 +6,10 @@ squares does the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.machine.parallel import ONE_BY_ONE, Workers, rows_in_order
+from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
@@ -37,7 +38,9 @@ class Study:
     """Draw noise, fit, measure: known terms in every form, with windows of every kind.
 
     rate_Hz: at which the system is sampled. formulation: the differential form. boxes: random
-    windows. automatic: smooth windows. noises: as for `coefficient_errors`.
+    windows. automatic: smooth windows. noises: standard deviations
+    of the white noise, in RMS of each state. A realization is one draw of it, the same for all
+    settings and, but for its size, for all levels.
     """
 
     system: System
@@ -59,18 +62,31 @@ class Study:
             n_windows=self.n_windows,
             n_points=self.n_points,
         )
-        system = replace(self.system, rate_Hz=self.rate_Hz)
-        with run.counted(len(self.noises) * self.n_realizations, "realization") as progress:
-            errors = coefficient_errors(
-                system,
-                settings,
-                noises=self.noises,
-                n_realizations=self.n_realizations,
-                workers=self.parallel,
-                seed=run.seed,
-                progress=progress,
-            )
-        return Outcome(system, settings, errors, window_cells(errors, settings))
+        n_pieces = len(self.noises) * self.n_realizations
+        with run.progress(n_pieces, "realization") as progress:
+            errors = self.errors(settings, seed=run.seed, progress=progress)
+        return Outcome(self.sampled, settings, errors, window_cells(errors, settings))
+
+    @property
+    def sampled(self) -> System:
+        return replace(self.system, rate_Hz=self.rate_Hz)
+
+    def errors(
+        self,
+        settings: Mapping[str, Setting],
+        *,
+        seed: int = 0,
+        progress: Callable[[int], None] = lambda n_more: None,
+    ) -> pd.DataFrame:
+        """The error of every setting on every realization, realizations being the pieces.
+
+        One row per noise, number and setting. Raises ValueError, before any fit, for windows that
+        are longer than the trajectory, or nothing to run.
+        """
+        check_windows(settings, round(self.system.duration_s * self.rate_Hz))
+        tasks = list(product(self.noises, range(self.n_realizations)))
+        fit = partial(_realization, self.sampled, settings, seed=seed)
+        return pd.DataFrame(rows_in_order(self.parallel, fit, tasks, progress))
 
 
 def true_library(system: System) -> Library:
@@ -90,29 +106,6 @@ def coefficient_error(
     beta_true = np.array([truth[state][name] for state in truth for name in terms[state]])
     beta = np.array([fitted[state][name] for state in truth for name in terms[state]])
     return float(np.linalg.norm(beta - beta_true) / np.linalg.norm(beta_true))
-
-
-def coefficient_errors(
-    system: System,
-    settings: Mapping[str, Setting],
-    *,
-    noises: Sequence[float],
-    n_realizations: int,
-    workers: Workers = ONE_BY_ONE,
-    seed: int = 0,
-    progress: Callable[[int], None] = lambda n_more: None,
-) -> pd.DataFrame:
-    """The error of every setting on every realization, realizations being the workers' pieces.
-
-    noises: standard deviations of the white noise, in RMS of each state. A realization is one
-    draw of it, the same for all settings and, but for its size, for all levels.
-    One row per noise, number and setting. Raises ValueError, before any fit, for windows that
-    are longer than the trajectory, or nothing to run.
-    """
-    check_windows(settings, round(system.duration_s * system.rate_Hz))
-    tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
-    fit = partial(_realization, system, settings, seed=seed)
-    return pd.DataFrame(rows_in_order(workers, fit, tasks, progress))
 
 
 def _realization(
@@ -145,7 +138,7 @@ def window_cells(errors: pd.DataFrame, settings: Mapping[str, Setting]) -> pd.Da
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """errors: as `coefficient_errors` gives them. cells: their means, from `window_cells`."""
+    """errors: as `Study.errors` gives them. cells: their means, from `window_cells`."""
 
     system: System
     settings: Mapping[str, Setting]

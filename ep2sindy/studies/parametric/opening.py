@@ -25,7 +25,7 @@ class PointSource:
     def label(self) -> str:
         return point_label(self.parameters)
 
-    def opened(self, inputs: Sequence[str]) -> PointData:
+    def open(self, inputs: Sequence[str]) -> PointData:
         """Open or simulate it; what does not oscillate comes without trajectory.
 
         A state that stays exactly where it is makes a point steady: no trajectory may hold it.

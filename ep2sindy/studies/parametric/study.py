@@ -15,7 +15,7 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Kind
-from ep2sindy.studies.known_terms import terms_of
+from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.opening import PointSource, point_sources
 from ep2sindy.studies.parametric.points import (
@@ -98,7 +98,7 @@ class Study:
     parallel: Workers
     parameters: Mapping[str, str | None]
     points: Sequence[Mapping[str, Any]]
-    model: Mapping[str, Any]
+    model: Terms
     cases: Cases
     bootstrap: TimeBootstrap
     refining: Refining
@@ -128,12 +128,12 @@ class Study:
         published = published_table(self.thesis or {}, names)
         sources = point_sources(self.source, self.parameters, self.points)
         inputs = self.source.inputs([how.library, how.searched])
-        opening = self.parallel.run(partial(PointSource.opened, inputs=inputs), sources)
+        opening = self.parallel.run(partial(PointSource.open, inputs=inputs), sources)
         points = _in_order(opening, len(sources), "opened", run)
 
         alone, together = np.random.default_rng(run.seed).spawn(2)
         fitted = parametric_study(points, how, workers=self.parallel, rng=alone)
-        results = _in_order(_told(fitted, run), len(points), "fitted", run)
+        results = _in_order(_tell(fitted, run), len(points), "fitted", run)
         return Outcome(
             study=how,
             results=results,
@@ -161,14 +161,14 @@ class Study:
 
 def _in_order(numbered: Iterable[tuple[int, Any]], total: int, verb: str, run: Run) -> list[Any]:
     found = {}
-    with run.counted(total, f"point {verb}") as came:
+    with run.progress(total, f"point {verb}") as came:
         for number, result in numbered:
             found[number] = result
             came(1)
     return [found[number] for number in range(total)]
 
 
-def _told(
+def _tell(
     numbered: Iterable[tuple[int, PointResult]], run: Run
 ) -> Iterator[tuple[int, PointResult]]:
     """Every result to TensorBoard as it comes; a step is the number of a point in the config."""

@@ -8,17 +8,11 @@ from typing import Any
 import pandas as pd
 
 from ep2sindy.discovery.control_law import ControlLaw
+from ep2sindy.figures.trends import rows_at
 from ep2sindy.library.equations import equation_text
 from ep2sindy.studies.parametric.all_points import JointResult
 from ep2sindy.studies.parametric.points import Fitted, PointResult
 from ep2sindy.studies.parametric.trends import exponent, trends
-
-
-def held(table: pd.DataFrame, at: Mapping[str, Any]) -> pd.DataFrame:
-    """The rows that have these values."""
-    for name, value in at.items():
-        table = table[table[name] == value]
-    return table
 
 
 def published_table(
@@ -48,18 +42,10 @@ def estimates_table(results: Sequence[PointResult], published: pd.DataFrame) -> 
     """One row per point, fit and quantity, with what was published."""
     parameters = list(results[0].parameters)
     rows = [
-        (
-            *result.parameters.values(),
-            fit,
-            result.usable(fit),
-            name,
-            each.value,
-            each.low,
-            each.high,
-        )
+        (*result.parameters.values(), fit, result.usable(fit), name, e.value, e.low, e.high)
         for result in results
         for fit, fitted in result.fits.items()
-        for name, each in fitted.estimates.items()
+        for name, e in fitted.estimates.items()
     ]
     columns = [*parameters, "fit", "usable", "quantity", "value", "low", "high"]
     table = pd.DataFrame(rows, columns=columns)
@@ -120,20 +106,17 @@ def tied_table(joint: JointResult | None) -> pd.DataFrame:
 
 
 def laws_table(laws: Mapping[str, Mapping[str, ControlLaw]]) -> pd.DataFrame:
-    """A law reads like an equation, but no derivative: `L_m = 0.00816 + 5.37e-05 V_D_V`."""
     rows = [
-        (
-            fit,
-            name,
-            equation_text(name, law.coef_by_term).replace("'", "", 1),
-            law.r2,
-            law.loo_error,
-            law.search_error,
-        )
+        (fit, name, _law_text(name, law), law.r2, law.loo_error, law.search_error)
         for fit, by_quantity in laws.items()
         for name, law in by_quantity.items()
     ]
     return pd.DataFrame(rows, columns=["fit", "quantity", "law", "r2", "loo_error", "search_error"])
+
+
+def _law_text(name: str, law: ControlLaw) -> str:
+    """A law reads like an equation, but no derivative: `L_m = 0.00816 + 5.37e-05 V_D_V`."""
+    return equation_text(name, law.coef_by_term).replace("'", "", 1)
 
 
 def trends_table(
@@ -146,7 +129,7 @@ def trends_table(
     for parameter, at in along:
         table = trends(results, along=parameter, at=at)
         for index, row in table.iterrows():
-            known = held(published, {**at, "fit": row["fit"], "quantity": row["quantity"]})
+            known = rows_at(published, {**at, "fit": row["fit"], "quantity": row["quantity"]})
             table.loc[index, "thesis"] = exponent(
                 known[parameter].to_numpy(dtype=float), known["value"].to_numpy(dtype=float)
             )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.figures.trends import trends_figure
+from ep2sindy.figures.trends import rows_at, trends_figure
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.signals.spectrum import frequency_text
@@ -131,7 +131,7 @@ class Outcome:
 
     def _fit(self, fit: str) -> Section:
         """One row per point: its quantities with half their intervals, and the thesis's."""
-        estimates = tables.held(self._tables["quantities"], {"fit": fit})
+        estimates = rows_at(self._tables["quantities"], {"fit": fit})
         units = next(each.fits[fit].model.units for each in self.results if each.fits)
         headings = {
             name: _heading(name, quantity.unit(self.study.library, units))
@@ -139,7 +139,7 @@ class Outcome:
         }
         rows = []
         for result in self.results:
-            here = tables.held(estimates, result.parameters).to_dict("records")
+            here = rows_at(estimates, result.parameters).to_dict("records")
             cells = {each["quantity"]: _cell(each) for each in here}
             row: dict[str, Any] = dict(result.parameters)
             row |= {heading: cells.get(name, "-") for name, heading in headings.items()}
