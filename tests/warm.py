@@ -2,10 +2,13 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 
 import ep2sindy as ep
+
+PACKAGE = Path(ep.__file__).parent
 
 
 def search() -> None:
@@ -25,12 +28,20 @@ def simulation() -> None:
 
 
 def compile_kernels() -> None:
-    """Both at once: there are two cores."""
+    """Where a source is newer than what was compiled of it; both at once: there are two cores."""
+    sources = [*PACKAGE.glob("*/kernels.py"), *PACKAGE.glob("*/gram_fits.py")]
+    if not any(is_stale(source) for source in sources):
+        return
     parts = [
         subprocess.Popen([sys.executable, "-m", "tests.warm", n]) for n in ("search", "simulation")
     ]
     for part in parts:
         part.wait()  # one that fails fails again in its test, which then says why
+
+
+def is_stale(source: Path) -> bool:
+    kept = (source.parent / "__pycache__").glob(f"{source.stem}.*.nbi")
+    return max((path.stat().st_mtime for path in kept), default=0.0) < source.stat().st_mtime
 
 
 if __name__ == "__main__":

@@ -201,7 +201,7 @@ def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str])
 def _zone_weights(
     field: xr.Dataset,
     slices: Mapping[str, slice],
-    masks: Mapping[str, Bool[np.ndarray, ...]],
+    masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
     *,
     axisymmetric: bool,
 ) -> Float[np.ndarray, "z r"]:
