@@ -15,8 +15,11 @@ if TYPE_CHECKING:
 
 TIMES = ("time", "t", "time_s", "t_s")  # what a table calls its time, in seconds
 
-Run: TypeAlias = "Trajectory | pd.DataFrame | tuple[np.ndarray, np.ndarray]"
-Runs: TypeAlias = "Run | Sequence[Run]"
+if TYPE_CHECKING:
+    Run: TypeAlias = Trajectory | pd.DataFrame | tuple[np.ndarray, np.ndarray]
+    Runs: TypeAlias = Run | Sequence[Run]
+else:  # pandas is not imported for a name
+    Run = Runs = object
 
 
 def trajectories_of(runs: object) -> list[Trajectory]:
