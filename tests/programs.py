@@ -1,10 +1,14 @@
 """Experiments run inside a test, without the command line; and, where asked, without figures."""
 
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import started_run, study_class
@@ -16,9 +20,21 @@ EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "exp").glob("*.yaml"
 
 
 def composed(*overrides: str) -> DictConfig:
-    """The config of the command line `ep2sindy OVERRIDES`."""
+    """The config of the command line `ep2sindy OVERRIDES`.
+
+    Hydra composes each choice of groups once, which takes long, and sets the values as it would.
+    """
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    chosen = [o for o in parsed if (ROOT / "conf" / o.key_or_group).is_dir()]
+    config = deepcopy(composed_of(tuple(str(o.input_line) for o in chosen)))
+    ConfigLoaderImpl._apply_overrides_to_config([o for o in parsed if o not in chosen], config)
+    return config
+
+
+@cache
+def composed_of(groups: tuple[str, ...]) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=list(overrides))
+        return compose("config", overrides=list(groups))
 
 
 @dataclass(frozen=True)

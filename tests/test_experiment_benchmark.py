@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -14,13 +13,11 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.studies.benchmark_view import published_cells
 from ep2sindy.studies.variants import Variant
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests import programs
 
 
 def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=["+exp=benchmark", *overrides])
+    return programs.composed("+exp=benchmark", *overrides)
 
 
 def toy(output: Path) -> list[str]:
@@ -165,9 +162,6 @@ def test_settings_that_cannot_work_are_refused(override: str, message: str, tmp_
 
 
 def test_a_key_of_this_study_does_nothing_in_another(tmp_path: Path) -> None:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose(
-            "config", overrides=["+exp=breathing", "+n_realizations=3", f"output={tmp_path}"]
-        )
+    config = programs.composed("+exp=breathing", "+n_realizations=3", f"output={tmp_path}")
     with pytest.raises(ValueError, match="unknown keys \\['n_realizations'\\]"):
         run_config(config)

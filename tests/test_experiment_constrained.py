@@ -3,14 +3,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.studies.constrained import Study
+from tests import programs
 
-ROOT = Path(__file__).resolve().parents[1]
 JUDGED = {
     "text", "f_kHz", "f_error", "nrmse", "amplitude_ratio", "status", "ci95", "cpu_s",
 }  # fmt: skip
@@ -26,8 +25,7 @@ def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
         "data.variables.u_iz.name=u_iz",
         f"output={output}",
     ]
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=[*on_file, *overrides])
+    return programs.composed(*on_file, *overrides)
 
 
 def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:

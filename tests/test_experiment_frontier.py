@@ -4,17 +4,14 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests import programs
 
 
 def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=["+exp=frontier", *overrides])
+    return programs.composed("+exp=frontier", *overrides)
 
 
 def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
@@ -12,8 +11,8 @@ from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import polynomial
 from ep2sindy.refinement.problem import Iteration
 from ep2sindy.studies.ils import watcher
+from tests import programs
 
-ROOT = Path(__file__).resolve().parents[1]
 EXACT = {
     "n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14},
     "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14},
@@ -35,8 +34,7 @@ def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
         "weak.test_functions.n_windows=500",
         "weak.test_functions.n_points=50",
     ]
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=[*toy, *overrides])
+    return programs.composed(*toy, *overrides)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -19,8 +18,8 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.page import page_html
 from ep2sindy.studies.parametric.study import Study
 from ep2sindy.studies.parametric.view import Outcome, with_error
+from tests import programs
 
-ROOT = Path(__file__).resolve().parents[1]
 ESTIMATES = {
     "constrained": {"L_m", "g_inj", "eps"},
     "free": {"L_m", "g_inj", "eps_i", "eps_n"},
@@ -34,8 +33,7 @@ LIBRARY_KEYS = "library may have ['degree', 'products', 'variables'] and needs v
 
 
 def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=["+exp=parametric", *overrides])
+    return programs.composed("+exp=parametric", *overrides)
 
 
 def computed(config: DictConfig) -> tuple[Outcome, str, str]:

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -22,13 +21,13 @@ from ep2sindy.discovery.blocks import Block, Kept
 from ep2sindy.studies import pointwise
 from ep2sindy.studies.pointwise_view import Outcome
 from ep2sindy.synthetic.regions import TERMS, three_regions
+from tests import programs
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=["+exp=pointwise", *overrides])
+    return programs.composed("+exp=pointwise", *overrides)
 
 
 def computed(*overrides: str) -> tuple[Outcome, Path]:

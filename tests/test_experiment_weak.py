@@ -4,17 +4,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=list(overrides))
+from tests.programs import composed
 
 
 def weak_on(path: Path, output: Path) -> list[str]:

@@ -3,17 +3,14 @@ import re
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests import programs
 
 
 def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("config", overrides=["+exp=weak_windows", *overrides])
+    return programs.composed("+exp=weak_windows", *overrides)
 
 
 def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
