@@ -158,6 +158,7 @@ def test_processes_give_the_same_bits(noisy_bytes: dict[str, bytes]) -> None:
     assert bytes_of(result) == noisy_bytes
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_bits_even_if_a_worker_is_killed(
     cluster: Any, noisy_bytes: dict[str, bytes]
 ) -> None:
