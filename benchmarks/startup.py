@@ -39,6 +39,7 @@ CASES = {
 def cpu_s(command: list[str], *, folder: str, cache: str | None = None) -> float:
     """User and system time of a process that must succeed."""
     environment = dict(os.environ) | ({"NUMBA_CACHE_DIR": cache} if cache else {})
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # as installed: bytecode is kept
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
