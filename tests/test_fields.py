@@ -8,7 +8,8 @@ from ep2sindy.data import zones
 from ep2sindy.data.fields import check_field, mask_outside
 from ep2sindy.data.open import read_field, write_field
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.data.zones import Zone, point, zone_average
+from ep2sindy.data.zones import GridPoint, Zone, point, zone_average
+from ep2sindy.studies.source import Sampling
 
 T = np.linspace(0.0, 1e-4, 11)
 
@@ -206,6 +207,11 @@ def test_a_point_is_the_nearest_cell() -> None:
     field = masked_field()
     run = point(field, z=0.9, r=1.2, states=["n_i"], inputs=["n_n", "T_e_eV"])
     assert run.values[0].tolist() == [3.0, 1.0, 3.0]
+    chosen = GridPoint(["n_i"], z=0.9, r=1.2)  # as a config says it
+    assert isinstance(chosen, Sampling)
+    same = chosen.trajectory(field, inputs=["n_n", "T_e_eV"], label="probe")
+    assert (same.label, same.names) == ("probe", run.names)
+    assert np.array_equal(same.values, run.values)
 
 
 @pytest.mark.parametrize(

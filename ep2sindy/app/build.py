@@ -33,6 +33,12 @@ def is_plain(value: object, kind: type) -> bool:
     return type(value) is kind or (kind, type(value)) == (float, int)
 
 
+def check_set(node: DictConfig) -> None:
+    """Raise ValueError for a value, at any depth, that a config leaves to its user."""
+    if missing := sorted(OmegaConf.missing_keys(node)):
+        raise ValueError(f"{missing[0]} must be set: it is still '???'")
+
+
 def check_arguments(node: Any, place: str) -> None:
     """Raise ValueError for an argument, at any depth, that is not of the plain kind it must be."""
     if isinstance(node, ListConfig):
@@ -78,8 +84,7 @@ def call_of(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     place: the node's dotted path, for errors. first: arguments that it is given when called.
     Raises ValueError where it cannot be called so, or what a nested target raised itself.
     """
-    if missing := sorted(OmegaConf.missing_keys(node)):
-        raise ValueError(f"{missing[0]} must be set: it is still '???'")
+    check_set(node)
     check_arguments(node, place)
     try:
         call = instantiate(node, _convert_="all", _partial_=True)
@@ -128,6 +133,7 @@ class Configured:
     def __post_init__(self) -> None:
         if not isinstance(self.node, DictConfig) or "_target_" not in self.node:
             raise ValueError(f"{self.place} must name a _target_: {self.node!r} came")
+        check_set(self.node)
 
     @property
     def settings(self) -> Mapping[str, Any]:

@@ -23,7 +23,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 def main() -> None:
     """Errors of the user's making end in one message; all others keep their traceback."""
-    gc.set_threshold(100_000, 50, 100)  # imports make objects that stay: looking costs 0.6 s a run
+    gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
     sweeps: list[Path] = []
     failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
@@ -59,7 +59,7 @@ def conf_folder() -> Path:
     for place in places:
         if (place / "config.yaml").is_file():
             return place
-    raise OSError(
+    raise ValueError(
         f"the package's configs must lie in one of {list(map(str, places))}: none of them has a "
         "config.yaml; install the package again"
     )

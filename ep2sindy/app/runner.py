@@ -42,23 +42,11 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     check_common(config)
     kind = study_class(config.get("study"))
     check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
-    taken = {key: config[key] for key in config if key in keys_of(kind)}
-    if missing := next(_missing(OmegaConf.to_container(OmegaConf.create(taken)), ""), None):
-        raise ValueError(f"{missing} must be set, for it has no default: {missing}=VALUE")
     study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
     with started_run(config) as run:
         outcome = study.compute(run)
         headline = write(run, outcome, hparams_of(run.settings, keys_of(kind)))
     return Finished(run.folder.path, headline)
-
-
-def _missing(settings: Any, place: str) -> Iterator[str]:
-    """Dotted paths of what has no value yet, interpolations left as they are."""
-    if settings == "???":
-        yield place
-    items = settings.items() if isinstance(settings, dict) else ()
-    for key, value in items:
-        yield from _missing(value, f"{place}.{key}" if place else str(key))
 
 
 def study_class(name: object) -> type:
