@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 
 from ep2sindy.thruster import kernels
 from ep2sindy.thruster.discretization import build_model, initial_state
-from ep2sindy.thruster.parameters import AnomalousTransport, OperatingPoint, Thruster
+from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.simulate import FIELDS, simulate
+from ep2sindy.thruster.transport import AnomalousTransport
 
 SAMPLE_S = 1.5e-6
 TARGET_CPU_S_PER_MS = 0.64  # at 100 cells, one core

@@ -120,20 +120,30 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.synthetic.systems import lorenz as lorenz
     from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra
     from ep2sindy.synthetic.systems import van_der_pol as van_der_pol
+    from ep2sindy.thruster.anode import AnodeSheath as AnodeSheath
+    from ep2sindy.thruster.anode import FixedAnode as FixedAnode
     from ep2sindy.thruster.cache import simulate_cached as simulate_cached
-    from ep2sindy.thruster.closures import ExponentialWall as ExponentialWall
-    from ep2sindy.thruster.closures import SheathWall as SheathWall
-    from ep2sindy.thruster.closures import TabulatedRates as TabulatedRates
-    from ep2sindy.thruster.closures import XenonFits as XenonFits
     from ep2sindy.thruster.ionization import ionization_rate as ionization_rate
     from ep2sindy.thruster.landmark import LANDMARK_POINT as LANDMARK_POINT
     from ep2sindy.thruster.landmark import landmark_thruster as landmark_thruster
+    from ep2sindy.thruster.magnetic_field import MagneticField as MagneticField
+    from ep2sindy.thruster.magnetic_field import MagneticFieldTable as MagneticFieldTable
+    from ep2sindy.thruster.magnetic_field import read_magnetic_field as read_magnetic_field
     from ep2sindy.thruster.parameters import OPERATING_POINTS as OPERATING_POINTS
-    from ep2sindy.thruster.parameters import AnomalousTransport as AnomalousTransport
-    from ep2sindy.thruster.parameters import MagneticField as MagneticField
     from ep2sindy.thruster.parameters import OperatingPoint as OperatingPoint
     from ep2sindy.thruster.parameters import Thruster as Thruster
+    from ep2sindy.thruster.propellant_files import propellant as propellant
+    from ep2sindy.thruster.propellant_files import read_propellant as read_propellant
+    from ep2sindy.thruster.propellants import PropellantTable as PropellantTable
+    from ep2sindy.thruster.propellants import TabulatedRates as TabulatedRates
+    from ep2sindy.thruster.propellants import XenonFits as XenonFits
     from ep2sindy.thruster.simulate import simulate as simulate
+    from ep2sindy.thruster.transport import AnomalousTransport as AnomalousTransport
+    from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport
+    from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport
+    from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall
+    from ep2sindy.thruster.walls import SheathWall as SheathWall
+    from ep2sindy.thruster.walls import wall_material as wall_material
 
     __version__: str
 
@@ -196,14 +206,17 @@ _FACE = {
     ),
     "synthetic.regions": "three_regions",
     "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz",
+    "thruster.anode": "AnodeSheath FixedAnode",
     "thruster.cache": "simulate_cached",
-    "thruster.closures": "XenonFits TabulatedRates SheathWall ExponentialWall",
     "thruster.ionization": "ionization_rate",
-    "thruster.landmark": "landmark_thruster LANDMARK_POINT",
-    "thruster.parameters": (
-        "MagneticField AnomalousTransport Thruster OperatingPoint OPERATING_POINTS"
-    ),
+    "thruster.landmark": "LANDMARK_POINT landmark_thruster",
+    "thruster.magnetic_field": "MagneticField MagneticFieldTable read_magnetic_field",
+    "thruster.parameters": "OPERATING_POINTS OperatingPoint Thruster",
+    "thruster.propellant_files": "propellant read_propellant",
+    "thruster.propellants": "PropellantTable TabulatedRates XenonFits",
     "thruster.simulate": "simulate",
+    "thruster.transport": "AnomalousTransport GaussianTransport MultiLogTransport",
+    "thruster.walls": "ExponentialWall SheathWall wall_material",
 }
 _MODULES = {name: module for module, names in _FACE.items() for name in names.split()}
 __all__ = ["__version__", *_MODULES]

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from ep2sindy.data.prepare import crop, decimate, derive, keep_where, low_pass
-from ep2sindy.thruster import closures
+from ep2sindy.thruster import propellants
 from ep2sindy.thruster.ionization import ionization_rate, read_rate_table
 
 DT = 1e-6
@@ -176,7 +176,7 @@ def warm() -> xr.Dataset:
 
 def test_the_rate_comes_from_the_fits() -> None:
     after = ionization_rate(warm())
-    expected = closures.ionization_rate(warm()["T_e_eV"].values[:, :2])
+    expected = propellants.ionization_rate(warm()["T_e_eV"].values[:, :2])
     assert np.array_equal(after["R_ion"].values[:, :2], expected)
     assert np.isnan(after["R_ion"].values[:, 2]).all()
     assert after["R_ion"].attrs == {"units": "m^3/s"}

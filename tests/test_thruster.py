@@ -6,17 +6,13 @@ import numpy as np
 import pytest
 
 from ep2sindy.thruster import kernels
-from ep2sindy.thruster.closures import SheathWall, TabulatedRates, XenonFits, ionization_rate
 from ep2sindy.thruster.discretization import build_model, closure_table, initial_state
 from ep2sindy.thruster.landmark import landmark_thruster, read_landmark_rates
-from ep2sindy.thruster.parameters import (
-    OPERATING_POINTS,
-    AnomalousTransport,
-    MagneticField,
-    OperatingPoint,
-    Thruster,
-)
+from ep2sindy.thruster.magnetic_field import MagneticField
+from ep2sindy.thruster.parameters import OPERATING_POINTS, OperatingPoint, Thruster
+from ep2sindy.thruster.propellants import TabulatedRates, XenonFits
 from ep2sindy.thruster.simulate import judge_status, simulate
+from ep2sindy.thruster.transport import AnomalousTransport
 
 NOMINAL = OperatingPoint(300.0, 5.0)
 
@@ -26,18 +22,6 @@ def short_run():
     return simulate(Thruster(), NOMINAL, duration_s=3e-3, progress=False)
 
 
-@pytest.mark.parametrize(
-    ("T_e_eV", "published"), [(5.0, 8.3e-15), (10.0, 4.0e-14), (20.0, 1.03e-13), (40.0, 1.93e-13)]
-)
-def test_ionization_rate_meets_published_figures(T_e_eV, published):
-    assert ionization_rate(T_e_eV) == pytest.approx(published, rel=0.02)  # figures of 2-3 digits
-
-
-def test_ionization_rate_branches_meet_at_5_eV():
-    below, above = ionization_rate(np.array([5.0 - 1e-9, 5.0]))
-    assert below == pytest.approx(above, rel=0.03)  # the two published fits differ by 2.3 %
-
-
 def test_closure_table_interpolates_the_formulas():
     T = np.linspace(2.003, 60.0, 500)
     table = closure_table(Thruster())
@@ -45,22 +29,6 @@ def test_closure_table_interpolates_the_formulas():
     tabulated = np.interp(T, grid, table[:, kernels.IONIZATION])
     away = np.abs(T - 5.0) > 0.01  # the published fit jumps there
     np.testing.assert_allclose(tabulated[away], XenonFits().ionization(T[away]), rtol=2e-4)
-
-
-def test_wall_emission_stops_at_the_space_charge_limit():
-    emission = SheathWall().emission(np.array([1.0, 10.0, 100.0]))
-    assert emission[0] < emission[1] < emission[2] == pytest.approx(0.983, abs=1e-3)
-
-
-def test_magnetic_field_peaks_at_the_exit():
-    field = MagneticField().at(np.array([-0.011, 0.0, 0.018]))
-    np.testing.assert_allclose(field, 15e-3 * np.exp([-0.5, 0.0, -0.5]))
-
-
-def test_anomalous_coefficient_is_linear_across_the_exit():
-    c = AnomalousTransport().at(np.array([-2e-3, -1.5e-3, 0.0, 1.5e-3, 2e-3]))
-    middle = 0.5 * (1 / 300 + 1 / 80)
-    np.testing.assert_allclose(c, [1 / 300, 1 / 300, middle, 1 / 80, 1 / 80])
 
 
 def advected_error(n_cells):

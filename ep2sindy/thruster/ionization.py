@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.thruster import closures
+from ep2sindy.thruster import propellants
 
 
 def ionization_rate(field: xr.Dataset, *, table: str | Path | None = None) -> xr.Dataset:
@@ -18,7 +18,7 @@ def ionization_rate(field: xr.Dataset, *, table: str | Path | None = None) -> xr
 
     table: CSV file of T_e in eV (increasing) and rate in m^3/s, linear between its rows; any
     further columns and lines of text are left out. By default the fits of
-    `ep2sindy.thruster.closures`.
+    `ep2sindy.thruster.propellants`.
     Raises ValueError if the field has R_ion already or no T_e_eV, or if T_e_eV leaves the
     table, which is never extrapolated.
     """
@@ -30,7 +30,7 @@ def ionization_rate(field: xr.Dataset, *, table: str | Path | None = None) -> xr
         raise ValueError(f"R_ion needs T_e_eV; this field has {list(field.data_vars)}")
     T_e_eV = field["T_e_eV"].astype(np.float64)
     if table is None:
-        rate: Callable = closures.ionization_rate
+        rate: Callable = propellants.ionization_rate
     else:
         T_eV, rates = read_rate_table(Path(table))
         low, high = float(T_e_eV.min()), float(T_e_eV.max())

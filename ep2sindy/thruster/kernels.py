@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ep2sindy.machine.compilation import compiled
-from ep2sindy.thruster.closures import E_CHARGE, M_ELECTRON
+from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 COLDEST_EV = 1.0  # of the ghost cells: a steep end would otherwise turn them negative
 
@@ -41,7 +41,8 @@ class Model(NamedTuple):
     pressure_factor: float  # p_e = pressure_factor * n * T_e
     conduction_factor: float  # kappa = conduction_factor * mu * n * T_e
     drift_weight: float  # 1: rates see the electrons' drift energy; 0: they do not
-    boundary_T_e_eV: float  # eV
+    anode_T_e_eV: float  # eV
+    cathode_T_e_eV: float  # eV
     cfl: float
     omega_ce: np.ndarray  # (n + 2,), rad/s
     anomalous: np.ndarray  # (n + 2,), 1/s
@@ -95,7 +96,7 @@ def face_fluxes(n, g, nn, model, u, f_n, f_g, f_nn):
     """
     cells = n.size - 2
     c2 = model.sound_speed_squared
-    bohm = np.sqrt(E_CHARGE * model.boundary_T_e_eV / model.ion_mass)
+    bohm = np.sqrt(E_CHARGE * model.anode_T_e_eV / model.ion_mass)
     for i in range(1, cells + 1):
         u[i] = g[i] / n[i]
     f_n[0], f_g[0] = rusanov(n[1], min(u[1], -bohm), n[1], u[1], c2)
@@ -242,8 +243,8 @@ def electron_step(state, model, dt, w):
     n[0], g[0], nn[0] = n[1], g[1], nn[1]
     n[-1], g[-1], nn[-1] = n[-2], g[-2], nn[-2]
     # The ends of the domain, half a cell outside the last centres, are held at their temperature.
-    T[0] = max(2.0 * model.boundary_T_e_eV - T[1], COLDEST_EV)
-    T[-1] = max(2.0 * model.boundary_T_e_eV - T[-2], COLDEST_EV)
+    T[0] = max(2.0 * model.anode_T_e_eV - T[1], COLDEST_EV)
+    T[-1] = max(2.0 * model.cathode_T_e_eV - T[-2], COLDEST_EV)
     nu, mobility, kappa, source = w[0], w[1], w[2], w[3]
     if not collisions(state, model, nu, mobility, kappa, source):
         return False

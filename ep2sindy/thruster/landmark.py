@@ -10,8 +10,11 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from ep2sindy.thruster.closures import ExponentialWall, TabulatedRates
-from ep2sindy.thruster.parameters import AnomalousTransport, OperatingPoint, Thruster
+from ep2sindy.thruster.anode import FixedAnode
+from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.propellants import TabulatedRates
+from ep2sindy.thruster.transport import AnomalousTransport
+from ep2sindy.thruster.walls import ExponentialWall
 
 ALPHA_CHANNEL = {1: 1.0, 2: 0.5, 3: 0.4}  # energy-loss coefficient by case; 1 in the plume
 LANDMARK_POINT = OperatingPoint(300.0, 5.0, neutral_speed=150.0)
@@ -27,10 +30,11 @@ def landmark_thruster(case: int, rates: TabulatedRates) -> Thruster:
         raise ValueError(f"LANDMARK has fluid cases {sorted(ALPHA_CHANNEL)}, got {case!r}")
     return Thruster(
         transport=AnomalousTransport(c_channel=1 / 160, c_plume=1 / 16, transition=1e-3),
-        rates=rates,
+        propellant=rates,
         wall=ExponentialWall(power_weights=(ALPHA_CHANNEL[case], 1.0)),
         ion_temperature=0.0,
-        boundary_T_e_eV=2.0,
+        anode=FixedAnode(T_e_eV=2.0),
+        cathode_T_e_eV=2.0,
         cathode_potential=0.0,
         series_resistance=0.0,
         pressure_factor=1.5,

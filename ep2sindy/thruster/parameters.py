@@ -5,97 +5,49 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import numpy as np
-from jaxtyping import Float
-
-from ep2sindy.thruster.closures import ExponentialWall, SheathWall, TabulatedRates, XenonFits
-
-
-def check_positive(owner: object, *names: str) -> None:
-    """Raise ValueError for the first named field that is not a finite positive number."""
-    for name in names:
-        value = getattr(owner, name)
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must be finite and positive, got {value!r}"
-            )
-
-
-def check_not_negative(owner: object, *names: str) -> None:
-    """Raise ValueError for the first named field that is negative or not finite."""
-    for name in names:
-        value = getattr(owner, name)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must be finite and zero or more, got {value!r}"
-            )
-
-
-@dataclass(frozen=True)
-class MagneticField:
-    """Radial field on the channel axis: a Gaussian about the exit, wider in the plume."""
-
-    peak: float = 15e-3  # T
-    width_channel: float = 11e-3  # m, standard deviation
-    width_plume: float = 18e-3  # m
-
-    def __post_init__(self) -> None:
-        check_positive(self, "peak", "width_channel", "width_plume")
-
-    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Field in T at a distance from the exit in m, negative inside."""
-        width = np.where(distance < 0.0, self.width_channel, self.width_plume)
-        return self.peak * np.exp(-0.5 * (distance / width) ** 2)
-
-
-@dataclass(frozen=True)
-class AnomalousTransport:
-    """Anomalous collisions nu = c omega_ce, with c linear across a layer about the exit.
-
-    The three numbers are tuned, as in every 1-D code; see docs/thruster.md.
-    """
-
-    c_channel: float = 1 / 300
-    c_plume: float = 1 / 80
-    transition: float = 3e-3  # m
-
-    def __post_init__(self) -> None:
-        check_positive(self, "c_channel", "c_plume")
-        check_not_negative(self, "transition")
-
-    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Coefficient c at a distance from the exit in m."""
-        if self.transition == 0.0:
-            return np.where(distance < 0.0, self.c_channel, self.c_plume)
-        share = np.clip(distance / self.transition + 0.5, 0.0, 1.0)
-        return self.c_channel + (self.c_plume - self.c_channel) * share
+from ep2sindy.thruster.anode import Anode, FixedAnode
+from ep2sindy.thruster.checks import check_not_negative, check_positive
+from ep2sindy.thruster.magnetic_field import Field, MagneticField
+from ep2sindy.thruster.propellants import Propellant, XenonFits, named
+from ep2sindy.thruster.transport import AnomalousTransport, Transport
+from ep2sindy.thruster.walls import SheathWall, Wall
 
 
 @dataclass(frozen=True)
 class Thruster:
-    """Geometry, field, closures and boundary values of one thruster. Default: SPT-100-like."""
+    """Geometry, field, closures and boundary values of one thruster. Default: SPT-100-like.
+
+    kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e: 4.66 and 0 are
+    Braginskii's for singly charged ions. charge_states: the ions' highest charge, 1 or 2.
+    cathode_potential: of the cathode plane above the cathode, its coupling voltage.
+    """
 
     channel_length: float = 0.025  # m
     domain_length: float = 0.05  # m
     inner_radius: float = 0.035  # m
     outer_radius: float = 0.05  # m
-    magnetic_field: MagneticField = field(default_factory=MagneticField)
-    transport: AnomalousTransport = field(default_factory=AnomalousTransport)
-    rates: XenonFits | TabulatedRates = field(default_factory=XenonFits)
-    wall: SheathWall | ExponentialWall = field(default_factory=SheathWall)
+    magnetic_field: Field = field(default_factory=MagneticField)
+    transport: Transport = field(default_factory=AnomalousTransport)
+    propellant: Propellant = field(default_factory=XenonFits)
+    charge_states: int = 1
+    wall: Wall = field(default_factory=SheathWall)
     ion_temperature: float = 1000.0  # K
-    boundary_T_e_eV: float = 3.0
+    anode: Anode = field(default_factory=FixedAnode)
+    cathode_T_e_eV: float = 3.0
     cathode_potential: float = 20.0  # V
     series_resistance: float = 1.0  # ohm
     pressure_factor: float = 1.0  # p_e = factor n T_e
-    conduction_factor: float = 4.66  # kappa = factor mu n T_e; Braginskii, singly charged ions
+    conduction_factor: float = 4.66
+    conduction_coulomb: float = 0.0
 
     def __post_init__(self) -> None:
         check_positive(
             self, "channel_length", "domain_length", "inner_radius", "outer_radius",
-            "boundary_T_e_eV", "pressure_factor", "conduction_factor",
+            "cathode_T_e_eV", "pressure_factor", "conduction_factor",
         )  # fmt: skip
-        check_not_negative(self, "ion_temperature", "cathode_potential", "series_resistance")
+        check_not_negative(
+            self, "ion_temperature", "cathode_potential", "series_resistance", "conduction_coulomb"
+        )
         if self.channel_length >= self.domain_length:
             raise ValueError(
                 f"the channel must end inside the domain: channel_length {self.channel_length} m "
@@ -106,6 +58,28 @@ class Thruster:
                 f"inner_radius must be below outer_radius: {self.inner_radius} m against "
                 f"{self.outer_radius} m"
             )
+        self.magnetic_field.check_covers(
+            -self.channel_length, self.domain_length - self.channel_length
+        )
+        self._check_propellant()
+
+    def _check_propellant(self) -> None:
+        if self.charge_states not in (1, 2):
+            raise ValueError(f"charge_states must be 1 or 2, got {self.charge_states!r}")
+        if self.charge_states > self.propellant.charge_states:
+            raise ValueError(
+                "charge_states 2 needs rates of the second charge, which the propellant "
+                f"{named(self.propellant)} has not; take ep2sindy.propellant(name='xenon')"
+            )
+        if self.propellant.range_eV is None:
+            return
+        low, high = self.propellant.range_eV
+        for place, T_e_eV in (("anode", self.anode.T_e_eV), ("cathode", self.cathode_T_e_eV)):
+            if not low <= T_e_eV <= high:
+                raise ValueError(
+                    f"the rates of {named(self.propellant)} cover T_e from {low:g} to {high:g} "
+                    f"eV, and it is {T_e_eV:g} eV at the {place}; extend the table"
+                )
 
     @property
     def gap(self) -> float:

@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.thruster import kernels
-from ep2sindy.thruster.closures import M_XENON
 from ep2sindy.thruster.discretization import build_model, cell_centres, initial_state
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 
@@ -174,7 +173,7 @@ def mass_balance(field: xr.Dataset, point: OperatingPoint, thruster: Thruster) -
     left = float(field["mass_out"][-1] - field["mass_out"][0])
     first, last = (field["n_i"] + field["n_n"]).isel(time=[0, -1]).astype(float).sum("z").values
     dz = float(field["z"][1] - field["z"][0])
-    accumulated = M_XENON * thruster.area * dz * float(last - first)
+    accumulated = thruster.propellant.mass * thruster.area * dz * float(last - first)
     entered = 1e-6 * point.mass_flow_mg_s * float(field["time"][-1])
     return (left + accumulated) / entered
 

@@ -1,0 +1,60 @@
+"""Checks that the values of this room share: numbers in their range, tables without a gap."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def check_positive(owner: object, *names: str) -> None:
+    """Raise ValueError for the first named field that is not a finite positive number."""
+    for name in names:
+        value = getattr(owner, name)
+        if not (math.isfinite(value) and value > 0.0):
+            raise ValueError(
+                f"{type(owner).__name__}.{name} must be finite and positive, got {value!r}"
+            )
+
+
+def check_not_negative(owner: object, *names: str) -> None:
+    """Raise ValueError for the first named field that is negative or not finite."""
+    for name in names:
+        value = getattr(owner, name)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ValueError(
+                f"{type(owner).__name__}.{name} must be finite and zero or more, got {value!r}"
+            )
+
+
+def check_increasing(owner: object, name: str) -> None:
+    """Raise ValueError if a named field is not two or more finite, increasing numbers."""
+    values = np.asarray(getattr(owner, name), dtype=float)
+    if values.ndim != 1 or values.size < 2:
+        raise ValueError(f"{type(owner).__name__}.{name} must hold two numbers or more")
+    steps = np.diff(values)
+    if not np.all(steps > 0.0):  # NaN too
+        row = int(np.argmin(steps > 0.0)) + 1
+        raise ValueError(
+            f"{type(owner).__name__}.{name} must increase: {values[row]:g} follows "
+            f"{values[row - 1]:g} at position {row}; sort the rows first, and fill the gaps"
+        )
+
+
+def check_rows(owner: object, first: str, *names: str) -> None:
+    """Raise ValueError for a named column that has not one finite number for each of `first`."""
+    wanted = len(getattr(owner, first))
+    for name in names:
+        values: Sequence[float] = getattr(owner, name)
+        if len(values) != wanted:
+            raise ValueError(
+                f"{type(owner).__name__}.{name} must have one number for each of {first}: "
+                f"{len(values)} for {wanted}"
+            )
+        if not np.all(np.isfinite(values)):
+            row = int(np.argmin(np.isfinite(values)))
+            raise ValueError(
+                f"{type(owner).__name__}.{name} must be finite, got {values[row]!r} at "
+                f"position {row}; fill the gap or leave the row out"
+            )

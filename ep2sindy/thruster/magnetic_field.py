@@ -1,0 +1,151 @@
+"""The radial magnetic field on the channel axis: a Gaussian, or a table from a file.
+
+Siblings with `at(distance)`, the field in T at a distance from the exit in m, negative inside,
+and `check_covers(first, last)`, which refuses a stretch that the field is not known on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster.checks import check_increasing, check_positive, check_rows
+from ep2sindy.thruster.tables import number, numbers, read_cells
+
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+FIELDS = {"T": 1.0, "mT": 1e-3, "G": 1e-4}
+Points = Sequence[float] | Float[np.ndarray, " points"]
+HIGHEST_T = 1.0  # no Hall thruster comes near: a larger number is in another unit
+
+
+@dataclass(frozen=True)
+class MagneticField:
+    """A Gaussian about the exit, wider in the plume."""
+
+    peak: float = 15e-3  # T
+    width_channel: float = 11e-3  # m, standard deviation
+    width_plume: float = 18e-3  # m
+
+    def __post_init__(self) -> None:
+        check_positive(self, "peak", "width_channel", "width_plume")
+
+    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Field in T at a distance from the exit in m, negative inside."""
+        width = np.where(distance < 0.0, self.width_channel, self.width_plume)
+        return self.peak * np.exp(-0.5 * (distance / width) ** 2)
+
+    def check_covers(self, first: float, last: float) -> None:
+        """A formula covers every stretch."""
+
+
+@dataclass(frozen=True)
+class MagneticFieldTable:
+    """Field through given points by a cubic that keeps their shape (PCHIP): no overshoot.
+
+    distance: from the exit in m, increasing, negative inside; B: in T, its sign left out.
+    The ends may fall short of a domain by the table's widest step; there the end value is held.
+    """
+
+    distance: Points
+    B: Points
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "B"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        check_increasing(self, "distance")
+        check_rows(self, "distance", "B")
+        largest = max(map(abs, self.B))
+        if not 0.0 < largest <= HIGHEST_T:
+            raise ValueError(
+                f"MagneticFieldTable.B must be in T and not zero everywhere, got up to {largest:g}"
+            )
+
+    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Field in T at a distance from the exit in m."""
+        from scipy.interpolate import PchipInterpolator
+
+        curve = PchipInterpolator(self.distance, np.abs(self.B))
+        return curve(np.clip(distance, self.distance[0], self.distance[-1]))
+
+    def check_covers(self, first: float, last: float) -> None:
+        """Raise ValueError if the points end short of [first, last], distances in m."""
+        step = max(np.diff(self.distance))
+        low, high = self.distance[0], self.distance[-1]
+        if low - step > first or high + step < last:
+            raise ValueError(
+                f"the magnetic field must cover the domain, {first:g} to {last:g} m from the "
+                f"exit: it is known from {low:g} to {high:g} m; measure on, or shorten the domain "
+                "(is the exit where you say that it is?)"
+            )
+
+
+def read_magnetic_field(
+    path: str | Path,
+    *,
+    exit_m: float,
+    z_unit: str | None = None,
+    B_unit: str | None = None,
+    scale: float = 1.0,
+) -> MagneticFieldTable:
+    """A field from a CSV file of two columns, position and field.
+
+    exit_m: the channel's exit in m on the file's own axis (0.025 if that begins at the anode of
+    a channel of 25 mm, 0 if at the exit). Units (m, cm, mm; T, mT, G) stand in the header, as in
+    `z_mm,B_mT` or `z (cm), Br [G]`, or are given; a file without any is taken as m and T, if
+    its numbers can be. scale: the field is multiplied by it. Lines that begin with # are left out.
+    Raises ValueError for a gap, an unknown unit, or a field above 1 T.
+    """
+    header, numbers = _two_columns(Path(path))
+    lengths = _unit(LENGTHS, z_unit, header[0], f"{path}: position")
+    fields = _unit(FIELDS, B_unit, header[1], f"{path}: field")
+    largest = float(np.abs(numbers[:, 1]).max())
+    if fields is None and largest > HIGHEST_T:
+        raise ValueError(
+            f"{path}: the field has no unit and reaches {largest:g}, too much for T; write it "
+            "into the header, such as z_m,B_G, or give B_unit=G or mT"
+        )
+    if lengths is None and np.ptp(numbers[:, 0]) > 1.0:
+        raise ValueError(
+            f"{path}: the position has no unit and spans {np.ptp(numbers[:, 0]):g}, too much for "
+            "m; write it into the header, such as z_mm,B_T, or give z_unit=mm or cm"
+        )
+    distance = (lengths or 1.0) * numbers[:, 0] - exit_m
+    try:
+        return MagneticFieldTable(
+            tuple(distance.tolist()), tuple((scale * (fields or 1.0) * numbers[:, 1]).tolist())
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _two_columns(path: Path) -> tuple[tuple[str, str], Float[np.ndarray, "rows 2"]]:
+    """Names of the columns, empty without a header, and their numbers."""
+    rows = read_cells(path, "file of a magnetic field")
+    if len(rows[0]) != 2:
+        raise ValueError(f"{path} must have two columns, position and field: it has {len(rows[0])}")
+    if all(number(cell) is None for cell in rows[0]):
+        return (rows[0][0], rows[0][1]), np.array(numbers(path, rows[1:], 2))
+    return ("", ""), np.array(numbers(path, rows, 2))
+
+
+def _unit(units: dict[str, float], given: str | None, header: str, place: str) -> float | None:
+    """Factor to SI: of the unit that is given, or of the header's last word of several."""
+    word = given
+    if word is None and (words := re.findall(r"[A-Za-z]+", header))[1:]:
+        word = words[-1]
+    if word is None:
+        return None
+    if word not in units:
+        raise ValueError(
+            f"{place} must be in one of {list(units)}: {word!r} came; the unit stands last in the "
+            "header, as in z_mm,B_mT, or is given"
+        )
+    return units[word]
+
+
+Field = MagneticField | MagneticFieldTable

@@ -1,0 +1,102 @@
+"""Propellants read from tables: the gases that come with the package, and a user's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ep2sindy.thruster.constants import ATOMIC_MASS, M_ARGON, M_KRYPTON, M_XENON
+from ep2sindy.thruster.propellants import PropellantTable
+from ep2sindy.thruster.tables import numbers, read_cells
+
+GASES = Path(__file__).parent / "gases"
+RATES = ("ionization", "excitation", "momentum")
+SECOND = ("double_ionization", "second_ionization")
+# Energies in eV: HallThruster.jl's tables, whose lumped levels they are; argon: its cross sections
+ENERGIES: dict[str, dict[str, float]] = {
+    "xenon": {
+        "ionization_eV": 12.1298437, "excitation_eV": 8.32,
+        "double_ionization_eV": 33.1048437, "second_ionization_eV": 20.975,
+    },
+    "krypton": {
+        "ionization_eV": 13.9996055, "excitation_eV": 9.99,
+        "double_ionization_eV": 38.3594455, "second_ionization_eV": 24.35984,
+    },
+    "argon": {"ionization_eV": 15.8, "excitation_eV": 11.5},
+}  # fmt: skip
+MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
+
+
+def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
+    """A gas that comes with the package: xenon, krypton or argon.
+
+    Xenon and krypton are the tables of HallThruster.jl, up to T_e of 170 and 100 eV, with a
+    second charge; argon follows from the cross sections of Phelps & Petrovic (1999), up to
+    100 eV. Each file in `gases/` names its sources. The default `XenonFits` are formulas.
+    """
+    if name not in MASSES:
+        raise ValueError(
+            f"there are the propellants {sorted(MASSES)}: {name!r} came; a table of your own is "
+            "read by ep2sindy.read_propellant"
+        )
+    return _table(
+        GASES / f"{name}.csv", name, MASSES[name], ENERGIES[name], coulomb_weight=coulomb_weight
+    )
+
+
+def read_propellant(
+    path: str | Path,
+    *,
+    mass_u: float,
+    ionization_eV: float,
+    excitation_eV: float,
+    double_ionization_eV: float | None = None,
+    second_ionization_eV: float | None = None,
+    name: str | None = None,
+) -> PropellantTable:
+    """A gas of one's own from a CSV file, its header naming the columns.
+
+    Columns: T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing; ionization, excitation and
+    momentum, rate coefficients in m^3/s; for a second charge double_ionization (X -> X2+) and
+    second_ionization (X+ -> X2+). Lines that begin with # are left out. mass_u: of the atom, in
+    atomic mass units; energies: what one event costs an electron.
+    Raises ValueError for a file that is not there, a column that is missing or unknown, or a gap.
+    """
+    given = {
+        "ionization_eV": ionization_eV,
+        "excitation_eV": excitation_eV,
+        "double_ionization_eV": double_ionization_eV,
+        "second_ionization_eV": second_ionization_eV,
+    }
+    energies = {key: value for key, value in given.items() if value is not None}
+    return _table(Path(path), name or Path(path).stem, mass_u * ATOMIC_MASS, energies)
+
+
+def _table(
+    path: Path, name: str, mass: float, energies: dict[str, float], coulomb_weight: float = 1.0
+) -> PropellantTable:
+    columns = _columns(path)
+    scale = {"T_e_eV": 1.0, "mean_energy_eV": 1.5}
+    first = [column for column in scale if column in columns]
+    known = {*scale, *RATES, *SECOND}
+    if len(first) != 1 or set(columns) - known or set(RATES) - set(columns):
+        raise ValueError(
+            f"{path} must have the columns T_e_eV or mean_energy_eV, {', '.join(RATES)}, and may "
+            f"have {' and '.join(SECOND)}: it has {list(columns)}"
+        )
+    rates: dict[str, Any] = {
+        f"{key}_rate": columns[key] for key in (*RATES, *SECOND) if key in columns
+    }
+    rates["T_e_eV"] = tuple(value / scale[first[0]] for value in columns[first[0]])
+    rates |= energies
+    try:
+        return PropellantTable(name, mass, coulomb_weight=coulomb_weight, **rates)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _columns(path: Path) -> dict[str, tuple[float, ...]]:
+    """Columns of a CSV file by name, every cell a number."""
+    header, *rows = read_cells(path, "table of a propellant")
+    values = zip(*numbers(path, rows, len(header)), strict=True)
+    return dict(zip(header, values, strict=True))

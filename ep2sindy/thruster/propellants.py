@@ -1,0 +1,293 @@
+"""Propellants: mass of the atom and rate coefficients against electrons, with their sources.
+
+Siblings with the same methods on arrays of T_e in eV, so that a simulation takes any of them:
+
+- `mass` (kg), `range_eV` (lowest and highest T_e that the coefficients cover, None for formulas),
+  `charge_states` (the highest charge there are coefficients for), energies in eV;
+- `ionization`, `energy_loss`, `events`, `momentum`, `coulomb` for X and X+;
+- `drift_events`: the inelastic events that take their energy from drift and heat together;
+- `double_ionization` (X -> X2+) and `second_ionization` (X+ -> X2+), where charge_states is 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster.checks import (
+    check_increasing,
+    check_not_negative,
+    check_positive,
+    check_rows,
+)
+from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON, M_XENON
+
+E_IONIZATION_EV = 12.13  # eV, first ionisation of xenon (Goebel & Katz, appendix E)
+E_EXCITATION_EV = 8.32  # eV, lowest excited level (Goebel & Katz, appendix E)
+
+FloatArray = Float[np.ndarray, "..."] | np.float64  # NumPy makes scalars of arrays without axes
+
+
+def thermal_speed(T_e_eV: FloatArray) -> FloatArray:
+    """Mean speed of Maxwellian electrons sqrt(8 e T / (pi m_e)), in m/s."""
+    return np.sqrt(8.0 * E_CHARGE * T_e_eV / (np.pi * M_ELECTRON))
+
+
+def ionization_rate(T_e_eV: FloatArray | float) -> FloatArray:
+    """Rate coefficient of electron-impact ionisation of xenon, in m^3/s.
+
+    T_e_eV: electron temperature in eV, any shape, positive.
+    Source: Goebel & Katz, Fundamentals of Electric Propulsion, appendix E.
+    """
+    T = np.asarray(T_e_eV, dtype=float)
+    threshold = np.exp(-12.127 / T)
+    cold = (3.97 + 0.643 * T - 0.0368 * T**2) * threshold
+    hot = -1.031e-4 * T**2 + 6.386 * threshold
+    return 1e-20 * np.where(T < 5.0, cold, hot) * thermal_speed(T)
+
+
+def excitation_rate(T_e_eV: FloatArray) -> FloatArray:
+    """Rate coefficient of electron-impact excitation of xenon, in m^3/s.
+
+    Source: Goebel & Katz, appendix E, one lumped level.
+    """
+    return 1.93e-19 * np.exp(-11.6 / T_e_eV) / np.sqrt(T_e_eV) * thermal_speed(T_e_eV)
+
+
+def momentum_transfer_rate(T_e_eV: FloatArray) -> FloatArray:
+    """Rate coefficient of electron-neutral momentum transfer, in m^3/s.
+
+    The fit turns negative below 0.4 eV, where it is held at zero.
+    Source: Goebel & Katz, chapter 3.
+    """
+    sigma = 6.6e-19 * (T_e_eV / 4.0 - 0.1) / (1.0 + (T_e_eV / 4.0) ** 1.6)  # m^2
+    return np.maximum(sigma, 0.0) * thermal_speed(T_e_eV)
+
+
+def coulomb_rate(T_e_eV: FloatArray) -> FloatArray:
+    """2.9e-12 T^-1.5; times n and ln(Lambda) it is nu_ei in 1/s (Goebel & Katz, chapter 3)."""
+    return 2.9e-12 * T_e_eV**-1.5
+
+
+@dataclass(frozen=True)
+class XenonFits:
+    """Xenon coefficients as published formulas (Goebel & Katz, appendix E and chapter 3).
+
+    Inelastic rates and wall losses are taken at the electrons' whole mean energy 1.5 T_e + K,
+    K the kinetic energy of their drift, hence at the temperature T_e + 2 K/3 (`drift_weight` 1).
+    """
+
+    mass: ClassVar[float] = M_XENON
+    ionization_eV: ClassVar[float] = E_IONIZATION_EV
+    drift_weight: ClassVar[float] = 1.0
+    range_eV: ClassVar[tuple[float, float] | None] = None
+    charge_states: ClassVar[int] = 1
+
+    def ionization(self, T_e_eV: FloatArray) -> FloatArray:
+        """Rate coefficient in m^3/s."""
+        return ionization_rate(T_e_eV)
+
+    def energy_loss(self, T_e_eV: FloatArray) -> FloatArray:
+        """Energy lost in ionisation and excitation, in eV m^3/s."""
+        ionization = E_IONIZATION_EV * ionization_rate(T_e_eV)
+        return ionization + E_EXCITATION_EV * excitation_rate(T_e_eV)
+
+    def events(self, T_e_eV: FloatArray) -> FloatArray:
+        """Ionising and exciting collisions together, in m^3/s."""
+        return ionization_rate(T_e_eV) + excitation_rate(T_e_eV)
+
+    def drift_events(self, T_e_eV: FloatArray) -> FloatArray:
+        """Every inelastic event takes its energy from drift and heat together, in m^3/s."""
+        return self.events(T_e_eV)
+
+    def momentum(self, T_e_eV: FloatArray) -> FloatArray:
+        """Momentum lost to neutrals in elastic collisions, in m^3/s."""
+        return momentum_transfer_rate(T_e_eV)
+
+    def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
+        """nu_ei over n and ln(Lambda)."""
+        return coulomb_rate(T_e_eV)
+
+
+@dataclass(frozen=True)
+class TabulatedRates:
+    """Coefficients from a user's table over the mean energy 1.5 T_e, as LANDMARK defines them.
+
+    mean_energy_eV: increasing. ionization_rate: m^3/s. energy_loss_rate: eV m^3/s.
+    elastic_rate: constant momentum transfer, m^3/s.
+    Coulomb collisions and the drift energy K are left out. Below the first row both
+    coefficients fall to zero linearly; beyond the last they stay.
+    """
+
+    mean_energy_eV: tuple[float, ...]
+    ionization_rate: tuple[float, ...]
+    energy_loss_rate: tuple[float, ...]
+    elastic_rate: float = 2.5e-13  # LANDMARK test case 3
+    mass: ClassVar[float] = M_XENON
+    ionization_eV: ClassVar[float] = E_IONIZATION_EV
+    drift_weight: ClassVar[float] = 0.0
+    range_eV: ClassVar[tuple[float, float] | None] = None  # as the benchmark's authors take it
+    charge_states: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        energy = np.asarray(self.mean_energy_eV)
+        lengths = {len(self.mean_energy_eV), len(self.ionization_rate), len(self.energy_loss_rate)}
+        if len(lengths) > 1 or energy.size < 2 or not np.all(np.diff(energy) > 0.0):
+            raise ValueError(
+                "a rate table needs two or more rows of increasing mean energy, with both rates "
+                f"in every row: got lengths {len(self.mean_energy_eV)}, "
+                f"{len(self.ionization_rate)}, {len(self.energy_loss_rate)}; sort the rows first"
+            )
+
+    def _interpolate(self, T_e_eV: FloatArray, values: tuple[float, ...]) -> FloatArray:
+        return np.interp(1.5 * T_e_eV, (0.0, *self.mean_energy_eV), (0.0, *values))
+
+    def ionization(self, T_e_eV: FloatArray) -> FloatArray:
+        """Rate coefficient in m^3/s."""
+        return self._interpolate(T_e_eV, self.ionization_rate)
+
+    def energy_loss(self, T_e_eV: FloatArray) -> FloatArray:
+        """Energy lost in all inelastic collisions, in eV m^3/s."""
+        return self._interpolate(T_e_eV, self.energy_loss_rate)
+
+    def events(self, T_e_eV: FloatArray) -> FloatArray:
+        """LANDMARK's constant momentum transfer holds all collisions: none are added to it."""
+        return np.zeros_like(T_e_eV)
+
+    def drift_events(self, T_e_eV: FloatArray) -> FloatArray:
+        """The drift energy is left out."""
+        return np.zeros_like(T_e_eV)
+
+    def momentum(self, T_e_eV: FloatArray) -> FloatArray:
+        """Momentum lost to neutrals, in m^3/s."""
+        return np.full_like(T_e_eV, self.elastic_rate)
+
+    def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
+        """No Coulomb collisions in this closure."""
+        return np.zeros_like(T_e_eV)
+
+
+@dataclass(frozen=True)
+class PropellantTable:
+    """Any gas: rate coefficients in m^3/s over the electron temperature, linear between rows.
+
+    T_e_eV: increasing. An inelastic event is one of two kinds, ionisation and one lumped
+    excitation; with both columns of the second charge, X2+ is there too, from X and from X+.
+    coulomb_weight: 0 leaves electron-ion collisions out. drift_weight: as for `XenonFits`; of the
+    inelastic events only excitation takes part of its energy from the drift, as in
+    HallThruster.jl. Beyond the rows the end values are held, and a run that gets there ends.
+    """
+
+    name: str
+    mass: float  # kg
+    ionization_eV: float
+    excitation_eV: float
+    T_e_eV: tuple[float, ...]
+    ionization_rate: tuple[float, ...]
+    excitation_rate: tuple[float, ...]
+    momentum_rate: tuple[float, ...]
+    double_ionization_rate: tuple[float, ...] = ()
+    second_ionization_rate: tuple[float, ...] = ()
+    double_ionization_eV: float | None = None
+    second_ionization_eV: float | None = None
+    drift_weight: float = 1.0
+    coulomb_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive(self, "mass", "ionization_eV", "excitation_eV")
+        check_not_negative(self, "drift_weight", "coulomb_weight")
+        check_increasing(self, "T_e_eV")
+        second = [n for n in ("double_ionization", "second_ionization") if self._has(n)]
+        rates = [f"{n}_rate" for n in ("ionization", "excitation", "momentum", *second)]
+        check_rows(self, "T_e_eV", *rates)
+        for name in rates:
+            if min(getattr(self, name)) < 0.0:
+                raise ValueError(f"PropellantTable.{name} must be zero or more in every row")
+        if len(second) == 1:
+            raise ValueError(
+                "a second charge needs double_ionization and second_ionization, both with their "
+                f"energy: {self.name} has only {second[0]}"
+            )
+        if second:
+            check_positive(self, "double_ionization_eV", "second_ionization_eV")
+
+    def _has(self, name: str) -> bool:
+        rate, energy = getattr(self, f"{name}_rate"), getattr(self, f"{name}_eV")
+        if bool(rate) != (energy is not None):
+            raise ValueError(
+                f"{name} of {self.name} needs both its column and {name}_eV: only one came"
+            )
+        return bool(rate)
+
+    @property
+    def range_eV(self) -> tuple[float, float]:
+        """Lowest and highest T_e of the rows."""
+        return self.T_e_eV[0], self.T_e_eV[-1]
+
+    @property
+    def charge_states(self) -> int:
+        """2 where there are rates of the second charge."""
+        return 2 if self.second_ionization_rate else 1
+
+    def _interpolate(self, T_e_eV: FloatArray, values: tuple[float, ...]) -> FloatArray:
+        return np.interp(T_e_eV, self.T_e_eV, values)
+
+    def ionization(self, T_e_eV: FloatArray) -> FloatArray:
+        """X -> X+, in m^3/s."""
+        return self._interpolate(T_e_eV, self.ionization_rate)
+
+    def excitation(self, T_e_eV: FloatArray) -> FloatArray:
+        """X -> X*, one lumped level, in m^3/s."""
+        return self._interpolate(T_e_eV, self.excitation_rate)
+
+    def energy_loss(self, T_e_eV: FloatArray) -> FloatArray:
+        """Energy lost in X -> X+ and excitation, in eV m^3/s."""
+        lost = self.ionization_eV * self.ionization(T_e_eV)
+        return lost + self.excitation_eV * self.excitation(T_e_eV)
+
+    def events(self, T_e_eV: FloatArray) -> FloatArray:
+        """Ionising and exciting collisions together, in m^3/s."""
+        return self.ionization(T_e_eV) + self.excitation(T_e_eV)
+
+    def drift_events(self, T_e_eV: FloatArray) -> FloatArray:
+        """Exciting collisions, in m^3/s."""
+        return self.excitation(T_e_eV)
+
+    def momentum(self, T_e_eV: FloatArray) -> FloatArray:
+        """Momentum lost to neutrals in elastic collisions, in m^3/s."""
+        return self._interpolate(T_e_eV, self.momentum_rate)
+
+    def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
+        """nu_ei over n and ln(Lambda)."""
+        return self.coulomb_weight * coulomb_rate(T_e_eV)
+
+    def double_ionization(self, T_e_eV: FloatArray) -> FloatArray:
+        """X -> X2+, in m^3/s; zero without that column."""
+        values = self.double_ionization_rate
+        return self._interpolate(T_e_eV, values) if values else np.zeros_like(T_e_eV)
+
+    def second_ionization(self, T_e_eV: FloatArray) -> FloatArray:
+        """X+ -> X2+, in m^3/s; zero without that column."""
+        values = self.second_ionization_rate
+        return self._interpolate(T_e_eV, values) if values else np.zeros_like(T_e_eV)
+
+
+Propellant = XenonFits | TabulatedRates | PropellantTable
+
+
+def named(propellant: Propellant) -> str:
+    """Name of a gas for messages."""
+    return propellant.name if isinstance(propellant, PropellantTable) else type(propellant).__name__
+
+
+def uncovered(propellant: Propellant, reached_eV: float) -> str | None:
+    """What to say of a run that got so hot; None where the rates cover it."""
+    if propellant.range_eV is None or reached_eV <= propellant.range_eV[1]:
+        return None
+    return (
+        f"the rates of {named(propellant)} cover T_e up to {propellant.range_eV[1]:g} eV, the run "
+        f"reached {reached_eV:g} eV; extend the table"
+    )

@@ -1,0 +1,43 @@
+"""Cells of a small CSV file, and numbers of them, with the place of a gap."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def read_cells(path: Path, what: str) -> list[list[str]]:
+    """Rows of a CSV file, but empty ones and those that begin with #; `what` it is, for errors."""
+    if not path.is_file():
+        raise ValueError(f"no such {what}: {path.absolute()}")
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        rows = [[cell.strip() for cell in row] for row in csv.reader(file)]
+    rows = [row for row in rows if any(row) and not row[0].startswith("#")]
+    if len(rows) < 2:
+        raise ValueError(f"{path} must have two rows or more: it has {len(rows)}")
+    return rows
+
+
+def number(cell: str) -> float | None:
+    """A cell as a finite number; None if it is none."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def numbers(path: Path, rows: Sequence[Sequence[str]], n_columns: int) -> list[list[float]]:
+    """Every cell as a number; raises ValueError with the row that has a gap."""
+    found = []
+    for k, row in enumerate(rows, start=1):
+        values = [value for cell in row if (value := number(cell)) is not None]
+        if len(values) != n_columns or len(row) != n_columns:
+            raise ValueError(
+                f"{path} must have {n_columns} numbers in every row: row {k} below the header is "
+                f"{','.join(row)!r}; fill the gap"
+            )
+        found.append(values)
+    return found

@@ -1,0 +1,96 @@
+"""Anomalous transport: collisions nu = c(z) omega_ce that no theory predicts.
+
+Siblings with one method: `at(distance)`, the coefficient c at a distance from the exit in m,
+negative inside the channel. Their numbers are tuned, as in every 1-D code; see docs/thruster.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster.checks import (
+    check_increasing,
+    check_not_negative,
+    check_positive,
+    check_rows,
+)
+
+Points = Sequence[float] | Float[np.ndarray, " points"]
+
+
+@dataclass(frozen=True)
+class AnomalousTransport:
+    """Two zones, with c linear across a layer about the exit."""
+
+    c_channel: float = 1 / 300
+    c_plume: float = 1 / 80
+    transition: float = 3e-3  # m
+
+    def __post_init__(self) -> None:
+        check_positive(self, "c_channel", "c_plume")
+        check_not_negative(self, "transition")
+
+    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Coefficient c at a distance from the exit in m."""
+        if self.transition == 0.0:
+            return np.where(distance < 0.0, self.c_channel, self.c_plume)
+        share = np.clip(distance / self.transition + 0.5, 0.0, 1.0)
+        return self.c_channel + (self.c_plume - self.c_channel) * share
+
+
+@dataclass(frozen=True)
+class GaussianTransport:
+    """One level with a trough: c = c_far (1 - (1 - trough) exp(-((d - center)/width)^2 / 2)).
+
+    center: distance of the trough from the exit in m; width: its standard deviation in m;
+    trough: what is left of c_far at its middle. Source: GaussianBohm of HallThruster.jl,
+    Marks et al., JOSS 8 (2023) 4672.
+    """
+
+    c_far: float = 1 / 16
+    trough: float = 0.1
+    center: float = 0.0  # m
+    width: float = 5e-3  # m
+
+    def __post_init__(self) -> None:
+        check_positive(self, "c_far", "trough", "width")
+        if self.trough > 1.0:
+            raise ValueError(f"GaussianTransport.trough must be at most 1, got {self.trough!r}")
+        if not np.isfinite(self.center):
+            raise ValueError(f"GaussianTransport.center must be finite, got {self.center!r}")
+
+    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Coefficient c at a distance from the exit in m."""
+        bell = np.exp(-0.5 * ((distance - self.center) / self.width) ** 2)
+        return self.c_far * (1.0 - (1.0 - self.trough) * bell)
+
+
+@dataclass(frozen=True)
+class MultiLogTransport:
+    """Through given points: log c is linear between them, and held beyond the first and last.
+
+    distance: of the points from the exit in m, increasing, negative inside; c: at them. As
+    Hall2De and HallThruster.jl (MultiLogBohm) have it.
+    """
+
+    distance: Points
+    c: Points
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "c"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        check_increasing(self, "distance")
+        check_rows(self, "distance", "c")
+        if min(self.c) <= 0.0:
+            raise ValueError(f"MultiLogTransport.c must be positive at every point, got {self.c}")
+
+    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Coefficient c at a distance from the exit in m."""
+        return np.exp(np.interp(distance, self.distance, np.log(self.c)))
+
+
+Transport = AnomalousTransport | GaussianTransport | MultiLogTransport

@@ -1,0 +1,175 @@
+"""Channel walls: what electrons and ions lose to them, with the published sources."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster.checks import check_not_negative, check_positive
+from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
+
+SHEATH_DENSITY_RATIO = 0.4965  # edge over mean density, 0.86 / sqrt(3) (Marks et al. 2023)
+
+# Secondary emission: yield at zero energy, and mean energy 1.5 T_e (eV) at which it reaches one
+# (linear fits of Marks et al., JOSS 8 (2023) 4672, HallThruster.jl v0.22). Goebel & Katz,
+# chapter 7, give power laws of the same measurements.
+MATERIALS: dict[str, tuple[float, float]] = {
+    "BN-SiO2": (0.54, 40.0),
+    "BN": (0.24, 45.0),
+    "alumina": (0.57, 22.0),
+    "SiC": (0.69, 43.0),
+    "SiO2": (0.50, 18.0),
+}
+
+FloatArray = Float[np.ndarray, "..."] | np.float64
+
+
+def share(
+    distance: Float[np.ndarray, " z"], channel: float, plume: float, transition: float
+) -> Float[np.ndarray, " z"]:
+    """From `channel` to `plume` across the exit: at once, or linear over `transition` in m."""
+    if transition == 0.0:
+        return np.where(distance < 0.0, channel, plume)
+    return channel + (plume - channel) * np.clip(distance / transition + 0.5, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class SheathWall:
+    """Dielectric channel wall behind a sheath, with linear secondary-electron emission.
+
+    gamma = min(gamma_max, yield_0 + (1 - yield_0) 1.5 T_e / crossover_eV), where
+    gamma_max = 1 - 8.3 sqrt(m_e/m) is the space-charge limit; wall collisions
+    nu_w = electron_scale 0.4965 sqrt(e T_e/m) / (gap (1 - gamma)); each costs
+    2 T_e + (1 - gamma) phi_w, phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e))). Of the
+    collisions the share `plume_collisions` acts beyond the exit, of the power `plume_power`; ions
+    are lost in the channel alone. transition: length in m over which they change at the exit.
+    Default: BN-SiO2. Sources: Marks et al., JOSS 8 (2023) 4672; Goebel & Katz, chapter 7.
+    """
+
+    yield_0: float = 0.54
+    crossover_eV: float = 40.0
+    electron_scale: float = 0.9
+    ion_scale: float = 0.5
+    plume_collisions: float = 1.0
+    plume_power: float = 1.0
+    transition: float = 0.0  # m
+
+    def __post_init__(self) -> None:
+        check_positive(self, "crossover_eV")
+        check_not_negative(
+            self, "yield_0", "electron_scale", "ion_scale", "plume_collisions", "plume_power",
+            "transition",
+        )  # fmt: skip
+        if self.yield_0 >= 1.0:
+            raise ValueError(f"SheathWall.yield_0 must be below 1, got {self.yield_0!r}")
+
+    def emission(self, T_e_eV: FloatArray, ion_mass: float) -> FloatArray:
+        """Secondary electrons per primary, held at the space-charge limit."""
+        limit = 1.0 - 8.3 * np.sqrt(M_ELECTRON / ion_mass)
+        linear = self.yield_0 + (1.0 - self.yield_0) * 1.5 * T_e_eV / self.crossover_eV
+        return np.minimum(limit, linear)
+
+    def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """Frequency at which an ion reaches the wall, in 1/s; gap: channel width in m."""
+        bohm = np.sqrt(E_CHARGE * T_e_eV / ion_mass)
+        return self.ion_scale * SHEATH_DENSITY_RATIO * bohm / gap
+
+    def collision(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """Frequency at which an electron reaches the wall, in 1/s."""
+        bohm = np.sqrt(E_CHARGE * T_e_eV / ion_mass)
+        arriving = self.electron_scale * SHEATH_DENSITY_RATIO * bohm / gap
+        return arriving / (1.0 - self.emission(T_e_eV, ion_mass))
+
+    def power(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """Power lost to the wall per electron, in eV/s."""
+        kept = 1.0 - self.emission(T_e_eV, ion_mass)
+        sheath = T_e_eV * np.log(kept * np.sqrt(ion_mass / (2.0 * np.pi * M_ELECTRON)))
+        return self.collision(T_e_eV, gap, ion_mass) * (2.0 * T_e_eV + kept * sheath)
+
+    def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Share of the ion loss at a distance from the exit in m, negative inside."""
+        return share(distance, 1.0, 0.0, self.transition)
+
+    def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Share of the electrons' collisions at a distance from the exit."""
+        return share(distance, 1.0, self.plume_collisions, self.transition)
+
+    def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Share of the power at a distance from the exit."""
+        return share(distance, 1.0, self.plume_power, self.transition)
+
+
+def wall_material(
+    name: str,
+    *,
+    electron_scale: float = 0.9,
+    ion_scale: float = 0.5,
+    plume_collisions: float = 1.0,
+    plume_power: float = 1.0,
+    transition: float = 0.0,
+) -> SheathWall:
+    """A wall of a named material: BN-SiO2, BN, alumina, SiC or SiO2; the rest as `SheathWall`."""
+    if name not in MATERIALS:
+        raise ValueError(
+            f"there are walls of {list(MATERIALS)}: {name!r} came; another material is "
+            "ep2sindy.SheathWall(yield_0=..., crossover_eV=...)"
+        )
+    yield_0, crossover_eV = MATERIALS[name]
+    return SheathWall(
+        yield_0, crossover_eV, electron_scale, ion_scale, plume_collisions, plume_power, transition
+    )
+
+
+@dataclass(frozen=True)
+class ExponentialWall:
+    """Wall loss 1e7 alpha eps exp(-20/eps) with eps = 1.5 T_e, as LANDMARK defines it.
+
+    power_weights: alpha in the channel and in the plume. Electrons collide with the channel
+    wall at 1e7 1/s; ions never do. transition: as for `SheathWall`.
+    Source: LANDMARK, test case 3.
+    """
+
+    power_weights: Sequence[float]
+    frequency: float = 1e7  # 1/s
+    sheath_V: float = 20.0
+    transition: float = 0.0  # m
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "power_weights", tuple(map(float, self.power_weights)))
+        check_not_negative(self, "frequency", "sheath_V", "transition")
+        if len(self.power_weights) != 2 or min(self.power_weights) < 0.0:
+            raise ValueError(
+                "ExponentialWall.power_weights must be two numbers, in the channel and in the "
+                f"plume, zero or more: {self.power_weights} came"
+            )
+
+    def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """No ion reaches the wall."""
+        return np.zeros_like(T_e_eV)
+
+    def collision(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """Constant frequency, in 1/s."""
+        return np.full_like(T_e_eV, self.frequency)
+
+    def power(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
+        """Power lost to the wall per electron, in eV/s."""
+        energy = 1.5 * T_e_eV
+        return self.frequency * energy * np.exp(-self.sheath_V / energy)
+
+    def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Share of an ion loss that is zero."""
+        return share(distance, 1.0, 0.0, self.transition)
+
+    def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Electrons collide in the channel alone."""
+        return share(distance, 1.0, 0.0, self.transition)
+
+    def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """alpha at a distance from the exit in m, negative inside."""
+        return share(distance, self.power_weights[0], self.power_weights[1], self.transition)
+
+
+Wall = SheathWall | ExponentialWall
