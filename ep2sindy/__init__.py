@@ -123,6 +123,13 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.thruster.anode import AnodeSheath as AnodeSheath
     from ep2sindy.thruster.anode import FixedAnode as FixedAnode
     from ep2sindy.thruster.cache import simulate_cached as simulate_cached
+    from ep2sindy.thruster.hallthruster_input import HallThrusterInput as HallThrusterInput
+    from ep2sindy.thruster.hallthruster_input import (
+        read_hallthruster_input as read_hallthruster_input,
+    )
+    from ep2sindy.thruster.hallthruster_run import (
+        simulate_hallthruster_input as simulate_hallthruster_input,
+    )
     from ep2sindy.thruster.ionization import ionization_rate as ionization_rate
     from ep2sindy.thruster.landmark import LANDMARK_POINT as LANDMARK_POINT
     from ep2sindy.thruster.landmark import landmark_thruster as landmark_thruster
@@ -208,6 +215,8 @@ _FACE = {
     "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz",
     "thruster.anode": "AnodeSheath FixedAnode",
     "thruster.cache": "simulate_cached",
+    "thruster.hallthruster_input": "HallThrusterInput read_hallthruster_input",
+    "thruster.hallthruster_run": "simulate_hallthruster_input",
     "thruster.ionization": "ionization_rate",
     "thruster.landmark": "LANDMARK_POINT landmark_thruster",
     "thruster.magnetic_field": "MagneticField MagneticFieldTable read_magnetic_field",

@@ -1,0 +1,260 @@
+"""The JSON input of HallThruster.jl: what it means here, and what is refused by name."""
+
+import json
+from copy import deepcopy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.thruster.constants import K_BOLTZMANN
+
+Z = np.linspace(0.0, 0.08, 41)
+FIELD = "\n".join(f"{z}, {0.02 * np.exp(-(((z - 0.025) / 0.012) ** 2))}" for z in Z)
+# test/regression/spt100_tutorial.json of HallThruster.jl v0.22
+TUTORIAL = {
+    "config": {
+        "thruster": {
+            "name": "SPT-100",
+            "geometry": {"inner_radius": 0.035, "outer_radius": 0.05, "channel_length": 0.025},
+            "magnetic_field": {"file": "bfield.csv"},
+        },
+        "domain": [0.0, 0.08],
+        "propellants": [{"gas": "Xenon", "max_charge": 1, "flow_rate_kg_s": 5e-6}],
+        "discharge_voltage": 300,
+    },
+    "simulation": {
+        "dt": 5e-9, "adaptive": True, "duration": 2e-3, "num_save": 1001,
+        "grid": {"type": "EvenGrid", "num_cells": 100},
+    },
+}  # fmt: skip
+# the keys of v0.18, whose config holds the propellant itself
+OLD = {
+    "propellant": "Krypton", "anode_mass_flow_rate": 4e-6, "neutral_velocity": 278.0, "ncharge": 2,
+    "ion_temperature_K": 800.0,
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "bfield.csv").write_text(FIELD + "\n")
+    return tmp_path
+
+
+def read(folder: Path, content: object):
+    path = folder / "input.json"
+    path.write_text(json.dumps(content))
+    return ep.read_hallthruster_input(path)
+
+
+def changed(**config: object) -> dict:
+    content = deepcopy(TUTORIAL)
+    content["config"] |= config
+    return content
+
+
+def test_the_tutorial_has_the_defaults_that_its_stored_run_names(folder: Path) -> None:
+    """As resolved in test/regression/output/ref_spt100_tutorial.json, v0.22."""
+    made = read(folder, TUTORIAL)
+    thruster = made.thruster
+    assert (thruster.channel_length, thruster.domain_length) == (0.025, 0.08)
+    assert (thruster.inner_radius, thruster.outer_radius) == (0.035, 0.05)
+    assert thruster.area == pytest.approx(0.0040055306333269865)
+    assert thruster.transport == ep.AnomalousTransport(1 / 160, 1 / 16, 0.1 * 0.025)
+    assert thruster.wall == ep.wall_material(
+        "BN-SiO2", electron_scale=1.0, ion_scale=0.0, plume_collisions=0.0, transition=0.1 * 0.025
+    )
+    assert thruster.propellant == ep.propellant("xenon")
+    assert thruster.propellant.mass == pytest.approx(2.1801715574645584e-25)
+    assert thruster.anode == ep.AnodeSheath(2.0, potential_weight=2.0)
+    assert (thruster.cathode_T_e_eV, thruster.cathode_potential) == (2.0, 0.0)
+    assert (thruster.ion_temperature, thruster.series_resistance) == (1000.0, 0.0)
+    assert thruster.conduction_factor == pytest.approx(3.6)  # 2.4 on the gradient of 1.5 T
+    assert thruster.conduction_coulomb == pytest.approx(2.0**-0.5)
+    assert made.operating_point == ep.OperatingPoint(300.0, 5.0, 150.0)
+    run = made.run
+    assert (run.n_cells, run.duration_s, run.n_samples) == (100, 2e-3, 1001)
+    assert run.sample_s == pytest.approx(2e-6)
+    assert (run.reconstruct, run.coldest_T_e_eV) == (True, 1.5)
+
+
+def test_the_field_is_read_from_beside_the_file_in_m_and_T(folder: Path) -> None:
+    field = read(folder, changed(magnetic_field_scale=2.0)).thruster.magnetic_field
+    np.testing.assert_allclose(
+        field.at(Z - 0.025), 0.04 * np.exp(-(((Z - 0.025) / 0.012) ** 2)), rtol=1e-12
+    )
+
+
+def test_a_field_within_the_file_needs_no_other(tmp_path: Path) -> None:
+    content = deepcopy(TUTORIAL)
+    content["config"]["thruster"]["magnetic_field"] = {
+        "file": "", "z": Z.tolist(), "B": [0.01] * Z.size,
+    }  # fmt: skip
+    field = read(tmp_path, content).thruster.magnetic_field
+    np.testing.assert_allclose(field.at(np.zeros(1)), 0.01)
+
+
+def test_an_output_holds_its_input(folder: Path) -> None:
+    assert read(folder, {"input": TUTORIAL, "output": {}}) == read(folder, TUTORIAL)
+
+
+def test_the_keys_of_older_versions(folder: Path) -> None:
+    content = changed(**OLD)
+    del content["config"]["propellants"]
+    made = read(folder, content)
+    assert made.thruster.propellant.name == "krypton"
+    assert made.thruster.charge_states == 2
+    assert made.thruster.ion_temperature == 800.0
+    assert made.operating_point == ep.OperatingPoint(300.0, 4.0, 278.0)
+
+
+def test_a_temperature_alone_gives_the_neutrals_a_quarter_of_their_thermal_speed(
+    folder: Path,
+) -> None:
+    flow = {"gas": "Xe", "flow_rate_kg_s": 5e-6, "temperature_K": 500.0, "allowed_charges": [1]}
+    made = read(folder, changed(propellants=[flow]))
+    speed = np.sqrt(8.0 * K_BOLTZMANN * 500.0 / (np.pi * made.thruster.propellant.mass))
+    assert made.operating_point.neutral_speed == pytest.approx(0.25 * speed)
+
+
+TWO_ZONES = ep.AnomalousTransport(0.01, 0.05, 0.1 * 0.025)
+MODELS = [
+    ({"type": "Bohm", "c": 0.02}, ep.AnomalousTransport(0.02, 0.02, 0.0)),
+    ({"type": "TwoZoneBohm", "c1": 0.01, "c2": 0.05}, TWO_ZONES),
+    ({"type": "TwoZoneBohm", "coeffs": [0.01, 0.05]}, TWO_ZONES),
+    (
+        {"type": "GaussianBohm", "hall_min": 0.1, "hall_max": 0.07, "center": 0.025, "width": 5e-3},
+        ep.GaussianTransport(c_far=0.07, trough=0.1, center=0.0, width=5e-3),
+    ),
+    (
+        {"type": "MultiLogBohm", "zs": [0.0, 0.025, 0.05], "cs": [0.1, 0.01, 0.1]},
+        ep.MultiLogTransport([-0.025, 0.0, 0.025], [0.1, 0.01, 0.1]),
+    ),
+]
+
+
+@pytest.mark.parametrize(("node", "expected"), MODELS, ids=lambda v: type(v).__name__)
+def test_transport_is_counted_from_the_exit(folder: Path, node: dict, expected: object) -> None:
+    assert read(folder, changed(anom_model=node)).thruster.transport == expected
+
+
+def test_walls_conduction_and_anode_follow_the_file(folder: Path) -> None:
+    made = read(
+        folder,
+        changed(
+            wall_loss_model={"type": "WallSheath", "material": "Alumina", "loss_scale": 0.5},
+            ion_wall_losses=True,
+            electron_plume_loss_scale=0.2,
+            transition_length=4e-3,
+            conductivity_model={"type": "Braginskii"},
+            anode_boundary_condition="dirichlet",
+            anode_Tev=3.0,
+            electron_ion_collisions=False,
+        ),
+    ).thruster
+    assert made.wall == ep.wall_material(
+        "alumina", electron_scale=0.5, ion_scale=0.5, plume_collisions=0.0, plume_power=0.2,
+        transition=4e-3,
+    )  # fmt: skip
+    assert (made.conduction_factor, made.conduction_coulomb) == (pytest.approx(6.99), 0.0)
+    assert made.anode == ep.FixedAnode(3.0)
+    assert np.all(made.propellant.coulomb(np.ones(3)) == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"solve_plume": True}, r"config\.solve_plume is not supported here but at False: True"),
+        ({"background_pressure_Torr": 1e-5}, r"config\.background_pressure_Torr is not supported"),
+        ({"LANDMARK": True}, r"config\.LANDMARK is not supported here but at False"),
+        ({"domian": [0, 1]}, r"config has keys that are not supported: \['domian'\]"),
+        ({"domain": [0.01, 0.08]}, r"config\.domain must begin at the anode"),
+        ({"discharge_voltage": "300 V"}, r"config\.discharge_voltage must be a number: '300 V'"),
+        ({"propellants": [{}, {}]}, r"a mixture of 2 is not supported"),
+        ({"propellants": [{"gas": "Bismuth"}]}, r"propellants\[0\]\.gas must be one of .*Bismuth"),
+        (
+            {"propellants": [{"flow_rate_kg_s": 5e-6, "max_charge": 3}]},
+            r"must ask for one or two charges: \[1, 2, 3\] is not supported",
+        ),
+        (
+            {"propellants": [{"flow_rate_kg_s": 5e-6, "velocity_m_s": {"xs": [], "ys": []}}]},
+            r"velocity_m_s must be a number: profiles are not supported",
+        ),
+        (
+            {"propellants": [{"flow_rate_kg_s": 5e-6, "excited_levels": [1]}]},
+            r"config\.propellants\[0\] has keys that are not supported: \['excited_levels'\]",
+        ),
+        ({"anom_model": {"type": "LogisticPressureShift"}}, r"anom_model\.type must be TwoZone"),
+        ({"wall_loss_model": {"type": "Glue"}}, r"wall_loss_model\.type must be WallSheath"),
+        (
+            {"wall_loss_model": {"type": "WallSheath", "material": "Gold"}},
+            r"wall_loss_model\.material must be one of .* 'Gold' came",
+        ),
+        ({"conductivity_model": {"type": "Spitzer"}}, r"conductivity_model\.type must be one of"),
+        ({"anode_boundary_condition": "neumann"}, r"anode_boundary_condition must be sheath or"),
+        ({"filter_circuit": {"type": "RLC"}}, r"config\.filter_circuit is not supported"),
+        ({"thruster": {"geometry": {}}}, r"config\.thruster\.geometry must have the key 'channel_"),
+    ],
+)
+def test_what_is_not_here_is_refused_by_name(folder: Path, config: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read(folder, changed(**config))
+
+
+def test_a_shielded_wall_is_refused(folder: Path) -> None:
+    content = deepcopy(TUTORIAL)
+    content["config"]["thruster"]["shielded"] = True
+    with pytest.raises(ValueError, match=r"config\.thruster\.shielded is not supported here but"):
+        read(folder, content)
+
+
+def test_a_missing_field_says_where_it_was_looked_for(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"magnetic_field\.file must be there: 'bfield\.csv' is"):
+        read(tmp_path, TUTORIAL)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("{", r"must be JSON"), ("[]", r"must have the key 'config'"), ("{}", r"it has \[\]")],
+)
+def test_a_file_that_is_no_input_is_refused(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "input.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        ep.read_hallthruster_input(path)
+    with pytest.raises(ValueError, match=r"no such input of HallThruster\.jl"):
+        ep.read_hallthruster_input(tmp_path / "none.json")
+
+
+def test_a_file_is_simulated_as_it_says(folder: Path) -> None:
+    content = changed(
+        anode_boundary_condition="dirichlet", conductivity_model={"type": "Braginskii"}
+    )
+    read(folder, content)
+    field = ep.simulate_hallthruster_input(
+        folder / "input.json", cache=folder, duration_s=4e-5, n_cells=20, progress=False
+    )
+    assert dict(field.sizes) == {"time": 21, "z": 20}  # 2 us, as the file's frames
+    assert json.loads(field.attrs["parameters"])["thruster"]["propellant"]["name"] == "xenon"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"config": {"reconstruct": False}}, r"config\.reconstruct is not supported here but at"),
+        (
+            {"simulation": {"grid": {"type": "UnevenGrid", "num_cells": 90}}},
+            r"n_cells=90 takes one",
+        ),
+    ],
+)
+def test_numerics_that_are_not_here_are_refused_before_a_run(
+    folder: Path, change: dict, message: str
+) -> None:
+    content = deepcopy(TUTORIAL)
+    for key, values in change.items():
+        content[key] |= values
+    read(folder, content)
+    with pytest.raises(ValueError, match=message):
+        ep.simulate_hallthruster_input(folder / "input.json", cache=folder, progress=False)
