@@ -52,22 +52,46 @@ def check_arguments(node: Any, place: str) -> None:
         if wanted and value is not None and not any(is_plain(value, kind) for kind in wanted):
             words = " or ".join(PLAIN[kind] for kind in wanted)
             raise ValueError(f"{place}.{name} must be {words}: {value!r} came")
+        if isinstance(value, DictConfig) and "_target_" in value:
+            _check_names(value, f"{place}.{name}")
         check_arguments(value, f"{place}.{name}")
 
 
-def _plain_kinds(node: DictConfig, place: str) -> dict[str, tuple[type, ...]]:
-    """Arguments of a target that can only be plain values, or None: by name, their kinds."""
+def _target(node: DictConfig, place: str) -> Any:
+    """What a node names; raises ValueError if there is no such thing."""
     try:
         module, _, name = node["_target_"].rpartition(".")
-        target: Any = getattr(import_module(module), name)
-        hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
-    except NameError:  # an annotation that is not there while the program runs
-        return {}
+        return getattr(import_module(module), name)
     except Exception as error:
         raise ValueError(
             f"{place} must name a _target_ that there is, such as ep2sindy.EBIC: "
             f"{node['_target_']!r} came"
         ) from error
+
+
+def _check_names(node: DictConfig, place: str) -> None:
+    """Raise ValueError, with its place, for an argument that a nested target does not take."""
+    target = _target(node, place)
+    try:
+        takes = inspect.signature(target)
+    except ValueError:  # compiled, it does not say what it takes
+        return
+    names = [name for name in map(str, node) if not name.startswith("_")]
+    try:
+        takes.bind_partial(**dict.fromkeys(names))
+    except TypeError as error:
+        raise ValueError(
+            f"{place}, {target.__name__}: {error}; it takes {list(takes.parameters)}"
+        ) from error
+
+
+def _plain_kinds(node: DictConfig, place: str) -> dict[str, tuple[type, ...]]:
+    """Arguments of a target that can only be plain values, or None: by name, their kinds."""
+    target = _target(node, place)
+    try:
+        hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
+    except Exception:  # an annotation that is not there while the program runs; no annotations
+        return {}
     found = {name: _alternatives(hint) for name, hint in hints.items()}
     return {name: kinds for name, kinds in found.items() if set(kinds) <= set(PLAIN)}
 

@@ -42,7 +42,10 @@ def study_of(study: type, config: DictConfig) -> Any:
     known = {*COMMON, *GROUPS, *keys_of(study)}
     unknown = set(map(str, config)) - known
     if unknown:
-        raise ValueError(f"unknown keys {sorted(unknown)}; there are {sorted(known)}")
+        hint = ""
+        if "thruster" in unknown:  # a file of ./conf/thruster without its first line
+            hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
+        raise ValueError(f"unknown keys {sorted(unknown)}; there are {sorted(known)}{hint}")
     return _filled(study, config)
 
 

@@ -1,0 +1,144 @@
+"""A thruster from a file: the group of configs, and what is said of one that cannot be."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+import ep2sindy as ep
+from ep2sindy.app.build import call_of
+from tests.programs import ROOT, composed
+
+THRUSTERS = sorted(path.stem for path in (ROOT / "conf" / "thruster").glob("*.yaml"))
+
+
+def built(*overrides: str) -> ep.Thruster:
+    node = composed("+exp=breathing", *overrides).data.thruster
+    return call_of(node, "data.thruster")()
+
+
+@pytest.mark.parametrize("name", THRUSTERS)
+def test_every_thruster_of_the_group_is_built(name: str) -> None:
+    assert isinstance(built(f"thruster={name}"), ep.Thruster)
+
+
+def test_the_default_is_the_default_of_the_class() -> None:
+    assert built() == ep.Thruster()
+
+
+def test_two_cycles_is_the_set_of_the_docs() -> None:
+    made = built("thruster=two_cycles")
+    assert made.transport == ep.AnomalousTransport(1 / 300, 1 / 80, 3e-3)
+    assert made.series_resistance == 1.0
+
+
+def test_the_spt_100_has_its_published_field() -> None:
+    made = built("thruster=spt100")
+    assert max(made.magnetic_field.B) == pytest.approx(20.82e-3)  # at the exit
+    assert made.wall == ep.wall_material("BN-SiO2", electron_scale=1.0)
+
+
+def test_a_value_is_set_from_the_command_line() -> None:
+    made = built("thruster=example", "data.thruster.propellant.name=argon")
+    assert made.propellant == ep.propellant("argon")
+
+
+@pytest.mark.parametrize("experiment", ["parametric", "pointwise", "breathing"])
+def test_experiments_take_a_thruster(experiment: str) -> None:
+    config = composed(f"+exp={experiment}", "thruster=spt100")
+    assert config.data.thruster.domain_length == 0.08
+    assert "thruster" not in config
+
+
+def test_data_from_a_file_have_no_thruster() -> None:
+    assert "thruster" not in composed("+exp=discover", "data=file").data
+
+
+def test_an_input_of_hallthruster_is_a_data_group(tmp_path: Path) -> None:
+    config = composed("+exp=breathing", "data=hallthruster_input", f"data.path={tmp_path}/no.json")
+    with pytest.raises(ValueError, match=r"no such input of HallThruster\.jl: .*no\.json"):
+        call_of(config.data, "data")()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("+data.thruster.chanel_length=0.02", r"data\.thruster, Thruster: .*'chanel_length'; it t"),
+        ("+data.thruster.wall.colour=1", r"data\.thruster\.wall, wall_material: .*'colour'; it ta"),
+        ("data.thruster.wall.name=glass", r"there are walls of .* 'glass' came"),
+        ("data.thruster.propellant.name=iodine", r"there are the propellants .* 'iodine' came"),
+        ("data.thruster.channel_length=long", r"data\.thruster\.channel_length must be a number"),
+        ("data.thruster.anode._target_=ep2sindy.Anode", r"data\.thruster\.anode must name a _targ"),
+    ],
+)
+def test_a_mistake_is_named_with_its_place(override: str, message: str) -> None:
+    node = composed("+exp=breathing", "thruster=example", override).data
+    with pytest.raises(ValueError, match=message):
+        call_of(node, "data")()
+
+
+OWN = """\
+# @package data.thruster
+_target_: ep2sindy.Thruster
+channel_length: 0.02
+magnetic_field:
+  _target_: ep2sindy.read_magnetic_field
+  path: B.csv
+  exit_m: 0.02
+propellant:
+  _target_: ep2sindy.read_propellant
+  path: rates.csv
+  mass_u: 126.9
+  ionization_eV: 10.45
+  excitation_eV: 6.8
+"""
+
+
+def test_a_thruster_of_ones_own_is_found_where_one_stands(tmp_path: Path) -> None:
+    """With the field and the rates from files beside it, and no line of Python."""
+    (tmp_path / "conf" / "thruster").mkdir(parents=True)
+    (tmp_path / "conf" / "thruster" / "mine.yaml").write_text(OWN)
+    (tmp_path / "B.csv").write_text("z_mm,B_mT\n0,1\n10,9\n20,18\n30,12\n50,2\n")
+    (tmp_path / "rates.csv").write_text(
+        "T_e_eV,ionization,excitation,momentum\n0.5,0,0,1e-13\n100,2e-13,9e-14,7e-13\n"
+    )
+    done = run("+exp=breathing", "thruster=mine", "--cfg", "job", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "mass_u: 126.9" in done.stdout
+    node = OmegaConf.create(done.stdout).data.thruster
+    here = Path.cwd()
+    os.chdir(tmp_path)
+    try:
+        made = call_of(node, "data.thruster")()
+    finally:
+        os.chdir(here)
+    assert (made.propellant.name, made.channel_length) == ("rates", 0.02)
+
+
+def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.run", *arguments],
+        cwd=cwd, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def test_a_file_without_its_first_line_says_so(tmp_path: Path) -> None:
+    from ep2sindy.app.runner import study_class
+    from ep2sindy.app.schema import study_of
+
+    (tmp_path / "thruster").mkdir()
+    (tmp_path / "thruster" / "mine.yaml").write_text("_target_: ep2sindy.Thruster\n")
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = compose(
+            "config",
+            overrides=[
+                "+exp=breathing", "thruster=mine", f"hydra.searchpath=[file://{tmp_path}]",
+            ],
+        )  # fmt: skip
+    with pytest.raises(ValueError, match=r"begins with the line '# @package data\.thruster'"):
+        study_of(study_class(config.study), config)
