@@ -29,7 +29,8 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.search
 	$(BIN)/python -m benchmarks.simulator
-	$(BIN)/python -m benchmarks.operating_points
+	$(BIN)/python -m benchmarks.simulator_2d
+	$(BIN)/python -m benchmarks.source
 	$(BIN)/python -m benchmarks.refine
 	$(BIN)/python -m benchmarks.intervals
 	$(BIN)/python -m benchmarks.pointwise

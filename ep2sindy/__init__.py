@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.data.prepare import derive as derive
     from ep2sindy.data.prepare import keep_where as keep_where
     from ep2sindy.data.prepare import low_pass as low_pass
+    from ep2sindy.data.prepare import radial_from_middle as radial_from_middle
     from ep2sindy.data.trajectory import Trajectory as Trajectory
     from ep2sindy.data.zones import GridPoint as GridPoint
     from ep2sindy.data.zones import Zone as Zone
@@ -122,6 +123,12 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.synthetic.systems import van_der_pol as van_der_pol
     from ep2sindy.thruster.anode import AnodeSheath as AnodeSheath
     from ep2sindy.thruster.anode import FixedAnode as FixedAnode
+    from ep2sindy.thruster.axial.balance import zone_balance as zone_balance
+    from ep2sindy.thruster.axial.simulate import simulate as simulate
+    from ep2sindy.thruster.axial.starts import ColdStart as ColdStart
+    from ep2sindy.thruster.axial.starts import GuessedStart as GuessedStart
+    from ep2sindy.thruster.axial.starts import Restart as Restart
+    from ep2sindy.thruster.axial.starts import SoftStart as SoftStart
     from ep2sindy.thruster.cache import simulate_cached as simulate_cached
     from ep2sindy.thruster.hallthruster_input import HallThrusterInput as HallThrusterInput
     from ep2sindy.thruster.hallthruster_input import (
@@ -139,12 +146,15 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.thruster.parameters import OPERATING_POINTS as OPERATING_POINTS
     from ep2sindy.thruster.parameters import OperatingPoint as OperatingPoint
     from ep2sindy.thruster.parameters import Thruster as Thruster
+    from ep2sindy.thruster.plane.cache import simulate_2d_cached as simulate_2d_cached
+    from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D as OPERATING_POINT_2D
+    from ep2sindy.thruster.plane.simulate import THRUSTER_2D as THRUSTER_2D
+    from ep2sindy.thruster.plane.simulate import simulate_2d as simulate_2d
     from ep2sindy.thruster.propellant_files import propellant as propellant
     from ep2sindy.thruster.propellant_files import read_propellant as read_propellant
     from ep2sindy.thruster.propellants import PropellantTable as PropellantTable
     from ep2sindy.thruster.propellants import TabulatedRates as TabulatedRates
     from ep2sindy.thruster.propellants import XenonFits as XenonFits
-    from ep2sindy.thruster.simulate import simulate as simulate
     from ep2sindy.thruster.transport import AnomalousTransport as AnomalousTransport
     from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport
     from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport
@@ -159,7 +169,7 @@ _FACE = {
     "constraints.fit": "constrained_fit",
     "constraints.relations": "Relation Constraint constraint relations_from_matrix",
     "data.open": "Variable open_field write_field read_field",
-    "data.prepare": "crop decimate low_pass derive keep_where",
+    "data.prepare": "crop decimate low_pass derive radial_from_middle keep_where",
     "data.trajectory": "Trajectory",
     "data.zones": "Zone ZoneAverage GridPoint zone_average point",
     "discovery.blocks": "Kept",
@@ -214,6 +224,9 @@ _FACE = {
     "synthetic.regions": "three_regions",
     "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz",
     "thruster.anode": "AnodeSheath FixedAnode",
+    "thruster.axial.balance": "zone_balance",
+    "thruster.axial.simulate": "simulate",
+    "thruster.axial.starts": "ColdStart GuessedStart Restart SoftStart",
     "thruster.cache": "simulate_cached",
     "thruster.hallthruster_input": "HallThrusterInput read_hallthruster_input",
     "thruster.hallthruster_run": "simulate_hallthruster_input",
@@ -221,9 +234,10 @@ _FACE = {
     "thruster.landmark": "LANDMARK_POINT landmark_thruster",
     "thruster.magnetic_field": "MagneticField MagneticFieldTable read_magnetic_field",
     "thruster.parameters": "OPERATING_POINTS OperatingPoint Thruster",
+    "thruster.plane.cache": "simulate_2d_cached",
+    "thruster.plane.simulate": "simulate_2d THRUSTER_2D OPERATING_POINT_2D",
     "thruster.propellant_files": "propellant read_propellant",
     "thruster.propellants": "PropellantTable TabulatedRates XenonFits",
-    "thruster.simulate": "simulate",
     "thruster.transport": "AnomalousTransport GaussianTransport MultiLogTransport",
     "thruster.walls": "ExponentialWall SheathWall wall_material",
 }

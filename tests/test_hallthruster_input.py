@@ -65,7 +65,7 @@ def test_the_tutorial_has_the_defaults_that_its_stored_run_names(folder: Path) -
     assert thruster.wall == ep.wall_material(
         "BN-SiO2", electron_scale=1.0, ion_scale=0.0, plume_collisions=0.0, transition=0.1 * 0.025
     )
-    assert thruster.propellant == ep.propellant("xenon")
+    assert thruster.propellant == ep.propellant("xenon_5eV")
     assert thruster.propellant.mass == pytest.approx(2.1801715574645584e-25)
     assert thruster.anode == ep.AnodeSheath(2.0, potential_weight=2.0)
     assert (thruster.cathode_T_e_eV, thruster.cathode_potential) == (2.0, 0.0)
@@ -236,13 +236,12 @@ def test_a_file_is_simulated_as_it_says(folder: Path) -> None:
         folder / "input.json", cache=folder, duration_s=4e-5, n_cells=20, progress=False
     )
     assert dict(field.sizes) == {"time": 21, "z": 20}  # 2 us, as the file's frames
-    assert json.loads(field.attrs["parameters"])["thruster"]["propellant"]["name"] == "xenon"
+    assert json.loads(field.attrs["parameters"])["thruster"]["propellant"]["name"] == "xenon_5eV"
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"config": {"reconstruct": False}}, r"config\.reconstruct is not supported here but at"),
         (
             {"simulation": {"grid": {"type": "UnevenGrid", "num_cells": 90}}},
             r"n_cells=90 takes one",

@@ -120,6 +120,19 @@ def test_masked_cells_are_blank_and_absent_terms_are_not(coefficients: Figure) -
     assert (absent.compressed() == 0.0).all()
 
 
+def test_coefficients_fade_to_grey_with_r2(coefficients: Figure) -> None:
+    """R2 is 0.8 for n_i' and -3 for n_n' in all fitted cells: the latter shows nothing but grey."""
+    for (ax, values), r2 in zip(maps(coefficients), [0.8] * 3 + [0.0] * 3, strict=True):
+        (mesh,) = ax.collections
+        alpha = np.asarray(mesh.get_alpha())
+        masked = np.ma.getmaskarray(values)
+        assert np.all(alpha[masked] == 1.0)  # white, over the grey
+        assert alpha[~masked] == pytest.approx(r2)
+        assert to_rgba(ax.get_facecolor()) == to_rgba(ABSENT)
+        assert np.allclose(mesh.cmap(np.nan), to_rgba("white"))
+    assert "the same at $R^2$ = 0.5" in legend(coefficients)
+
+
 def test_maps_have_the_proportions_of_the_thruster(coefficients: Figure, quality: Figure) -> None:
     for figure in (coefficients, quality):
         for ax, _ in maps(figure):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.data.prepare import crop, decimate, derive, keep_where, low_pass
+from ep2sindy.data.prepare import crop, decimate, derive, keep_where, low_pass, radial_from_middle
 from ep2sindy.thruster import propellants
 from ep2sindy.thruster.ionization import ionization_rate, read_rate_table
 
@@ -218,3 +218,36 @@ def test_the_rate_is_never_overwritten_nor_guessed() -> None:
         ionization_rate(ionization_rate(warm()))
     with pytest.raises(ValueError, match=r"R_ion needs T_e_eV; this field has \['I_d'\]"):
         ionization_rate(ramp())
+
+
+def radial(r: list[float]) -> xr.Dataset:
+    """u_ir = 1, 2, .. m/s over r, at two times."""
+    values = np.ones((2, 1)) * np.arange(1.0, 1.0 + len(r))
+    return xr.Dataset(
+        {"u_ir": (("time", "r"), values, {"units": "m/s"})},
+        coords={"time": [0.0, 1.0], "r": r},
+    )
+
+
+@pytest.mark.parametrize(
+    ("r", "middle_m", "expected"),
+    [
+        ([0.03, 0.04, 0.05, 0.06], None, [-1.0, -2.0, 3.0, 4.0]),
+        ([0.03, 0.04, 0.05], None, [-1.0, 2.0, 3.0]),  # a row in the middle stays as it is
+        ([0.03, 0.04, 0.05, 0.06], 0.035, [-1.0, 2.0, 3.0, 4.0]),
+    ],
+)
+def test_radial_velocity_counts_from_mid_radius(
+    r: list[float], middle_m: float | None, expected: list[float]
+) -> None:
+    before = radial(r)
+    found = radial_from_middle(before, middle_m=middle_m)["u_ir"]
+    assert found.dims == ("time", "r")
+    assert found.values.tolist() == [expected] * 2
+    assert found.attrs["units"] == "m/s"
+    assert before["u_ir"].values[0, 0] == 1.0
+
+
+def test_mid_radius_without_a_radial_velocity_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"needs u_ir on r: .* \['I_d'\] on \['time'\]"):
+        radial_from_middle(ramp())

@@ -19,7 +19,7 @@ def kept(folder):
 
 def test_second_call_reads_identical_values(tmp_path, monkeypatch):
     first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    monkeypatch.setattr(cache, "simulate", lambda *_, **__: pytest.fail("simulated twice"))
+    monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated twice"))
     second = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     xr.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
     assert all(first[name].dtype == second[name].dtype for name in first.variables)
@@ -73,6 +73,6 @@ def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
 
 def test_a_cache_that_cannot_be_written_costs_no_simulation(tmp_path, monkeypatch):
     (tmp_path / "taken").write_text("a file")
-    monkeypatch.setattr(cache, "simulate", lambda *_, **__: pytest.fail("simulated in vain"))
+    monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
     with pytest.raises(OSError, match="a folder they can be kept in.*choose another cache"):
         simulate_cached(Thruster(), POINT, cache=tmp_path / "taken", **BRIEF)

@@ -22,7 +22,7 @@ from beartype import beartype
 from jaxtyping import AbstractArray, jaxtyped
 
 # Compiled by numba, which cannot look inside a checking wrapper.
-COMPILED = ("kernels", "gram_fits")
+COMPILED = ("kernels", "gram_fits")  # endings of names
 MARK = "checked1"  # in names of kept bytecode: count on when `marked` changes
 SCOPE = jaxtyped("context")  # of axis names; it holds nothing, so that one is enough
 
@@ -39,7 +39,7 @@ class Finder(MetaPathFinder):
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         names = fullname.split(".")
-        if len(names) < 2 or names[0] != "ep2sindy" or names[-1] in COMPILED:
+        if len(names) < 2 or names[0] != "ep2sindy" or names[-1].endswith(COMPILED):
             return None
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is None or spec.origin is None or Path(spec.origin).name == "__init__.py":

@@ -27,13 +27,20 @@ def simulation() -> None:
     ep.refine(system.model, [system.trajectory()], window=20, n_windows=2, rng=0)
 
 
+def plane() -> None:
+    """Kernels of the (z, r) simulator."""
+    settings = {"duration_s": 2e-5, "warm_up_s": 0.0, "sample_s": 1e-6, "n_z": 12, "n_r": 12}
+    ep.simulate_2d(progress=False, **settings)
+
+
 def compile_kernels() -> None:
     """Where a source is newer than what was compiled of it; both at once: there are two cores."""
-    sources = [*PACKAGE.glob("*/kernels.py"), *PACKAGE.glob("*/gram_fits.py")]
-    if not any(is_stale(source) for source in sources):
+    sources = [*PACKAGE.rglob("*kernels.py"), *PACKAGE.glob("*/gram_fits.py")]
+    if not any(is_stale(source) for source in sources if "@compiled" in source.read_text()):
         return
     parts = [
-        subprocess.Popen([sys.executable, "-m", "tests.warm", n]) for n in ("search", "simulation")
+        subprocess.Popen([sys.executable, "-m", "tests.warm", name])
+        for name in ("search", "simulation", "plane")
     ]
     for part in parts:
         part.wait()  # one that fails fails again in its test, which then says why
@@ -45,4 +52,4 @@ def is_stale(source: Path) -> bool:
 
 
 if __name__ == "__main__":
-    {"search": search, "simulation": simulation}[sys.argv[1]]()
+    {"search": search, "simulation": simulation, "plane": plane}[sys.argv[1]]()

@@ -15,6 +15,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from ep2sindy.app.defaults import write_defaults
 from ep2sindy.studies.source import Step
 
 
@@ -173,6 +174,7 @@ class Configured:
         node = deepcopy(self.node)
         missing = object()
         for place, value in places.items():
+            write_defaults(node, place, partial(_target, place=self.place))
             if OmegaConf.select(node, place, default=missing) is missing:
                 raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
             OmegaConf.update(node, place, value)

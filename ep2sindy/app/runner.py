@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
+from ep2sindy.report.document import Section, Text
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.page import page_html
 from ep2sindy.report.run import Run
@@ -137,8 +138,11 @@ def write(run: Run, outcome: Outcome, hparams: Mapping[str, Any]) -> dict[str, f
         board.text(name, model.text())
     headline = dict(outcome.headline())
     board.settings(hparams, headline)
-    folder.write_text("report.html", page_html(run.title, sections, figures))
+    warned = [Section("Warnings", [Text(text, warning=True) for text in run.warnings])]
+    page = [*(warned if run.warnings else []), *sections]
+    folder.write_text("report.html", page_html(run.title, page, figures))
     named = {"experiment": run.title, "seed": run.seed}
+    named |= {"warnings": run.warnings} if run.warnings else {}
     folder.write_json("summary.json", named | outcome.summary())
     return headline
 

@@ -138,6 +138,27 @@ def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.D
     return derived
 
 
+def radial_from_middle(field: xr.Dataset, *, middle_m: float | None = None) -> xr.Dataset:
+    """Turn the sign of u_ir below mid radius: positive is then away from it on both sides.
+
+    Equations that are alike on both sides get coefficients of one sign, and maps of them become
+    symmetric. middle_m: mid radius; None is the middle of the grid.
+    Raises ValueError for a field without u_ir on r.
+    """
+    if "u_ir" not in field or "r" not in field["u_ir"].dims:
+        raise ValueError(
+            f"a velocity away from mid radius needs u_ir on r: this field has "
+            f"{list(field.data_vars)} on {list(field.dims)}; leave this step out"
+        )
+    r = grid_points(field, "r")
+    middle = 0.5 * (r[0] + r[-1]) if middle_m is None else middle_m
+    below = r < middle - 1e-6 * (r[-1] - r[0])  # a row in the middle keeps its sign
+    sign = xr.DataArray(np.where(below, -1, 1).astype(field["u_ir"].dtype), dims="r")
+    signed = (field["u_ir"] * sign).transpose(*field["u_ir"].dims)
+    name = "radial ion velocity, away from mid radius"
+    return field.assign(u_ir=signed.assign_attrs(field["u_ir"].attrs | {"long_name": name}))
+
+
 def keep_where(field: xr.Dataset, *, condition: str) -> xr.Dataset:
     """Mask the cells where `condition` does not hold, such as the inside of a wall.
 

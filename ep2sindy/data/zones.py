@@ -94,14 +94,17 @@ def zone_average(
     Weights are the sizes of the cells: length in z and, where the field has r, annulus area
     (length if not axisymmetric). One set of cells serves all variables of the call: those
     where none of them is masked. `products` such as "n_i*n_n*R_ion" add inputs named
-    `<n_i*n_n*R_ion>` with the average of the product, which is not the product of averages.
+    `<n_i*n_n*R_ion>` with the average of the product, which is not the product of averages. A
+    variable whose attribute `average_of` names the product is taken for it: a simulation's samples
+    are averages in time, and so is that.
     Sums run in float64 and slab by slab in time, whatever the storage.
     Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
     value that is not finite in a cell that is not masked.
     """
     check_field(field)
     columns = {name: [(name, 1)] for name in (*states, *inputs)}
-    columns |= {f"<{p.replace(' ', '')}>": split_factors(p) for p in products}
+    factors_of = {f"<{p.replace(' ', '')}>": split_factors(p) for p in products}
+    columns |= {column: _kept_average(field, factors) for column, factors in factors_of.items()}
     used = list(dict.fromkeys(name for factors in columns.values() for name, _ in factors))
     _check_names(field, used, [*states, *inputs, *products])
     slices = zone_slices(field, zone or Zone())
@@ -119,7 +122,7 @@ def zone_average(
         input_names=list(columns)[len(states) :],
         units={
             column: unit_product((field[name].attrs["units"], power) for name, power in factors)
-            for column, factors in columns.items()
+            for column, factors in (columns | _known(field, factors_of)).items()
         },
         label=label,
     )
@@ -188,6 +191,23 @@ def point(
             )
         nearest[axis] = [int(np.argmin(np.abs(points - place)))]
     return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
+
+
+Factors = list[tuple[str, int]]
+
+
+def _kept_average(field: xr.Dataset, factors: Factors) -> Factors:
+    """The variable that holds the time average of a product, where the field has one."""
+    for name, variable in field.data_vars.items():
+        kept = variable.attrs.get("average_of")
+        if kept is not None and sorted(split_factors(kept)) == sorted(factors):
+            return [(str(name), 1)]
+    return factors
+
+
+def _known(field: xr.Dataset, columns: Mapping[str, Factors]) -> dict[str, Factors]:
+    """Products whose factors the field has, all of them: these tell the unit by themselves."""
+    return {c: f for c, f in columns.items() if all(name in field for name, _ in f)}
 
 
 def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str]) -> None:

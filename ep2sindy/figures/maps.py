@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize
+from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -45,14 +46,14 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
 
     result: as `studies.pointwise` gives it. Red is a positive coefficient (a source), blue a
     negative one, darker the larger its magnitude; grey a term that is not in the equation; white
-    a point without equations. A column has one scale of whole decades; terms that no point
-    selected have no column. outline: the thruster whose channel is drawn.
-    Over one axis alone, magnitudes are points over it.
+    a point without equations. Colours fade to that grey as the equation's R2 falls to 0. A column
+    has one scale of whole decades; terms that no point selected have no column. outline: the
+    thruster whose channel is drawn. Over one axis alone, magnitudes are points over it.
     """
     terms = [t for t in result["term"].values if (np.abs(result["coef"].sel(term=t)) > 0).any()]
     if not terms:
         raise ValueError("coefficient maps need a term: no point of the study selected any")
-    coef = result["coef"].sel(term=terms)
+    coef, r2 = result["coef"].sel(term=terms), result[r2_name(result)]
     flat = len(space_axes(coef)) == 1
     shape = coef.sizes["equation"], len(terms)
     figure = map_figure(coef, shape, extra=1.1)
@@ -62,27 +63,37 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
         if flat:
             _signed_points(list(column), coef.sel(term=term))
         else:
-            _signed_maps(figure, list(column), coef.sel(term=term))
+            _signed_maps(figure, list(column), coef.sel(term=term), r2.clip(0.0, 1.0))
     for row, equation in zip(axes, coef["equation"].values, strict=True):
         name = f"${latex_derivative(str(equation))}$"
         row[0].annotate(
             name, (-0.42, 0.5), xycoords="axes fraction", fontsize=12, ha="right", va="center"
         )
     finish_panels(axes, coef, outline)
-    entries = {"source (+)": SOURCE, "sink (−)": SINK} | ({} if flat else {"not selected": ABSENT})
+    entries: dict[str, Any] = {"source (+)": SOURCE, "sink (−)": SINK}
+    if not flat:
+        half = 0.5 * (np.array(to_rgb(SOURCE)) + np.array(to_rgb(ABSENT)))
+        entries |= {"the same at $R^2$ = 0.5": half, "not selected": ABSENT}
     patches = [Patch(color=colour, label=label) for label, colour in entries.items()]
     legend_above(figure, patches, size=9.0)
     return figure
 
 
-def _signed_maps(figure: Figure, column: Sequence[Axes], coef: xr.DataArray) -> None:
+def r2_name(result: xr.Dataset) -> str:
+    """R2 of the held-out rows, or of the training rows where none were held out."""
+    return "r2_test" if np.isfinite(result["r2_test"]).any() else "r2_train"
+
+
+def _signed_maps(
+    figure: Figure, column: Sequence[Axes], coef: xr.DataArray, opacity: xr.DataArray
+) -> None:
     """One term in all equations, with their colour bar: the grey in its middle ends at +-10^low."""
     low, high = _decades(coef.values)
     scale = _signed_colours()
-    for ax, values in zip(column, coef, strict=True):
-        draw_map(
-            ax, values.copy(data=_signed_log(values.values, low, high)), scale, Normalize(-1, 1)
-        )
+    for ax, values, shown in zip(column, coef, opacity, strict=True):
+        signed = values.copy(data=_signed_log(values.values, low, high))
+        draw_map(ax, signed, scale.with_extremes(bad="white"), Normalize(-1, 1), opacity=shown)
+        ax.set_facecolor(ABSENT)
     bar = figure.colorbar(
         ScalarMappable(Normalize(-1, 1), scale), ax=column, location="bottom", aspect=14,
         pad=0.02, shrink=0.95,
@@ -196,8 +207,8 @@ def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figu
     R2 is that of the held-out rows, or of the training rows where none were held out; below 0 is
     drawn as 0.
     """
-    held_out = bool(np.isfinite(result["r2_test"]).any())
-    r2 = result["r2_test" if held_out else "r2_train"]
+    name = r2_name(result)
+    r2, held_out = result[name], name == "r2_test"
     n_equations = result.sizes["equation"]
     n_columns = 3 if (result["status"] != 0).any() else 2
     figure = map_figure(r2, (n_equations, n_columns), scale=1.4, extra=0.9)

@@ -51,8 +51,15 @@ def _edges(array: xr.DataArray, axis: str) -> Float[np.ndarray, " edges"]:
     return cell_edges(points) if len(points) > 1 else points[0] + np.array([-1e-3, 1e-3])
 
 
-def draw_map(ax: Axes, values: xr.DataArray, colours: Colormap, norm: Normalize) -> None:
-    """Cells by colour; over one axis, a strip."""
+def draw_map(
+    ax: Axes,
+    values: xr.DataArray,
+    colours: Colormap,
+    norm: Normalize,
+    *,
+    opacity: xr.DataArray | None = None,
+) -> None:
+    """Cells by colour; over one axis, a strip. opacity: 0 to 1, of the same cells; NaN is 1."""
     space = space_axes(values)
     z = CM * _edges(values, space[0])
     if len(space) == 1:
@@ -60,7 +67,9 @@ def draw_map(ax: Axes, values: xr.DataArray, colours: Colormap, norm: Normalize)
         ax.set_yticks([])
         return
     r = CM * _edges(values, "r")
-    ax.pcolormesh(z, r, values.transpose("r", "z").values, cmap=colours, norm=norm)
+    mesh = ax.pcolormesh(z, r, values.transpose("r", "z").values, cmap=colours, norm=norm)
+    if opacity is not None:
+        mesh.set(alpha=opacity.fillna(1.0).transpose("r", "z").values)
     ax.set_aspect("equal")
 
 

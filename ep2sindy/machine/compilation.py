@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -11,10 +13,27 @@ from numba.core import event
 
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
-    """`numba.njit` with its cache on; as `@compiled` or `@compiled(inline="always")`."""
+    """`numba.njit` with its cache on; as `@compiled` or `@compiled(inline="always")`.
+
+    What a kernel calls is compiled into it, so a change in any kernel of its folder, or in the
+    columns that they share, compiles it anew: numba itself looks at the kernel's own file alone.
+    """
+    if function is None:
+        return lambda each: compiled(each, **options)
     _announce()
-    kernel = numba.njit(cache=True, **options)
-    return kernel if function is None else kernel(function)
+    kernel = numba.njit(cache=True, **options)(function)
+    kept: Any = getattr(kernel._cache, "_cache_file", None)
+    if hasattr(kept, "_source_stamp"):  # numba has no public way
+        kept._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+    return kernel
+
+
+@cache
+def _stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
+    """Names, dates and sizes of all that is compiled in a folder."""
+    sources = [*sorted(folder.glob("*.py")), *sorted(folder.parent.glob("closures.py"))]
+    stats = [(source.name, source.stat()) for source in sources]
+    return tuple((name, stat.st_mtime, stat.st_size) for name, stat in stats)
 
 
 class _Announcer(event.Listener):
@@ -24,7 +43,7 @@ class _Announcer(event.Listener):
         if not _ANNOUNCED:
             _ANNOUNCED.append(True)
             print(
-                "ep2sindy: compiling its kernels, once after installation (some ten seconds) ...",
+                "ep2sindy: compiling its kernels, once after installation (half a minute) ...",
                 file=sys.stderr,
                 flush=True,
             )

@@ -19,7 +19,7 @@ from ep2sindy.report.tensorboard import Board
 class Run:
     """One run of a study: its name and seed, where it writes and what it says on the way.
 
-    settings: the whole config as plain values.
+    settings: the whole config as plain values. warnings: what the page and the summary repeat.
     """
 
     title: str
@@ -28,10 +28,16 @@ class Run:
     screen: Screen
     board: Board
     settings: Mapping[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
 
     def say(self, text: str, *, warning: bool = False) -> None:
         """A line for those who watch, at once: on the screen and in run.log."""
         self.screen.print(*renderables(Text(text, warning=warning)))
+
+    def warn(self, text: str) -> None:
+        """Say that something is amiss, at once, on the page and in the summary."""
+        self.warnings.append(text)
+        self.say(text, warning=True)
 
     def write(self, name: str, writer: Callable[[Path], None]) -> None:
         """A file of the study's own into the run folder, whole or not at all."""

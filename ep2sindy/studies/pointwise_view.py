@@ -21,7 +21,8 @@ from ep2sindy.thruster.parameters import Thruster
 
 CAPTIONS = {
     "coefficients": "Coefficient of every term at every point: its sign says source or sink, the "
-    "colour its order of magnitude. Grey: the term is not in the equation; blank: no equation.",
+    "colour its order of magnitude, fading to grey as the equation's R2 falls to 0. Grey: the term "
+    "is not in the equation; blank: no equation.",
     "regimes": "Regimes: points where the same terms act, and how sure the bootstraps are.",
     "quality": "R2 on held-out rows if there are any, number of terms, and what became of the "
     "points if not all were fitted.",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,6 +13,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.report.run import Run
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.kinds import Deferred
+from ep2sindy.studies.simulated import check_recorded, say_simulation
 
 Step = Callable[[xr.Dataset], xr.Dataset]
 
@@ -25,7 +26,9 @@ class FieldSource:
     prepare: Sequence[Step] = ()
 
     def field(self) -> xr.Dataset:
+        """Raises DivergedError for a simulation that broke before it could be studied."""
         field: xr.Dataset = self.data.build()
+        check_recorded(field)
         for step in self.prepare:
             field = step(field)
         return field
@@ -65,20 +68,13 @@ class Source:
 
     def sampled(self, field: xr.Dataset, libraries: Iterable[Library], run: Run) -> Trajectory:
         """The trajectory that libraries need, and a word on it for those who watch."""
+        say_simulation(run, field.attrs)  # first: it may say why the rest cannot work
         data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=run.title)
-        say_data(run, data, field.attrs)
+        say_data(run, data)
         return data
 
 
-def say_data(run: Run, data: Trajectory, attributes: Mapping[str, Any]) -> None:
-    if "status" in attributes:  # ours, from a simulation
-        run.say(
-            f"simulation: {attributes['status']}; discharge current "
-            f"{attributes['I_d_mean']:.2f} A, standard deviation {attributes['I_d_std']:.2f} A; "
-            f"mass out/in {attributes['mass_balance']:.4f}"
-        )
-        if attributes["status"] != "oscillating":
-            run.say("this case does not sustain its oscillation", warning=True)
+def say_data(run: Run, data: Trajectory) -> None:
     frequencies = ", ".join(
         f"{name} {frequency_text(dominant_frequency(data.t, column))}"
         for name, column in zip(data.state_names, data.states.T, strict=True)

@@ -30,8 +30,8 @@ class AnodeSheath:
     2 T + potential_weight V_s: 1 is what a Maxwellian pays that climbs the sheath (Goebel & Katz,
     chapter 7; Hara, Plasma Sources Sci. Technol. 28 (2019) 044001); HallThruster.jl v0.22 takes 2.
     The temperature has no gradient there, but where electrons leave the anode, which have T_e_eV.
-    Ions leave at sqrt(e T/m)/sqrt(1 + chi), chi = exp(-x)/(sqrt(pi x) (1 + erf(sqrt(x)))),
-    x = V_s/T (Hara 2019).
+    Ions leave at sqrt((e T + k T_i)/m)/sqrt(1 + chi) or faster, T of the first cell,
+    chi = exp(-x)/(sqrt(pi x) (1 + erf(sqrt(x)))), x = V_s/T (Hara 2019).
     """
 
     T_e_eV: float = 2.0  # of electrons from the anode, and of the first guess

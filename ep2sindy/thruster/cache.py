@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import xarray as xr
 from tqdm import tqdm
 
 from ep2sindy.machine.files import fingerprint, replacing
+from ep2sindy.thruster.axial.model import CFL
+from ep2sindy.thruster.axial.settings import Settings, to_json
+from ep2sindy.thruster.axial.simulate import as_start, simulate_as
+from ep2sindy.thruster.axial.starts import Start
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.simulate import simulate, to_json
 
 
 def simulate_cached(
@@ -20,22 +25,46 @@ def simulate_cached(
     duration_s: float = 18e-3,
     warm_up_s: float = 2e-3,
     sample_s: float = 1.5e-6,
+    averaged: bool = True,
     n_cells: int = 100,
+    stretch: float = 2.0,
+    reconstruct: bool = True,
+    cfl: float = CFL,
+    coldest_T_e_eV: float = 0.0,
+    initial: Start | xr.Dataset | str | Path | None = None,
     progress: bool = True,
 ) -> xr.Dataset:
     """Read this simulation from the folder `cache`, or run it once and keep it there.
 
-    The file name holds a hash of all parameters and of this package's source text, so a
-    changed formula is never answered from an old file. Both ways return the same values.
-    A file that cannot be read is reported, recomputed and replaced. Results appear under
-    their final name only once complete. Raises OSError if the folder cannot be written.
+    Arguments are those of `simulate`. The file name holds a hash of all parameters and of this
+    package's source text, so a changed formula is never answered from an old file. Both ways
+    return the same values. A file that cannot be read is reported, recomputed and replaced.
+    Results appear under their final name only once complete. Raises OSError if the folder cannot
+    be written.
     """
-    settings = {
-        "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s, "n_cells": n_cells,
+    start = as_start(initial)
+    settings = Settings(
+        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,
+        coldest_T_e_eV,
+    )  # fmt: skip
+    parameters = {
+        "thruster": thruster, "operating_point": operating_point, "settings": settings,
+        "initial": start.label,
     }  # fmt: skip
-    parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
-    key = fingerprint(to_json(parameters), sources=Path(__file__).parent)
-    path = Path(cache) / f"thruster_{operating_point.label}_{key}.nc"
+    return kept(
+        Path(cache) / f"thruster_{operating_point.label}",
+        to_json(parameters),
+        partial(simulate_as, settings, thruster, operating_point, start, progress=progress),
+    )
+
+
+def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
+    """What `run` returns, read from the file that is named by a stem and a hash, or run and kept.
+
+    Raises OSError if the folder cannot be written, before anything runs.
+    """
+    key = fingerprint(parameters, sources=Path(__file__).parent)
+    path = stem.with_name(f"{stem.name}_{key}.nc")
     if path.exists():
         try:
             return read(path)
@@ -48,15 +77,7 @@ def simulate_cached(
             f"simulations need a folder they can be kept in: {path.parent} failed with "
             f"{error.strerror!r}; choose another cache"
         ) from error
-    field = simulate(
-        thruster,
-        operating_point,
-        duration_s=duration_s,
-        warm_up_s=warm_up_s,
-        sample_s=sample_s,
-        n_cells=n_cells,
-        progress=progress,
-    )
+    field = run()
     write(field, path)
     return field
 
@@ -71,6 +92,9 @@ def read(path: Path) -> xr.Dataset:
 
 def write(field: xr.Dataset, path: Path) -> None:
     """Write compressed, whole or not at all."""
-    compressed = {str(variable): {"zlib": True, "complevel": 4} for variable in field.data_vars}
+    compressed = {
+        str(variable): {"zlib": True, "complevel": 1, "shuffle": True}
+        for variable in field.data_vars
+    }
     with replacing(path) as temporary:
         field.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)

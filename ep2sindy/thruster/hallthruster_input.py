@@ -23,6 +23,8 @@ from ep2sindy.thruster.propellants import PropellantTable
 
 GASES = {"Xenon": "xenon", "Krypton": "krypton", "Argon": "argon"}
 GASES |= {"Xe": "xenon", "Kr": "krypton", "Ar": "argon"}
+# What their stored runs ionise xenon by is not the finer table that later versions brought.
+RATES_OF = {"xenon": "xenon_5eV", "krypton": "krypton", "argon": "argon"}
 # Keys that are taken at this value alone; any other would change what is simulated.
 CONFIG_AT_REST: dict[str, Any] = {
     "background_pressure_Torr": 0.0,
@@ -224,7 +226,7 @@ def _gas(flow: Node, coulomb: bool) -> PropellantTable:
         raise ValueError(
             f"{flow.place}.gas must be one of {sorted(GASES)}: {name!r} is not supported here"
         )
-    return propellant(GASES[name], coulomb_weight=1.0 if coulomb else 0.0)
+    return propellant(RATES_OF[GASES[name]], coulomb_weight=1.0 if coulomb else 0.0)
 
 
 def _speed(flow: Node, gas: PropellantTable) -> float:

@@ -27,8 +27,6 @@ def simulate_hallthruster_input(
     `read_hallthruster_input`.
     """
     given = read_hallthruster_input(path)
-    if not given.run.reconstruct:
-        raise ValueError(f"{path}: config.reconstruct is not supported here but at True")
     if n_cells is None and not given.run.even_grid:
         raise ValueError(
             f"{path}: simulation.grid must be an EvenGrid here; n_cells={given.run.n_cells} takes "
@@ -42,5 +40,8 @@ def simulate_hallthruster_input(
         warm_up_s=warm_up_s,
         sample_s=given.run.sample_s if sample_s is None else sample_s,
         n_cells=given.run.n_cells if n_cells is None else n_cells,
+        stretch=1.0,  # their EvenGrid
+        reconstruct=given.run.reconstruct,
+        coldest_T_e_eV=given.run.coldest_T_e_eV,
         progress=progress,
     )

@@ -1,8 +1,8 @@
 """The LANDMARK benchmark's 1-D fluid cases (test case 3), for verification.
 
 The benchmark's closures differ from the default set: mean-energy pressure p_e = n eps,
-conductivity (10/9) mu n eps, a constant sheath loss, and a rate table that its authors
-distribute (landmark-plasma.com); the table is the caller's to supply.
+conductivity (10/9) mu n eps, a constant sheath loss, ions born at rest, and a rate table that its
+authors distribute (landmark-plasma.com); the table is the caller's to supply.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ def landmark_thruster(case: int, rates: TabulatedRates) -> Thruster:
         series_resistance=0.0,
         pressure_factor=1.5,
         conduction_factor=2.5,
+        ions_born_at_rest=True,
     )
 
 

@@ -20,6 +20,8 @@ class Thruster:
     kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e: 4.66 and 0 are
     Braginskii's for singly charged ions. charge_states: the ions' highest charge, 1 or 2.
     cathode_potential: of the cathode plane above the cathode, its coupling voltage.
+    ions_born_at_rest: ionisation adds no momentum to the ions, as LANDMARK has it; otherwise it
+    adds the neutrals'.
     """
 
     channel_length: float = 0.025  # m
@@ -39,6 +41,7 @@ class Thruster:
     pressure_factor: float = 1.0  # p_e = factor n T_e
     conduction_factor: float = 4.66
     conduction_coulomb: float = 0.0
+    ions_born_at_rest: bool = False
 
     def __post_init__(self) -> None:
         check_positive(

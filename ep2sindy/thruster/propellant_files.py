@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ep2sindy.thruster.constants import ATOMIC_MASS, M_ARGON, M_KRYPTON, M_XENON
 from ep2sindy.thruster.propellants import PropellantTable
@@ -28,20 +31,37 @@ MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
 
 
 def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
-    """A gas that comes with the package: xenon, krypton or argon.
+    """A gas that comes with the package: xenon, krypton, argon, or xenon_5eV.
 
     Xenon and krypton are the tables of HallThruster.jl, up to T_e of 170 and 100 eV, with a
     second charge; argon follows from the cross sections of Phelps & Petrovic (1999), up to
-    100 eV. Each file in `gases/` names its sources. The default `XenonFits` are formulas.
+    100 eV. Each file in `gases/` names its sources. xenon_5eV ionises by the table that the stored
+    runs of HallThruster.jl v0.22 have, linear over 5 eV. The default `XenonFits` are formulas.
     """
+    if name == "xenon_5eV":
+        return _ionized_in_steps(propellant("xenon", coulomb_weight=coulomb_weight), name)
     if name not in MASSES:
         raise ValueError(
-            f"there are the propellants {sorted(MASSES)}: {name!r} came; a table of your own is "
-            "read by ep2sindy.read_propellant"
+            f"there are the propellants {[*sorted(MASSES), 'xenon_5eV']}: {name!r} came; a table "
+            "of your own is read by ep2sindy.read_propellant"
         )
     return _table(
         GASES / f"{name}.csv", name, MASSES[name], ENERGIES[name], coulomb_weight=coulomb_weight
     )
+
+
+def _ionized_in_steps(xenon: PropellantTable, name: str) -> PropellantTable:
+    """Xenon with the ionisation table of 5 eV steps, resampled at 1 eV of mean energy."""
+    stored = _columns(GASES / "xenon_ionization_5eV.csv")
+    energy = np.arange(1.0 + np.floor(stored["mean_energy_eV"][-1]))
+    rates: dict[str, Any] = {
+        f"{rate}_rate": tuple(np.interp(energy / 1.5, xenon.T_e_eV, getattr(xenon, f"{rate}_rate")))
+        for rate in (*RATES, *SECOND)
+    }
+    rates["ionization_rate"] = tuple(
+        np.interp(energy, stored["mean_energy_eV"], stored["ionization"])
+    )
+    return replace(xenon, name=name, T_e_eV=tuple(energy / 1.5), **rates)
 
 
 def read_propellant(

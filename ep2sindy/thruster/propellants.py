@@ -76,15 +76,20 @@ def coulomb_rate(T_e_eV: FloatArray) -> FloatArray:
 class XenonFits:
     """Xenon coefficients as published formulas (Goebel & Katz, appendix E and chapter 3).
 
-    Inelastic rates and wall losses are taken at the electrons' whole mean energy 1.5 T_e + K,
-    K the kinetic energy of their drift, hence at the temperature T_e + 2 K/3 (`drift_weight` 1).
+    Inelastic rates are taken at the electrons' whole mean energy 1.5 T_e + K, K the kinetic
+    energy of their drift, hence at T_e + 2 K/3; with `drift_weight` 0 at T_e. The heat pays
+    all of what an event costs: drag along the field turns into heat whatever it comes from, and
+    the energy of the drift, which follows the field at once, is not stored.
     """
 
+    drift_weight: float = 1.0
     mass: ClassVar[float] = M_XENON
     ionization_eV: ClassVar[float] = E_IONIZATION_EV
-    drift_weight: ClassVar[float] = 1.0
     range_eV: ClassVar[tuple[float, float] | None] = None
     charge_states: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "drift_weight")
 
     def ionization(self, T_e_eV: FloatArray) -> FloatArray:
         """Rate coefficient in m^3/s."""
@@ -100,8 +105,8 @@ class XenonFits:
         return ionization_rate(T_e_eV) + excitation_rate(T_e_eV)
 
     def drift_events(self, T_e_eV: FloatArray) -> FloatArray:
-        """Every inelastic event takes its energy from drift and heat together, in m^3/s."""
-        return self.events(T_e_eV)
+        """None: the heat pays for every event."""
+        return np.zeros_like(T_e_eV)
 
     def momentum(self, T_e_eV: FloatArray) -> FloatArray:
         """Momentum lost to neutrals in elastic collisions, in m^3/s."""
@@ -178,7 +183,7 @@ class PropellantTable:
     excitation; with both columns of the second charge, X2+ is there too, from X and from X+.
     coulomb_weight: 0 leaves electron-ion collisions out. drift_weight: as for `XenonFits`; of the
     inelastic events only excitation takes part of its energy from the drift, as in
-    HallThruster.jl. Beyond the rows the end values are held, and a run that gets there ends.
+    HallThruster.jl. Beyond the rows the end values are held, and a run that gets there says so.
     """
 
     name: str

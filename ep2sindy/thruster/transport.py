@@ -27,7 +27,7 @@ class AnomalousTransport:
     """Two zones, with c linear across a layer about the exit."""
 
     c_channel: float = 1 / 300
-    c_plume: float = 1 / 80
+    c_plume: float = 1 / 145
     transition: float = 3e-3  # m
 
     def __post_init__(self) -> None:

@@ -9,9 +9,10 @@ from typing import Any
 from ep2sindy.data.trajectory import ConstantStateError
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.parametric.oscillation import STEADY, PointData, naming, point_label
+from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
 from ep2sindy.studies.source import Source
 
-WITHOUT_OSCILLATION = (STEADY, "decaying", "diverged")  # what a simulation says of itself
+WITHOUT_BREATHING = (STEADY, "decaying", "diverged", "transit")  # what a simulation says of itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,18 +27,21 @@ class PointSource:
         return point_label(self.parameters)
 
     def open(self, inputs: Sequence[str]) -> PointData:
-        """Open or simulate it; what does not oscillate comes without trajectory.
+        """Open or simulate it; what does not breathe comes without trajectory.
 
         A state that stays exactly where it is makes a point steady: no trajectory may hold it.
         """
         with naming(self.parameters):
             try:
                 field = self.source.field()
-                if (status := field.attrs.get("status")) in WITHOUT_OSCILLATION:
+                if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
                     return PointData(self.parameters, None, status)
                 sampling = self.source.trajectory
                 run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                return PointData(self.parameters, run)
+                notes = amiss(field.attrs) if is_simulation(field.attrs) else []
+                return PointData(self.parameters, run, notes=notes)
+            except DivergedError:
+                return PointData(self.parameters, None, "diverged")
             except ConstantStateError:
                 return PointData(self.parameters, None, STEADY)
 

@@ -18,6 +18,7 @@ from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.opening import PointSource, point_sources
+from ep2sindy.studies.parametric.oscillation import point_label
 from ep2sindy.studies.parametric.points import (
     Case,
     PointResult,
@@ -130,7 +131,9 @@ class Study:
         inputs = self.source.inputs([how.library, how.searched])
         opening = self.parallel.run(partial(PointSource.open, inputs=inputs), sources)
         points = _in_order(opening, len(sources), "opened", run)
-
+        for point in points:
+            for note in point.notes:
+                run.warn(f"{point_label(point.parameters)}: {note}")
         alone, together = np.random.default_rng(run.seed).spawn(2)
         fitted = parametric_study(points, how, workers=self.parallel, rng=alone)
         results = _in_order(_tell(fitted, run), len(points), "fitted", run)

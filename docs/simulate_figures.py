@@ -1,0 +1,39 @@
+"""Draw the figures of docs/simulate.md by the commands that it names.
+
+python docs/simulate_figures.py     # some minutes; prints what docs/simulate.md quotes
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+ONE = ["+exp=simulate", "data.progress=false"]
+SCAN = [
+    "+exp=simulate",
+    "data.duration_s=3.0e-3",
+    "scan={operating_point.voltage:[150,200,250,300,350,400],"
+    "thruster.transport.c_plume:[0.005,0.0077,0.01,0.0125]}",
+]
+FIGURES = {"maps": ONE, "profiles": ONE, "stability": SCAN}
+
+
+def main(overrides: list[str]) -> None:
+    folders: dict[str, Path] = {}
+    for name, command in FIGURES.items():
+        key = " ".join(command)
+        if key not in folders:
+            program = [sys.executable, "-m", "experiments.run", *command, *overrides]
+            done = subprocess.run(program, cwd=DOCS.parent, stdout=subprocess.PIPE, text=True)
+            print(done.stdout)
+            done.check_returncode()
+            folders[key] = DOCS.parent / done.stdout.split()[-1]
+        drawn = folders[key] / "figures" / f"{name}.png"
+        shutil.copyfile(drawn, DOCS / f"simulate_{name}.png")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,183 @@
+"""Figures of one simulated discharge: its current, spectrum, profiles, and (z, t) maps."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ep2sindy.data.fields import cell_edges
+from ep2sindy.figures.panels import CM
+from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above, unit_text
+from ep2sindy.signals.spectrum import power_spectrum
+
+PROFILES = ("n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization")
+MAPS = {"n_n": "viridis", "n_i": "magma"}  # colours told apart by any eye, and in grey
+SHARES = (5, 95)  # %, of the inner band of a profile
+READABLE = {"m/s": (1e-3, "km/s"), "V/m": (1e-3, "kV/m")}
+MS, KHZ = 1e3, 1e-3
+
+
+def current_figure(field: xr.Dataset, window: slice) -> Figure:
+    """The discharge current over the whole record, and over a few periods beside the beam's."""
+    figure = Figure(figsize=(9.0, 4.8), layout="constrained")
+    whole, part = figure.subplots(2, 1)
+    time = MS * field["time"].values
+    whole.plot(time, field["I_d"].values, color=DATA, lw=0.5)
+    if window.stop - window.start < time.size:
+        whole.axvspan(time[window.start], time[window.stop - 1], color=COLOURS[4], alpha=0.35, lw=0)
+    shown = field.isel(time=window)
+    part.plot(time[window], shown["I_d"].values, color=DATA, lw=1.3, label="discharge current")
+    highest = shown["I_d"].values
+    if "I_beam" in field:
+        beam = shown["I_beam"].values
+        highest = np.maximum(highest, beam)
+        part.plot(time[window], beam, color=COLOURS[0], lw=1.3, ls="--", label="ion beam current")
+    for ax, values in ((whole, field["I_d"].values), (part, highest)):
+        ax.set_ylabel("current (A)")
+        _from_zero(ax, values)
+        ax.margins(x=0.0)
+    part.set_xlabel("time after the warm-up (ms)")
+    legend_above(figure, part.lines)
+    return figure
+
+
+def spectrum_figure(
+    field: xr.Dataset, *, f_kHz: float, f_max_Hz: float, transit_Hz: float
+) -> Figure:
+    """Power of the discharge current over frequency, both logarithmic; the peak is marked.
+
+    f_kHz: where the peak is, NaN for none. transit_Hz: above it ions in transit oscillate.
+    """
+    frequency, power = power_spectrum(field["time"].values, field["I_d"].values)
+    shown = (frequency > 0.0) & (frequency <= f_max_Hz)
+    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
+    ax = figure.subplots()
+    floor = max(1e-12 * power.max(), np.finfo(float).tiny)
+    ax.loglog(KHZ * frequency[shown], np.maximum(power[shown], floor), color=DATA, lw=0.8)
+    if np.isfinite(f_kHz):
+        label = f"peak, {f_kHz:.1f} kHz"
+        ax.axvline(f_kHz, color=COLOURS[1], lw=1.2, ls="--", label=label)
+    if f_max_Hz > transit_Hz:
+        limits = KHZ * transit_Hz, KHZ * f_max_Hz
+        ax.axvspan(*limits, color=GREY, alpha=0.25, lw=0, label="transit range")
+    ax.set(xlabel="frequency (kHz)", ylabel=f"power of the current ({unit_text('A^2/Hz')})")
+    ax.set_xlim(KHZ * frequency[shown][0], KHZ * frequency[shown][-1])
+    ax.grid(alpha=0.3)
+    legend_above(figure, ax.get_legend_handles_labels()[0])
+    return figure
+
+
+def profile_table(field: xr.Dataset) -> dict[str, Float[np.ndarray, "5 cells"]]:
+    """By variable its mean, 5 %, 95 %, least and largest value in time along the axis."""
+    found = {}
+    for name in (name for name in PROFILES if name in field):
+        values = along_z(field[name])
+        low, high = np.percentile(values, SHARES, axis=0)
+        found[name] = np.stack(
+            [values.mean(axis=0), low, high, values.min(axis=0), values.max(axis=0)]
+        )
+    return found
+
+
+def profile_figure(field: xr.Dataset) -> Figure:
+    """Mean profiles with bands of 5 to 95 %, and of all that was, the channel's exit dashed."""
+    profiles = profile_table(field)
+    n_rows = -(-len(profiles) // 3)
+    figure = Figure(figsize=(10.0, 2.6 * n_rows + 0.4), layout="constrained")
+    axes = figure.subplots(n_rows, 3, squeeze=False, sharex=True)
+    z = CM * field["z"].values
+    for ax, (name, values) in zip(axes.flat, profiles.items(), strict=False):
+        (mean, low, high, least, most), unit = scaled(values, field[name].attrs["units"])
+        ax.fill_between(z, least, most, color=COLOURS[5], alpha=0.3, lw=0, label="whole range")
+        label = f"{SHARES[0]} to {SHARES[1]} % of the time"
+        ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=label)
+        ax.plot(z, mean, color=DATA, lw=1.5, label="mean")
+        ax.set_title(_words(field[name]), fontsize=10)
+        ax.set_ylabel(unit)
+        _mark_exit(ax, field, along="x")
+        ax.margins(x=0.0)
+    for ax in axes.flat[len(profiles) :]:
+        ax.remove()
+    for ax in axes.flat[max(0, len(profiles) - 3) : len(profiles)]:
+        ax.set_xlabel("distance from the anode (cm)")
+        ax.tick_params(labelbottom=True)
+    legend_above(figure, axes.flat[0].get_legend_handles_labels()[0])
+    return figure
+
+
+def map_figure(field: xr.Dataset, window: slice) -> Figure:
+    """The current, and below it neutrals and ions over time and axis, for a few periods."""
+    names = [name for name in MAPS if name in field]
+    shown = field.isel(time=window)
+    time = MS * shown["time"].values
+    figure = Figure(figsize=(9.0, 1.7 + 2.4 * len(names)), layout="constrained")
+    axes = figure.subplots(
+        1 + len(names), 1, sharex=True, height_ratios=[1.0, *[1.7] * len(names)], squeeze=False
+    )[:, 0]
+    axes[0].plot(time, shown["I_d"].values, color=DATA, lw=1.3)
+    axes[0].set_ylabel("discharge\ncurrent (A)")
+    _from_zero(axes[0], shown["I_d"].values)
+    edges = CM * cell_edges(field["z"].values.astype(float))
+    for ax, name in zip(axes[1:], names, strict=True):
+        values, unit = scaled(along_z(shown[name]), field[name].attrs["units"])
+        drawn = ax.pcolormesh(
+            cell_edges(time), edges, values.T, cmap=MAPS[name], vmin=0.0, rasterized=True
+        )
+        bar = figure.colorbar(drawn, ax=ax, pad=0.02, aspect=14)
+        bar.set_label(f"{_words(field[name])}\n({unit})")
+        ax.set_ylabel("distance from\nthe anode (cm)")
+        _mark_exit(ax, field, along="y")
+    axes[0].set_xlim(time[0], time[-1])
+    axes[-1].set_xlabel("time after the warm-up (ms)")
+    return figure
+
+
+def along_z(array: xr.DataArray) -> Float[np.ndarray, "time z"]:
+    """Values on (time, z); over r, their average by area where there is plasma."""
+    if "r" in array.dims:
+        array = array.weighted(array["r"]).mean("r")
+    return array.transpose("time", "z").values.astype(float)
+
+
+def scaled(
+    values: Float[np.ndarray, "*shape"], unit: str
+) -> tuple[Float[np.ndarray, "*shape"], str]:
+    """Numbers to read, and what they count: 2e18 m^-3 are 2 in 10^18 m^-3."""
+    factor, name = READABLE.get(unit, (1.0, unit))
+    largest = float(np.nanmax(np.abs(factor * values), initial=0.0))
+    if 1e-2 <= largest < 1e4 or largest == 0.0:
+        return factor * values, unit_text(name)
+    power = int(np.floor(np.log10(largest)))
+    return factor * values / 10.0**power, f"$10^{{{power}}}$ {unit_text(name)}"
+
+
+def _from_zero(ax: Axes, values: Float[np.ndarray, " time"]) -> None:
+    """Limits that hold zero: a steady current must not look like one that moves."""
+    low, high = min(0.0, float(values.min())), max(0.0, float(values.max()))
+    ax.set_ylim(1.05 * low, (1.08 * high) or 1.0)
+
+
+def _words(array: xr.DataArray) -> str:
+    return str(array.attrs.get("long_name", array.name))
+
+
+def _mark_exit(ax: Axes, field: xr.Dataset, *, along: str) -> None:
+    """The end of the channel as a dashed line, where the run says where it is."""
+    thruster = json.loads(field.attrs.get("parameters", "{}")).get("thruster", {})
+    if length := thruster.get("channel_length"):
+        style: dict[str, Any] = {"color": DATA if along == "x" else "white", "lw": 1.0, "ls": "--"}
+        (ax.axvline if along == "x" else ax.axhline)(CM * length, **style)
+
+
+def last_periods(t: Float[np.ndarray, " time"], f_kHz: float, periods: float) -> slice:
+    """The last few periods of a record; a tenth of it where there is no frequency."""
+    share = 0.1 * (t[-1] - t[0])
+    duration_s = periods / (1e3 * f_kHz) if np.isfinite(f_kHz) and f_kHz > 0.0 else share
+    start = int(np.searchsorted(t, t[-1] - duration_s))
+    return slice(max(0, min(start, t.size - 16)), t.size)

@@ -1,0 +1,147 @@
+"""Figures of a scan: what the discharge does over one parameter, or over two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above
+
+BREATHES = "oscillating"
+HATCHES = {"steady": "//", "decaying": "\\\\", "transit": "..", "diverged": "xx", "failed": "++"}
+MARKERS = {BREATHES: "o", "steady": "s", "decaying": "v", "transit": "D"}
+WORTHLESS = ("diverged", "failed")  # whose current says nothing
+CURVES = {  # column -> title, factor
+    "I_d_mean": ("discharge current (A)", 1.0),
+    "f_kHz": ("frequency (kHz)", 1.0),
+    "thrust_N": ("thrust (mN)", 1e3),
+    "anode_efficiency": ("anode efficiency (%)", 100.0),
+}
+DARK = 0.6  # of the colour scale: black writing below, white above
+
+
+def stability_figure(
+    points: pd.DataFrame, axes: Sequence[str], labels: Mapping[str, str]
+) -> Figure:
+    """Standard deviation of the current over two parameters, a panel for each of the others'.
+
+    points: texts in the columns `axes`, the first along x, and status, cycle, I_d_std and f_kHz.
+    labels: what the parameters are called.
+    """
+    along, up, *others = axes
+    groups = list(points.groupby(others, sort=False)) if others else [((), points)]
+    x, y = (list(dict.fromkeys(points[name])) for name in (along, up))
+    n_columns = min(len(groups), max(1, 12 // (2 * len(x))))
+    n_rows = -(-len(groups) // n_columns)
+    size = n_columns * (0.95 * len(x) + 0.7) + 1.8, n_rows * (0.62 * len(y) + 0.9) + 0.7
+    figure = Figure(figsize=(max(size[0], 5.5), size[1]), layout="constrained")
+    panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
+    known = points.loc[~points["status"].isin(WORTHLESS), "I_d_std"]
+    scale = Normalize(0.0, float(known.max()) if len(known) and known.max() > 0 else 1.0)
+    for ax, (held, group) in zip(panels.flat, groups, strict=False):
+        for row in group.to_dict("records"):
+            _cell(ax, x.index(row[along]), y.index(row[up]), row, scale)
+        title = [f"{labels[name]}: {value}" for name, value in zip(others, held, strict=True)]
+        ax.set_title(", ".join(title), fontsize=10)
+        ax.set(xlim=(0, len(x)), ylim=(0, len(y)))
+        ax.set_xticks(np.arange(len(x)) + 0.5, x)
+        ax.set_yticks(np.arange(len(y)) + 0.5, y)
+        ax.tick_params(length=0)
+    for ax in panels.flat[len(groups) :]:
+        ax.remove()
+    for ax in panels.flat[max(0, len(groups) - n_columns) : len(groups)]:
+        ax.tick_params(labelbottom=True)
+    figure.supxlabel(labels[along], fontsize=10)
+    figure.supylabel(fill(labels[up], 26), fontsize=10, multialignment="center")
+    bar = figure.colorbar(ScalarMappable(scale, colormaps["Blues"]), ax=panels, pad=0.02)
+    bar.set_label("standard deviation of the\ndischarge current (A)")
+    seen = [name for name in HATCHES if (points["status"] == name).any()]
+    if seen:
+        style: dict[str, Any] = {"facecolor": "white", "edgecolor": DATA}
+        legend_above(figure, [Patch(hatch=2 * HATCHES[n], label=n, **style) for n in seen])
+    return figure
+
+
+def _cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale: Normalize) -> None:
+    """One point: the colour its amplitude, hatched and named where it does not breathe."""
+    status, std = point["status"], float(point["I_d_std"])
+    known = status not in WORTHLESS and np.isfinite(std)
+    colour = colormaps["Blues"](scale(std)) if known else "white"
+    hatch = HATCHES.get(status)
+    style: dict[str, Any] = {"facecolor": colour, "edgecolor": GREY, "lw": 0.8, "hatch": hatch}
+    ax.add_patch(Rectangle((column, row), 1, 1, **style))
+    lines = [f"{std:.2f} A"] if known else []
+    if np.isfinite(point["f_kHz"]) and known:
+        lines += [f"{point['f_kHz']:.1f} kHz"]
+    lines += [str(point["cycle"]) if status == BREATHES else status]
+    dark = known and hatch is None and scale(std) > DARK
+    box = {"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5} if hatch else None
+    ax.text(
+        column + 0.5,
+        row + 0.5,
+        "\n".join(lines),
+        ha="center",
+        va="center",
+        fontsize=7.5,
+        color="white" if dark else "black",
+        bbox=box,
+    )
+
+
+def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
+    """Current with its standard deviation, frequency, thrust and efficiency over one parameter.
+
+    points: values or texts in the column `along`, and what CURVES names; markers tell statuses.
+    """
+    figure = Figure(figsize=(8.0, 5.2), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True)
+    numbers = pd.api.types.is_numeric_dtype(points[along])
+    x = points[along].to_numpy(float) if numbers else np.arange(len(points), dtype=float)
+    for ax, (name, (title, factor)) in zip(panels.flat, CURVES.items(), strict=True):
+        kept = (~points["status"].isin(WORTHLESS)).to_numpy()
+        order = np.argsort(x[kept])
+        values = factor * points[name].to_numpy(float)
+        if numbers:
+            ax.plot(x[kept][order], values[kept][order], color=GREY, lw=1.0, zorder=1)
+        for status, marker in MARKERS.items():
+            here = (points["status"] == status).to_numpy()
+            reach = points["I_d_std"][here] if name == "I_d_mean" else None
+            colour = COLOURS[0] if status == BREATHES else COLOURS[1]
+            ax.errorbar(x[here], values[here], reach, fmt=marker, color=colour, capsize=3, ms=5)
+        for place, status in zip(x[~kept], points["status"][~kept], strict=True):
+            ax.axvline(place, color=COLOURS[3], lw=1.0, ls=":" if status == "diverged" else "--")
+        ax.set_title(title, fontsize=10)
+        ax.grid(alpha=0.3)
+        ax.margins(x=0.08)
+        if not numbers:
+            ax.set_xticks(x, points[along])
+    for ax in panels[-1]:
+        ax.set_xlabel(label)
+    legend_above(figure, _statuses(points))
+    return figure
+
+
+def _statuses(points: pd.DataFrame) -> list[Line2D]:
+    """What the markers and lines of the curves mean, of those that there are."""
+    entries = []
+    for status in (BREATHES, *HATCHES):
+        if not (points["status"] == status).any():
+            continue
+        if status in MARKERS:
+            colour = COLOURS[0] if status == BREATHES else COLOURS[1]
+            style: dict[str, Any] = {"ls": "none", "marker": MARKERS[status], "color": colour}
+        else:
+            style = {"ls": ":" if status == "diverged" else "--", "color": COLOURS[3]}
+        entries.append(Line2D([], [], label=status, **style))
+    return entries

@@ -1,0 +1,181 @@
+"""How one run of the simulator reads: what it did, where its power went, and how it breathes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from ep2sindy.figures import breathing
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures, places
+from ep2sindy.signals.spectrum import power_spectrum
+from ep2sindy.studies.simulated import status_text
+from ep2sindy.thruster.verdict import TRANSIT_HZ
+
+LEAST_SAMPLES = 16  # fewer cannot be drawn
+POWERS = ("P_in", "P_ions", "P_inelastic", "P_wall", "P_anode", "P_cathode")
+AVERAGED = " Averaged over r by area."
+CAPTIONS = {
+    "current": "Discharge current over the record (above) and over the part that is shaded there, "
+    "beside the ion beam current (below).",
+    "spectrum": "Power spectrum of the discharge current; breathing lies below 60 kHz, "
+    "oscillations of ions in transit above.",
+    "profiles": "Profiles along the axis: mean in time, the band that holds 5 to 95 % of the time, "
+    "and the whole range. Dashed: the channel's exit.",
+    "maps": "Discharge current, neutrals and ions over time and axis: neutrals fill the channel, "
+    "are ionised, and fill it again. Dashed: the channel's exit.",
+}
+NUMBERS = (
+    "f_kHz", "I_d_mean", "I_d_std", "thrust_N", "isp_s", "anode_efficiency", "I_beam_mean",
+    "I_wall_mean", "mass_balance", "energy_balance",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A run, and how much of it figures show: `field.nc` holds all of it."""
+
+    field: xr.Dataset
+    periods: float
+    f_max_Hz: float | None
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What a run is judged by, in SI; NaN for what it did not live to have."""
+        attributes = dict(self.field.attrs)
+        if "I_beam" in self.field and self.field.sizes["time"]:
+            attributes["I_beam_mean"] = self.field["I_beam"].mean()
+        return {name: float(attributes.get(name, np.nan)) for name in NUMBERS}
+
+    @property
+    def can_be_drawn(self) -> bool:
+        return self.field.sizes["time"] >= LEAST_SAMPLES
+
+    def models(self) -> dict[str, SparseModel]:
+        return {}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        found = {"performance": self._performance(), "power": power_table(self.field)}
+        if self.can_be_drawn:
+            found |= {"profiles": self._profiles(), "spectrum": self._spectrum()}
+        return found
+
+    def _profiles(self) -> pd.DataFrame:
+        columns = {"z": self.field["z"].values}
+        for name, values in breathing.profile_table(self.field).items():
+            ends = ("mean", "low", "high", "min", "max")
+            columns |= {f"{name}_{end}": each for end, each in zip(ends, values, strict=True)}
+        return pd.DataFrame(columns)
+
+    def _spectrum(self) -> pd.DataFrame:
+        frequency, power = power_spectrum(self.field["time"].values, self.field["I_d"].values)
+        return pd.DataFrame({"frequency_Hz": frequency, "power": power})
+
+    def figures(self) -> dict[str, Captioned]:
+        if not self.can_be_drawn:
+            return {}
+        field, time = self.field, self.field["time"].values
+        window = breathing.last_periods(time, self.numbers["f_kHz"], self.periods)
+        highest = 0.5 / float(time[1] - time[0])
+        up_to = {"f_max_Hz": min(self.f_max_Hz or highest, highest), "transit_Hz": TRANSIT_HZ}
+        drawn = {
+            "current": partial(breathing.current_figure, field, window),
+            "spectrum": partial(
+                breathing.spectrum_figure, field, f_kHz=self.numbers["f_kHz"], **up_to
+            ),
+            "profiles": partial(breathing.profile_figure, field),
+            "maps": partial(breathing.map_figure, field, window),
+        }
+        radial = AVERAGED if "r" in field.dims else ""
+        tails = {"profiles": radial, "maps": radial}
+        return {n: Captioned(d, CAPTIONS[n] + tails.get(n, "")) for n, d in drawn.items()}
+
+    def sections(self) -> list[Section]:
+        notes: list[Block] = []
+        if not self.can_be_drawn:
+            n = self.field.sizes["time"]
+            notes = [Text(f"The run broke after {n} samples: there is nothing to draw.")]
+        return [
+            Section("Run", [Table(self._performance()), *notes]),
+            Section("Where the power goes", [power_text(self.field)]),
+            Section("Current", pictures(["current", "spectrum"])),
+            Section("Along the axis", pictures(["profiles", "maps"])),
+        ]
+
+    def _performance(self) -> pd.DataFrame:
+        """What it did in words and units."""
+        n, attributes = self.numbers, self.field.attrs
+        mode = "transit" if attributes["status"] == "transit" else "breathing"
+        share = f"{100.0 * n['I_d_std'] / n['I_d_mean']:.0f}"
+        beam = f"{100.0 * n['I_beam_mean'] / n['I_d_mean']:.0f}"
+        rows = {
+            "status": status_text(attributes),
+            "start": attributes.get("initial", "-"),
+            "discharge current, mean": _with(places(n["I_d_mean"], 2), "A"),
+            "discharge current, standard deviation": _with(
+                places(n["I_d_std"], 2), f"A, {share} % of the mean"
+            ),
+            f"{mode} frequency": _with(places(n["f_kHz"], 2), "kHz"),
+            "thrust": _with(places(1e3 * n["thrust_N"], 1), "mN"),
+            "specific impulse": _with(places(n["isp_s"], 0), "s"),
+            "anode efficiency": _with(places(100.0 * n["anode_efficiency"], 1), "%"),
+            "ion beam current, mean": _with(
+                places(n["I_beam_mean"], 2), f"A, {beam} % of the discharge current"
+            ),
+            "ion current to the walls, mean": _with(places(n["I_wall_mean"], 2), "A"),
+            "mass balance, (left + stored)/entered": places(n["mass_balance"], 4),
+            "energy balance, (left + stored)/entered": places(n["energy_balance"], 4),
+            "rates of the propellant": attributes.get("rates", "-"),
+        }
+        return pd.DataFrame({"quantity": list(rows), "value": list(rows.values())})
+
+    def summary(self) -> dict[str, Any]:
+        attributes = self.field.attrs
+        return {
+            "file": "field.nc",
+            "status": attributes["status"],
+            "cycle": attributes.get("cycle", "none"),
+            "initial": attributes.get("initial"),
+            **self.numbers,
+            "rates": attributes.get("rates"),
+            "n_samples": self.field.sizes["time"],
+            "power_W": dict(power_table(self.field)[["name", "power_W"]].to_numpy().tolist()),
+        }
+
+    def headline(self) -> dict[str, float]:
+        return self.numbers
+
+
+def _with(number: str, unit: str) -> str:
+    return number if number == "-" else f"{number} {unit}"
+
+
+def power_table(field: xr.Dataset) -> pd.DataFrame:
+    """Mean power in W by where it goes, and its share of what the plasma takes."""
+    known = [name for name in POWERS if name in field and field.sizes["time"]]
+    power = {name: float(field[name].mean()) for name in known}
+    text = {name: str(field[name].attrs.get("long_name", name)) for name in known}
+    if "P_in" in power:
+        power["stored"] = power["P_in"] - sum(power[name] for name in known if name != "P_in")
+        text["stored"] = "stored by the electrons, or unaccounted for"
+    share = [100.0 * each / power.get("P_in", np.nan) for each in power.values()]
+    columns = {"name": list(power), "goes_to": list(text.values()), "power_W": list(power.values())}
+    return pd.DataFrame({**columns, "share": share})
+
+
+def power_text(field: xr.Dataset) -> Table | Text:
+    """The same to read."""
+    table = power_table(field)
+    if table.empty:
+        return Text("This run has no record of its power.")
+    rows = {
+        "power": table["goes_to"],
+        "W": [places(round(value, 1) + 0.0, 1) for value in table["power_W"]],  # no -0.0
+        "%": [places(round(value, 1) + 0.0, 1) for value in table["share"]],
+    }
+    return Table(pd.DataFrame(rows), breaks=[0], note="Means over the record.")

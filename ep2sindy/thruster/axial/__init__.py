@@ -1,0 +1,1 @@
+"""The model along the axis: ions, neutrals and electrons between anode and cathode plane."""

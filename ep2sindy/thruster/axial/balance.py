@@ -1,0 +1,54 @@
+"""The balance of ions and neutrals in a zone: what changes in it is what crosses its ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+NEEDED = ("dn_i_dt", "dn_n_dt", "face_flux_i", "face_flux_n", "ionization", "wall_loss", "dz")
+
+
+def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
+    """Terms of d<n>/dt in the cells whose centres lie in z = (from, to) in m, in m^-3/s, per time.
+
+    field: a run of `simulate` with averages, of singly charged ions; the zone must end before
+    the last cell. Returns `change_i`, `change_n` (of the zone averages), `inflow_i`, `inflow_n`
+    (through its two ends, less what leaves), `ionization`, `wall_loss` and `residual`: the change
+    of n_i + n_n less its inflow, which is rounding.
+    Raises ValueError for a field without averages, or a zone without cells or at the last one.
+    """
+    if missing := [name for name in NEEDED if name not in field]:
+        raise ValueError(
+            f"a zone's balance needs a simulation with averages: this field lacks {missing}; "
+            "simulate with averaged=True"
+        )
+    inside = np.flatnonzero((field["z"].values >= z[0]) & (field["z"].values <= z[1]))
+    if inside.size == 0 or inside[-1] + 1 >= field.sizes["z"]:
+        raise ValueError(
+            f"a zone must hold cells and end before the last one: z from {z[0]:g} to {z[1]:g} m "
+            f"came, the cells' centres reach from {float(field['z'][0]):g} to "
+            f"{float(field['z'][-1]):g} m"
+        )
+    first, beyond = int(inside[0]), int(inside[-1]) + 1
+    dz = field["dz"].values[first:beyond].astype(float)
+
+    def mean(name: str) -> np.ndarray:
+        return field[name].values[:, first:beyond].astype(float) @ dz / dz.sum()
+
+    def inflow(name: str) -> np.ndarray:
+        through = field[name].values
+        return (through[:, first].astype(float) - through[:, beyond]) / dz.sum()
+
+    terms = {
+        "change_i": mean("dn_i_dt"),
+        "change_n": mean("dn_n_dt"),
+        "inflow_i": inflow("face_flux_i"),
+        "inflow_n": inflow("face_flux_n"),
+        "ionization": mean("ionization"),
+        "wall_loss": mean("wall_loss"),
+    }
+    terms["residual"] = (
+        terms["change_i"] + terms["change_n"] - terms["inflow_i"] - terms["inflow_n"]
+    )
+    data = {name: (("time",), values, {"units": "m^-3/s"}) for name, values in terms.items()}
+    return xr.Dataset(data, coords={"time": field["time"]})

@@ -1,0 +1,110 @@
+"""Compiled inner loop: one sample after the other, heavy species and electrons in turn."""
+
+import numpy as np
+
+from ep2sindy.machine.compilation import compiled
+from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
+from ep2sindy.thruster.axial.heavy_kernels import add_scaled, heavy_step
+from ep2sindy.thruster.axial.state_kernels import (
+    CHANGE_I,
+    CHANGE_N,
+    E_Z,
+    ENERGY,
+    ENTRY,
+    FAST,
+    FLUX_I,
+    N_I,
+    N_N,
+    PER_CHARGE,
+    R_ION,
+    SHORTEST_STEP,
+    T_E,
+    U_IZ,
+    Sums,
+    inside,
+)
+
+NO_NAN = {**FAST, "fastmath": {*FAST["fastmath"], "nnan"}}  # a maximum needs it for vectors
+
+
+@compiled(**NO_NAN)
+def fastest(n, g, inverse_dz, c):
+    """Largest (|u| + c)/dz of a species, 1/s."""
+    top = 0.0
+    for i in inside(n):
+        top = max(top, (abs(g[i] / n[i]) + c) * inverse_dz[i])
+    return top
+
+
+@compiled(**FAST)
+def time_step(state, model, left):
+    """Equal share of the time left to the next sample that keeps the CFL number."""
+    c = np.sqrt(model.sound_speed_squared)
+    top = 0.0
+    for k in range(state.n_i.shape[0]):
+        top = max(top, fastest(state.n_i[k], state.flux_i[k], model.inverse_dz, c))
+    return left / np.ceil(left * top / model.cfl)
+
+
+@compiled(**FAST)
+def add_instant(sums, state, weight, work):
+    """Adds weight times the present fields, but for what the heavy step adds itself."""
+    cells = sums.cells
+    add_scaled(cells[N_N], state.n_n, weight)
+    add_scaled(cells[T_E], state.T_e_eV, weight)
+    add_scaled(cells[R_ION], state.rates[0], weight)
+    add_scaled(cells[E_Z], state.E, weight)
+    add_scaled(cells[ENERGY], state.energy, weight)
+    for k in range(state.n_i.shape[0]):
+        n, g, u = state.n_i[k], state.flux_i[k], work[0]
+        for i in range(u.size):
+            u[i] = g[i] / n[i]
+        add_scaled(cells[N_I + PER_CHARGE * k], n, weight)
+        add_scaled(cells[U_IZ + PER_CHARGE * k], u, weight)
+        add_scaled(cells[FLUX_I + PER_CHARGE * k], g, weight)
+    add_scaled(sums.series, state.instant, weight)
+
+
+@compiled(**FAST)
+def add_changes(sums, state, sign):
+    """With -1 before and 1 after a sample, what the densities gained in it."""
+    add_scaled(sums.cells[CHANGE_N], state.n_n, sign)
+    for k in range(state.n_i.shape[0]):
+        add_scaled(sums.cells[CHANGE_I + PER_CHARGE * k], state.n_i[k], sign)
+
+
+@compiled(**ENTRY)
+def advance(state, model, sample_s, averaged, fields, series):
+    """Fill the rows of fields (cell sums, rows, cells) and series (rows, series); return how many.
+
+    Averages over each sample, or the values at its end. Rows before the one that breaks stay.
+    """
+    size = state.n_n.size
+    work, rows = np.zeros((26, size)), np.zeros(size, np.uint64)
+    sums = Sums(np.zeros((fields.shape[0], size)), np.zeros(series.shape[1]))
+    for row in range(series.shape[0]):
+        start_density(state)
+        sums.cells[:] = 0.0
+        sums.series[:] = 0.0
+        add_changes(sums, state, -1.0)
+        left, weight = sample_s, sample_s
+        while left > 1e-9 * sample_s:
+            dt = time_step(state, model, left)
+            if not averaged:  # what stays is the last step's
+                sums.cells[:] = 0.0
+                sums.series[:] = 0.0
+                weight = dt
+            if not dt > SHORTEST_STEP * sample_s:
+                return row
+            heavy_step(state, model, dt, sums, work)
+            if not electron_step(state, model, dt, rows, work):
+                return row
+            add_instant(sums, state, dt, work)
+            left -= dt
+        add_changes(sums, state, 1.0)
+        for k in range(fields.shape[0]):
+            for i in range(size - 2):
+                fields[k, row, i] = sums.cells[k, i + 1] / weight
+        for k in range(series.shape[1]):
+            series[row, k] = sums.series[k] / weight
+    return series.shape[0]

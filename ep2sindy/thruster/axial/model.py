@@ -1,0 +1,94 @@
+"""From parameters to the arrays of the compiled loop."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster.anode import AnodeSheath
+from ep2sindy.thruster.axial.state_kernels import Model
+from ep2sindy.thruster.closures import DRIFT_EVENTS, TABLE_STEP_EV, closure_table
+from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
+from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.propellants import PropellantTable
+
+CFL = 0.8
+
+
+def build_model(
+    thruster: Thruster,
+    point: OperatingPoint,
+    faces: Float[np.ndarray, " faces"],
+    *,
+    cfl: float = CFL,
+    reconstruct: bool = True,
+    coldest_eV: float = 0.0,
+) -> Model:
+    """Gather every constant of one run; arrays hold one ghost cell at each end."""
+    distance = lengths_and_centres(faces)[1] - thruster.channel_length
+    omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
+    mass, anode, wall = thruster.propellant.mass, thruster.anode, thruster.wall
+    table = closure_table(thruster)
+    return Model(
+        **_lengths(faces),
+        reconstruct=reconstruct,
+        area=thruster.area,
+        ion_mass=mass,
+        sound_speed_squared=K_BOLTZMANN * thruster.ion_temperature / mass,
+        neutral_speed=point.neutral_speed,
+        birth_speed=0.0 if thruster.ions_born_at_rest else point.neutral_speed,
+        neutral_inflow=1e-6 * point.mass_flow_mg_s / (mass * thruster.area),
+        voltage=point.voltage - thruster.cathode_potential,
+        resistance=thruster.series_resistance,
+        pressure_factor=thruster.pressure_factor,
+        conduction_factor=thruster.conduction_factor,
+        conduction_coulomb=thruster.conduction_coulomb,
+        drift_weight=thruster.propellant.drift_weight,
+        drift_credit=bool(thruster.propellant.drift_weight > 0.0 and table[:, DRIFT_EVENTS].any()),
+        sheath=isinstance(anode, AnodeSheath),
+        sheath_weight=anode.potential_weight if isinstance(anode, AnodeSheath) else 0.0,
+        anode_T_e_eV=anode.T_e_eV,
+        cathode_T_e_eV=thruster.cathode_T_e_eV,
+        coldest_eV=coldest_eV,
+        cfl=cfl,
+        omega_ce=omega_ce,
+        anomalous=thruster.transport.at(distance) * omega_ce,
+        wall_ion_weight=wall.ion_weight(distance),
+        wall_collision_weight=wall.collision_weight(distance),
+        wall_power_weight=wall.power_weight(distance),
+        table=table,
+        table_step_eV=TABLE_STEP_EV,
+        second_thresholds_eV=_second_thresholds(thruster),
+    )
+
+
+def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Float[np.ndarray, " cells"]]:
+    """Lengths of a model, of its cells and between their centres."""
+    dz, z = lengths_and_centres(faces)
+    between = np.diff(z)
+    return {
+        "dz": dz,
+        "inverse_dz": 1.0 / dz,
+        "between": between,
+        "to_left": np.append(1.0, dz[1:] / between),
+        "to_right": np.append(dz[:-1] / between, 1.0),
+    }
+
+
+def lengths_and_centres(
+    faces: Float[np.ndarray, " faces"],
+) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
+    """Of all cells with their ghosts, which mirror the outermost cells."""
+    dz = np.diff(faces)
+    dz = np.concatenate([dz[:1], dz, dz[-1:]])
+    ends = [faces[0] - dz[0], *faces, faces[-1] + dz[-1]]
+    return dz, 0.5 * (np.array(ends[1:]) + np.array(ends[:-1]))
+
+
+def _second_thresholds(thruster: Thruster) -> tuple[float, float]:
+    if thruster.charge_states == 1:
+        return 0.0, 0.0
+    propellant = thruster.propellant
+    assert isinstance(propellant, PropellantTable)  # the thruster has seen to it
+    energies = propellant.double_ionization_eV, propellant.second_ionization_eV
+    return energies[0] or 0.0, energies[1] or 0.0

@@ -1,0 +1,123 @@
+"""What a run of the axial model recorded, as an xarray.Dataset with names and units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+from ep2sindy.thruster.axial import state_kernels as recorded
+from ep2sindy.thruster.axial.state_kernels import Model
+from ep2sindy.thruster.constants import E_CHARGE
+
+FIELDS = {  # variable -> place among the cell sums, unit, long name
+    "n_i": (recorded.N_I, "m^-3", "ion density"),
+    "u_iz": (recorded.U_IZ, "m/s", "axial ion velocity"),
+    "n_n": (recorded.N_N, "m^-3", "neutral density"),
+    "T_e_eV": (recorded.T_E, "eV", "electron temperature"),
+    "R_ion": (recorded.R_ION, "m^3/s", "ionisation rate coefficient"),
+    "E_z": (recorded.E_Z, "V/m", "axial electric field"),
+}
+# Averages of products, and what closes the balance of a sample; only averages have them.
+AVERAGES = {
+    "ionization": (recorded.IONIZATION, "m^-3/s", "neutrals ionised per volume and time"),
+    "flux_i": (recorded.FLUX_I, "m^-2/s", "ion flux"),
+    "energy_e": (recorded.ENERGY, "eV*m^-3", "heat of the electrons per volume"),
+    "wall_loss": (recorded.WALL_LOSS, "m^-3/s", "ions lost to the walls"),
+    "face_flux_i": (recorded.FACE_I, "m^-2/s", "ion flux through the cell's face to the anode"),
+    "face_flux_n": (recorded.FACE_N, "m^-2/s", "neutral flux through that face"),
+    "dn_i_dt": (recorded.CHANGE_I, "m^-3/s", "change of n_i over the sample"),
+    "dn_n_dt": (recorded.CHANGE_N, "m^-3/s", "change of n_n over the sample"),
+}
+OF_CHARGE = ("n_i", "u_iz", "flux_i", "face_flux_i", "dn_i_dt")
+PRODUCTS = {"ionization": "n_i*n_n*R_ion", "flux_i": "n_i*u_iz"}  # whose averages they are
+
+SERIES = {  # variable -> unit, long name
+    "I_d": ("A", "discharge current"),
+    "V_d": ("V", "discharge voltage behind the series resistance"),
+    "thrust": ("N", "ion momentum flux through the cathode plane"),
+    "I_beam": ("A", "ion current through the cathode plane"),
+    "I_wall": ("A", "ion current to the channel walls"),
+    "mass_flow_i": ("kg/s", "ions leaving through the cathode plane"),
+    "mass_flow_n": ("kg/s", "neutrals leaving through the cathode plane"),
+    "mass_out": ("kg", "propellant that left through the cathode plane since the start"),
+    "P_in": ("W", "power that the plasma takes from the supply"),
+    "P_ions": ("W", "work of the field on the ions"),
+    "P_inelastic": ("W", "electron power lost in ionisation and excitation"),
+    "P_wall": ("W", "electron power lost to the walls"),
+    "P_anode": ("W", "electron power lost to the anode"),
+    "P_cathode": ("W", "electron power lost through the cathode plane"),
+}
+POWERS = ("P_in", "P_ions", "P_inelastic", "P_wall", "P_anode", "P_cathode")
+
+
+def field_columns(*, charges: int, averaged: bool) -> dict[str, tuple[int, str, str]]:
+    """Variables of a run: place among the cell sums, unit and long name."""
+    first = FIELDS | (AVERAGES if averaged else {})
+    columns = dict(first)
+    for k in range(1, charges):
+        for name in OF_CHARGE:
+            if name in first:
+                place, unit, text = first[name]
+                text = f"{text}, charge {k + 1}"
+                columns[f"{name}{k + 1}"] = (place + recorded.PER_CHARGE * k, unit, text)
+    return columns
+
+
+def series_of(
+    sums: Float[np.ndarray, "samples series"], model: Model, *, voltage: float, sample_s: float
+) -> dict[str, Float[np.ndarray, " samples"]]:
+    """The named series of a run; voltage: of the supply, in V."""
+    current = sums[:, recorded.CURRENT]
+    particles = model.ion_mass * model.area
+    flow_i, flow_n = sums[:, recorded.IONS_OUT], sums[:, recorded.NEUTRALS_OUT]
+    powers = sums[:, recorded.POWER : recorded.P_CATHODE + 1].T
+    return {
+        "I_d": current,
+        "V_d": voltage - model.resistance * current,
+        "thrust": sums[:, recorded.THRUST],
+        "I_beam": E_CHARGE * model.area * sums[:, recorded.BEAM],
+        "I_wall": sums[:, recorded.WALL_CURRENT],
+        "mass_flow_i": particles * flow_i,
+        "mass_flow_n": particles * flow_n,
+        "mass_out": particles * sample_s * np.cumsum(flow_i + flow_n),
+        **dict(zip(POWERS, powers, strict=True)),
+    }
+
+
+def as_dataset(
+    fields: Mapping[str, tuple[Float[np.ndarray, "samples cells"], str, str]],
+    series: Mapping[str, Float[np.ndarray, " samples"]],
+    end: Mapping[str, Float[np.ndarray, " cells"]],
+    *,
+    sample_s: float,
+    faces: Float[np.ndarray, " faces"],
+) -> xr.Dataset:
+    """Label the recorded arrays with dimensions, units and names."""
+    data: dict[str, Any] = {}
+    for name, (values, unit, text) in fields.items():
+        notes = {"units": unit, "long_name": text}
+        if name in PRODUCTS:
+            notes["average_of"] = PRODUCTS[name]
+        data[name] = (("time", "z"), values, notes)
+    for name, column in series.items():
+        unit, text = SERIES[name]
+        data[name] = (("time",), column, {"units": unit, "long_name": text})
+    for name, profile in end.items():  # for a restart, in SI units, T_e and energies in eV
+        data[name] = (("z",), profile, {"units": "1", "long_name": "state at the end of the run"})
+    data["dz"] = (("z",), np.diff(faces), {"units": "m", "long_name": "length of the cell"})
+    n_samples = len(next(iter(series.values())))
+    notes = {"units": "s", "long_name": "time after the warm-up"}
+    coords = {
+        # "s" is a unit here, not a calendar: decode with decode_times=False
+        "time": ("time", sample_s * np.arange(n_samples), notes),
+        "z": (
+            "z",
+            0.5 * (faces[1:] + faces[:-1]),
+            {"units": "m", "long_name": "axial distance from the anode"},
+        ),
+    }
+    return xr.Dataset(data, coords=coords)

@@ -1,0 +1,60 @@
+"""How a run of the axial model is solved and recorded."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from ep2sindy.thruster.axial.model import CFL
+
+MIN_STEPS = 16  # fewer samples leave nothing to judge an oscillation by
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a run is solved and recorded: see `simulate`."""
+
+    duration_s: float = 18e-3
+    warm_up_s: float = 2e-3
+    sample_s: float = 1.5e-6
+    averaged: bool = True
+    n_cells: int = 100
+    stretch: float = 2.0
+    reconstruct: bool = True
+    cfl: float = CFL
+    coldest_T_e_eV: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where a run could not start or could not be sampled."""
+        if not (np.isfinite(self.sample_s) and self.sample_s > 0.0):
+            raise ValueError(f"sample_s must be finite and positive, got {self.sample_s!r} s")
+        if not (np.isfinite(self.warm_up_s) and self.warm_up_s >= 0.0):
+            raise ValueError(f"warm_up_s must be finite and zero or more, got {self.warm_up_s!r} s")
+        if not (np.isfinite(self.duration_s) and self.duration_s >= MIN_STEPS * self.sample_s):
+            raise ValueError(
+                f"duration_s must hold at least {MIN_STEPS} sampling steps of "
+                f"{self.sample_s!r} s, got {self.duration_s!r} s"
+            )
+        if not 0.0 < self.cfl <= 1.0:
+            raise ValueError(f"cfl must be above 0 and at most 1, got {self.cfl!r}")
+        if not 0.0 <= self.coldest_T_e_eV < np.inf:
+            raise ValueError(
+                f"coldest_T_e_eV must be finite and zero or more, got {self.coldest_T_e_eV!r} eV"
+            )
+
+
+def to_json(parameters: dict[str, Any]) -> str:
+    """Nested dataclasses as JSON, each with the name of its class, keys sorted."""
+
+    def plain(value: Any) -> Any:
+        if is_dataclass(value) and not isinstance(value, type):
+            members = {name: plain(getattr(value, name)) for name in asdict(value)}
+            return {"class": type(value).__name__, **members}
+        if isinstance(value, dict):
+            return {name: plain(member) for name, member in value.items()}
+        return list(value) if isinstance(value, tuple) else value
+
+    return json.dumps(plain(parameters), sort_keys=True)

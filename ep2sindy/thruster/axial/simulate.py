@@ -1,0 +1,266 @@
+"""Run the axial fluid model and return what it did as an xarray.Dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from tqdm import tqdm
+
+from ep2sindy.thruster.axial import kernels
+from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
+from ep2sindy.thruster.axial.grid import cell_faces
+from ep2sindy.thruster.axial.model import CFL, build_model, lengths_and_centres
+from ep2sindy.thruster.axial.output import (
+    POWERS,
+    as_dataset,
+    field_columns,
+    series_of,
+)
+from ep2sindy.thruster.axial.settings import Settings, to_json
+from ep2sindy.thruster.axial.starts import (
+    GuessedStart,
+    Restart,
+    Start,
+    end_of,
+    stored_energy,
+)
+from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, PER_CHARGE, SERIES_SUMS, Model, State
+from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.propellants import uncovered
+from ep2sindy.thruster.verdict import diagnose, performance
+
+CHUNK_ROWS = 50  # samples between two updates of the progress bar
+
+
+def simulate(
+    thruster: Thruster,
+    operating_point: OperatingPoint,
+    *,
+    duration_s: float = 18e-3,
+    warm_up_s: float = 2e-3,
+    sample_s: float = 1.5e-6,
+    averaged: bool = True,
+    n_cells: int = 100,
+    stretch: float = 2.0,
+    reconstruct: bool = True,
+    cfl: float = CFL,
+    coldest_T_e_eV: float = 0.0,
+    initial: Start | xr.Dataset | str | Path | None = None,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Simulate one operating point and record it at equal steps after a warm-up.
+
+    averaged: record averages over each sampling step, as probes and most codes' output are, with
+    the products and fluxes that close its balance; False takes the values at its end, which alias
+    what is faster. stretch: length of the plume's cells over the channel's; with 1 all are alike.
+    reconstruct: van Leer's slopes, or first-order fluxes. coldest_T_e_eV: T_e is held above it,
+    as HallThruster.jl does at 1.5 eV; the energy balance then misses what that adds. initial:
+    `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of another run: its Dataset or
+    NetCDF file.
+
+    Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
+    (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the
+    parameters as JSON, `initial`, `status` (oscillating, transit, steady, decaying or diverged;
+    see `judge_status`), `cycle`, `f_kHz`, mean and standard deviation of I_d, thrust, specific
+    impulse and efficiency, and `mass_balance` and `energy_balance` (out plus stored over in).
+    A diverged run ends at its last finite sample and says so; it is not an error.
+    Raises ValueError for settings that cannot be run.
+    """
+    settings = Settings(
+        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,
+        coldest_T_e_eV,
+    )  # fmt: skip
+    return simulate_as(settings, thruster, operating_point, as_start(initial), progress=progress)
+
+
+def simulate_as(
+    settings: Settings, thruster: Thruster, point: OperatingPoint, start: Start, *, progress: bool
+) -> xr.Dataset:
+    """`simulate`, with its settings as one value."""
+    parameters = to_json({"thruster": thruster, "operating_point": point, "settings": settings})
+    faces = cell_faces(thruster, settings.n_cells, settings.stretch)
+    model = build_model(
+        thruster, point, faces, cfl=settings.cfl, reconstruct=settings.reconstruct,
+        coldest_eV=settings.coldest_T_e_eV,
+    )  # fmt: skip
+    with _bar(settings, start, point.label, progress) as bar:
+        record = run(model, start, lengths_and_centres(faces)[1], parameters, settings, bar)
+    field = _dataset(record, model, settings, point, faces)
+    field.attrs = {
+        "title": "1-D axial Hall-thruster fluid model",
+        "parameters": parameters,
+        **_attributes(field, record, model, point, thruster, settings.sample_s),
+    }
+    return field
+
+
+def as_start(initial: Start | xr.Dataset | str | Path | None) -> Start:
+    """A start by itself, or the end of the run that was named instead."""
+    if initial is None:
+        return GuessedStart()
+    if isinstance(initial, xr.Dataset | str | Path):
+        return Restart(initial)
+    return initial
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What a run recorded, where it ended, and the heat it held at the record's two ends, in J."""
+
+    fields: Float[np.ndarray, "sums samples cells"]
+    series: Float[np.ndarray, "samples series"]
+    state: State
+    stored_J: tuple[float, float]
+    diverged: bool
+    start: str
+
+
+def run(
+    model: Model,
+    start: Start,
+    z: Float[np.ndarray, " cells"],
+    parameters: str,
+    settings: Settings,
+    bar: tqdm,
+) -> Record:
+    """Start, hold, warm up and record; a run that breaks ends with its last whole sample."""
+    state, goes_on = start.state(model, z, parameters), start.goes_on(z)
+    charges, size = state.n_i.shape
+    n_fields = len(CELL_SUMS) + PER_CHARGE * (charges - 1)
+    quiet = model if start.resistance is None else model._replace(resistance=start.resistance)
+    n_hold, n_warm_up, n_samples = _rows(settings, start)
+    whole = goes_on or first_fields(state, model)
+    for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
+        whole = whole and _pass(each, state, settings, n_rows, n_fields, bar)
+    before = stored_energy(state, model)
+    fields = np.empty((n_fields, n_samples if whole else 0, size - 2), np.float32)
+    series = np.empty((fields.shape[1], len(SERIES_SUMS)))
+    filled = _fill(model, state, settings, fields, series, bar)
+    return Record(
+        fields[:, :filled],
+        series[:filled],
+        state,
+        (before, stored_energy(state, model)),
+        diverged=filled < n_samples,
+        start=start.told(z),
+    )
+
+
+def first_fields(state: State, model: Model) -> bool:
+    """Field, rates and current of profiles, for the first step to see; False where it breaks."""
+    start_density(state)
+    rows, work = np.zeros(state.n_n.size, np.uint64), np.zeros((26, state.n_n.size))
+    return electron_step(state, model, 0.0, rows, work)
+
+
+def _rows(settings: Settings, start: Start) -> tuple[int, int, int]:
+    """Samples that the start holds, of the warm-up, and of the record."""
+    step = settings.sample_s
+    held, warm_up = round(start.hold_s / step), round(settings.warm_up_s / step)
+    return held, warm_up, round(settings.duration_s / step) + 1
+
+
+def _bar(settings: Settings, start: Start, label: str, progress: bool) -> tqdm:
+    total = sum(_rows(settings, start))
+    return tqdm(total=total, desc=label, unit="sample", disable=not progress)
+
+
+def _pass(
+    model: Model, state: State, settings: Settings, n_rows: int, n_fields: int, bar: tqdm
+) -> bool:
+    """Advance by n_rows samples without keeping them; False where the run breaks."""
+    fields = np.empty((n_fields, CHUNK_ROWS, state.n_n.size - 2), np.float32)
+    series = np.empty((CHUNK_ROWS, len(SERIES_SUMS)))
+    while n_rows > 0:
+        n = min(n_rows, CHUNK_ROWS)
+        if _fill(model, state, settings, fields[:, :n], series[:n], bar) < n:
+            return False
+        n_rows -= n
+    return True
+
+
+def _fill(
+    model: Model,
+    state: State,
+    settings: Settings,
+    fields: Float[np.ndarray, "sums samples cells"],
+    series: Float[np.ndarray, "samples series"],
+    bar: tqdm,
+) -> int:
+    """Advance and record until the arrays are full or the run breaks; how many samples it took."""
+    filled = 0
+    while filled < len(series):
+        part = slice(filled, filled + CHUNK_ROWS)
+        done = kernels.advance(
+            state, model, settings.sample_s, settings.averaged, fields[:, part], series[part]
+        )
+        filled += done
+        bar.update(done)
+        if done < len(series[part]):
+            break
+    return filled
+
+
+def _dataset(
+    record: Record,
+    model: Model,
+    settings: Settings,
+    point: OperatingPoint,
+    faces: Float[np.ndarray, " faces"],
+) -> xr.Dataset:
+    columns = field_columns(charges=len(record.state.n_i), averaged=settings.averaged)
+    fields = {
+        name: (record.fields[place], unit, text) for name, (place, unit, text) in columns.items()
+    }
+    series = series_of(record.series, model, voltage=point.voltage, sample_s=settings.sample_s)
+    end = end_of(record.state)
+    return as_dataset(fields, series, end, sample_s=settings.sample_s, faces=faces)
+
+
+def _attributes(
+    field: xr.Dataset,
+    record: Record,
+    model: Model,
+    point: OperatingPoint,
+    thruster: Thruster,
+    sample_s: float,
+) -> dict[str, Any]:
+    """Verdict, performance, balances, and what a restart needs beside the profiles."""
+    attributes = {"initial": record.start, **diagnose(field, diverged=record.diverged)}
+    if field.sizes["time"]:
+        mean = {name: float(field[name].mean()) for name in ("I_d", "V_d", "thrust", "I_wall")}
+        attributes |= performance(
+            point, thrust_N=mean["thrust"], current_A=mean["I_d"], voltage_V=mean["V_d"]
+        )
+        attributes["I_wall_mean"] = mean["I_wall"]
+        seconds = sample_s * field.sizes["time"]
+        attributes["energy_balance"] = energy_balance(field, record, seconds)
+        if "dn_n_dt" in field:
+            attributes["mass_balance"] = mass_balance(field, model, seconds)
+    hottest = float(field["T_e_eV"].max()) if field.sizes["time"] else 0.0
+    attributes["rates"] = uncovered(thruster.propellant, hottest) or "covered"
+    attributes["end_I_d"] = float(record.state.instant[0])
+    return attributes
+
+
+def mass_balance(field: xr.Dataset, model: Model, seconds: float) -> float:
+    """Propellant that left plus propellant that accumulated, over propellant that entered."""
+    heavy = [name for name in field.data_vars if str(name).startswith("dn_")]
+    gained = sum(field[name].mean("time").astype(float) for name in heavy)
+    per_area = model.ion_mass * model.area
+    accumulated = per_area * float((gained * field["dz"]).sum()) * seconds
+    return (float(field["mass_out"][-1]) + accumulated) / (
+        per_area * model.neutral_inflow * seconds
+    )
+
+
+def energy_balance(field: xr.Dataset, record: Record, seconds: float) -> float:
+    """What field, collisions, walls and ends took plus what the electrons stored, over P_in."""
+    out = sum(float(field[name].mean()) for name in POWERS[1:])
+    stored = (record.stored_J[1] - record.stored_J[0]) / seconds
+    return (out + stored) / float(field[POWERS[0]].mean())

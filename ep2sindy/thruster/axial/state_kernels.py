@@ -1,0 +1,118 @@
+"""What the compiled loop works on: constants of a run, its state, and what it sums up.
+
+Cell arrays hold one ghost cell at each end: index 0 lies behind the anode, index -1 beyond the
+cathode plane; cells 1 .. n are the domain. Face i lies between cells i and i + 1. Species arrays
+have one row per charge state.
+
+The loops of these kernels are short and touch few arrays each: so the compiler turns them into
+vector instructions.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ep2sindy.machine.compilation import compiled
+
+# Sums may be reordered; infinities and NaNs must stay what they are: they end a run.
+ENTRY: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp", "nsz"}}
+# For what only kernels call: without the wrappers for Python, which would double the time to
+# compile, and inlined, since a call costs as much as a loop over the cells.
+FAST: dict[str, Any] = {
+    **ENTRY,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    "forceinline": True,
+}
+
+SHORTEST_STEP = 1e-5  # of a sample: what needs shorter steps has diverged
+
+# What a run records, in the order of `Sums.cells`: averages over a sample, or its last values.
+CELL_SUMS = (
+    N_N, T_E, R_ION, E_Z, IONIZATION, WALL_LOSS, ENERGY, FACE_N, CHANGE_N,
+    N_I, U_IZ, FLUX_I, FACE_I, CHANGE_I,
+) = range(14)  # fmt: skip
+PER_CHARGE = 5  # the last five, once more for every further charge state
+SERIES_SUMS = (
+    CURRENT, THRUST, WALL_CURRENT, BEAM, IONS_OUT, NEUTRALS_OUT,
+    POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE,
+) = range(12)  # fmt: skip
+
+
+# Unsigned indices: numba lets negative ones count from the end, which costs the vectors.
+ONE = np.uint64(1)
+
+
+@compiled(**FAST)
+def inside(values):
+    """Indices of all cells but the ghosts."""
+    return range(ONE, np.uint64(values.size) - ONE)
+
+
+@compiled(**FAST)
+def faces(values):
+    """Indices of all faces, each that of the cell on its anode side."""
+    return range(np.uint64(0), np.uint64(values.size) - ONE)
+
+
+class Model(NamedTuple):
+    """Everything the compiled loop needs that does not change in time."""
+
+    dz: np.ndarray  # (n + 2,), m: lengths of the cells
+    inverse_dz: np.ndarray  # (n + 2,), 1/m
+    between: np.ndarray  # (n + 1,), m: distance of the centres beside each face
+    to_left: np.ndarray  # (n + 2,): length of a cell over the distance to its left neighbour
+    to_right: np.ndarray  # (n + 2,)
+    reconstruct: bool  # van Leer's slopes, or none
+    area: float  # m^2
+    ion_mass: float  # kg
+    sound_speed_squared: float  # k_B T_i / m, m^2/s^2
+    neutral_speed: float  # m/s
+    birth_speed: float  # of ions born of neutrals, m/s
+    neutral_inflow: float  # 1/(m^2 s)
+    voltage: float  # V_0 - V_c, V
+    resistance: float  # ohm
+    pressure_factor: float  # p_e = pressure_factor * n * T_e
+    conduction_factor: float  # kappa = factor / (1 + coulomb * nu_ei / nu) * mu * n * T_e
+    conduction_coulomb: float
+    drift_weight: float  # 1: rates see the electrons' drift energy; 0: they do not
+    drift_credit: bool  # some inelastic events are paid from it, not from the heat
+    sheath: bool  # at the anode, or a temperature that is held there
+    sheath_weight: float  # share of its drop that electrons pay with heat
+    anode_T_e_eV: float  # eV
+    cathode_T_e_eV: float  # eV
+    coldest_eV: float  # T_e is held above: no energy balance then
+    cfl: float
+    omega_ce: np.ndarray  # (n + 2,), rad/s
+    anomalous: np.ndarray  # (n + 2,), 1/s
+    wall_ion_weight: np.ndarray  # (n + 2,): ion loss, electron collisions and power loss
+    wall_collision_weight: np.ndarray
+    wall_power_weight: np.ndarray
+    table: np.ndarray  # (temperatures, columns), as `closure_table` fills it
+    table_step_eV: float
+    second_thresholds_eV: tuple[float, float]  # of X -> X2+ and X+ -> X2+
+
+
+class State(NamedTuple):
+    """Cell arrays that the loop advances in place."""
+
+    n_i: np.ndarray  # (charges, n + 2), m^-3
+    flux_i: np.ndarray  # (charges, n + 2), n_i u_i, 1/(m^2 s)
+    n_n: np.ndarray  # (n + 2,), m^-3
+    T_e_eV: np.ndarray  # (n + 2,)
+    energy: np.ndarray  # (n + 2,), 1.5 n_e T_e, eV/m^3
+    drift_eV: np.ndarray  # (n + 2,), K, kinetic energy of the electrons' drift
+    n_e: np.ndarray  # (n + 2,), m^-3
+    flux_q: np.ndarray  # (n + 2,), charge flux of all ions over e
+    log_n: np.ndarray  # (2, n + 2): ln n_e and the n_e it was taken at
+    E: np.ndarray  # (n + 2,), V/m
+    rates: np.ndarray  # (3, n + 2), m^3/s: X -> X+, X -> X2+, X+ -> X2+
+    wall_loss: np.ndarray  # (n + 2,), 1/s, of singly charged ions
+    instant: np.ndarray  # (series,), the series' present values
+
+
+class Sums(NamedTuple):
+    """Integrals over the time of one sample."""
+
+    cells: np.ndarray  # (cell sums, n + 2)
+    series: np.ndarray  # (series,)

@@ -1,0 +1,189 @@
+"""Run the (z, r) fluid model and return what it did as an xarray.Dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from tqdm import tqdm
+
+from ep2sindy.thruster.axial.settings import Settings, to_json
+from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.plane.balance import diagnose
+from ep2sindy.thruster.plane.build import build_model, check_thruster, initial_state
+from ep2sindy.thruster.plane.grid import MaskedGrid
+from ep2sindy.thruster.plane.kernels import advance
+from ep2sindy.thruster.plane.state_kernels import Model, State
+from ep2sindy.thruster.propellants import XenonFits
+from ep2sindy.thruster.transport import AnomalousTransport
+
+CHUNK_ROWS = 50  # samples between two updates of the progress bar
+
+PLANES = {  # variable -> unit, long name, in the order the compiled loop fills them
+    "n_i": ("m^-3", "ion density"),
+    "n_n": ("m^-3", "neutral density"),
+    "u_iz": ("m/s", "axial ion velocity"),
+    "u_ir": ("m/s", "radial ion velocity, outward"),
+}
+PROFILES = {
+    "T_e_eV": ("eV", "electron temperature, of z alone"),
+    "R_ion": ("m^3/s", "ionisation rate coefficient, of z alone"),
+    "E_z": ("V/m", "axial electric field where the density is the reference density"),
+}
+SERIES = {
+    "I_d": ("A", "discharge current"),
+    "thrust": ("N", "axial ion momentum that leaves the domain"),
+    "mass_out": ("kg", "xenon that left the domain since the start"),
+    "mass_held": ("kg", "xenon in the domain"),
+    "V_d": ("V", "discharge voltage behind the series resistance"),
+}
+
+# Its cycle is nearly the same on every grid from 62 x 74 on: see docs/thruster.md.
+THRUSTER_2D = Thruster(
+    transport=AnomalousTransport(c_channel=1 / 300, c_plume=1 / 160),
+    propellant=XenonFits(drift_weight=0.0),
+    conduction_factor=2.4,
+    series_resistance=2.0,
+)
+OPERATING_POINT_2D = OperatingPoint(300.0, 5.0, neutral_speed=240.0)
+
+
+def simulate_2d(
+    thruster: Thruster = THRUSTER_2D,
+    operating_point: OperatingPoint = OPERATING_POINT_2D,
+    *,
+    duration_s: float = 18e-3,
+    warm_up_s: float = 2e-3,
+    sample_s: float = 1.5e-6,
+    n_z: int = 41,
+    n_r: int = 49,
+    averaged: bool = True,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Simulate one operating point in (z, r) and sample it at equal steps after a warm-up.
+
+    averaged: a sample is the mean over the sampling step that ends at its time; otherwise the
+    state at that time, which aliases oscillations faster than half the sampling rate.
+
+    Returns a Dataset on ("time", "z", "r"), time in s from the end of the warm-up: PLANES on all
+    three (float32, NaN in the thruster's body), PROFILES in time and z, SERIES in time
+    (float64). The electrons are quasi-one-dimensional, so T_e_eV and R_ion do not depend on r.
+    Attributes as those of `simulate`. A diverged run ends at its last finite sample and says so.
+    Raises ValueError for settings that cannot be run.
+    """
+    Settings(duration_s, warm_up_s, sample_s)  # checks them
+    check_thruster(thruster)
+    grid = MaskedGrid(thruster, n_z, n_r)
+    model = build_model(thruster, operating_point, grid)
+    n_samples = round(duration_s / sample_s) + 1
+    rows = warmed_up_run(
+        grid, model, round(warm_up_s / sample_s), n_samples, sample_s, averaged,
+        tqdm(desc=operating_point.label, unit="sample", disable=not progress),
+    )  # fmt: skip
+    field = as_dataset(rows, sample_s, grid)
+    drop = thruster.series_resistance * field["I_d"].values
+    field["V_d"] = ("time", operating_point.voltage - drop, attributes(SERIES["V_d"]))
+    settings = {
+        "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
+        "n_z": n_z, "n_r": n_r, "averaged": averaged,
+    }  # fmt: skip
+    parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
+    field.attrs = {
+        "title": "2-D (z, r) Hall-thruster fluid model",
+        "note": "electrons are quasi-one-dimensional: T_e_eV, R_ion and E_z depend on z alone",
+        "parameters": to_json(parameters),
+        **diagnose(field, operating_point, diverged=len(rows.series) < n_samples),
+    }
+    return field
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Sampled arrays, one row per sample."""
+
+    planes: list[Float[np.ndarray, "time z r"]]
+    profiles: Float[np.ndarray, "time profiles z"]
+    series: Float[np.ndarray, "time series"]
+
+    def until(self, n_rows: int) -> Rows:
+        """The first rows, as views."""
+        planes = [plane[:n_rows] for plane in self.planes]
+        return Rows(planes, self.profiles[:n_rows], self.series[:n_rows])
+
+
+def warmed_up_run(
+    grid: MaskedGrid,
+    model: Model,
+    n_warm_up: int,
+    n_samples: int,
+    sample_s: float,
+    averaged: bool,
+    bar: tqdm,
+) -> Rows:
+    """The samples after the warm-up; of a warm-up that diverges, its last finite ones."""
+    state = initial_state(grid, model)
+    bar.total = n_warm_up + n_samples
+    with bar:
+        while n_warm_up:
+            n_rows = min(n_warm_up, CHUNK_ROWS)
+            rows = march(state, model, grid, n_rows, sample_s, averaged, bar)
+            if len(rows.series) < n_rows:
+                return rows
+            n_warm_up -= n_rows
+        return march(state, model, grid, n_samples, sample_s, averaged, bar)
+
+
+def march(
+    state: State,
+    model: Model,
+    grid: MaskedGrid,
+    n_rows: int,
+    sample_s: float,
+    averaged: bool,
+    bar: tqdm,
+) -> Rows:
+    """Advance `state` by n_rows samples; fewer rows come back where it diverges."""
+    rows = Rows(
+        [np.full((n_rows, grid.n_z, grid.n_r), np.nan, np.float32) for _ in PLANES],
+        np.empty((n_rows, len(PROFILES), grid.n_z), np.float32),
+        np.empty((n_rows, len(SERIES) - 1)),
+    )
+    filled = 0
+    while filled < n_rows:
+        chunk = slice(filled, min(filled + CHUNK_ROWS, n_rows))
+        planes = [plane[chunk] for plane in rows.planes]
+        done, _ = advance(
+            state, model, sample_s, averaged, *planes, rows.profiles[chunk], rows.series[chunk]
+        )
+        filled += done
+        bar.update(done)
+        if filled < chunk.stop:
+            break
+    return rows.until(filled)
+
+
+def attributes(entry: tuple[str, str]) -> dict[str, str]:
+    """Unit and name as xarray keeps them."""
+    return {"units": entry[0], "long_name": entry[1]}
+
+
+def as_dataset(rows: Rows, sample_s: float, grid: MaskedGrid) -> xr.Dataset:
+    """Label the sampled arrays with dimensions, units and names, without copying the planes."""
+    data: dict[str, tuple] = {
+        name: (("time", "z", "r"), plane, attributes(entry))
+        for (name, entry), plane in zip(PLANES.items(), rows.planes, strict=True)
+    }
+    for k, (name, entry) in enumerate(PROFILES.items()):
+        data[name] = (("time", "z"), np.ascontiguousarray(rows.profiles[:, k]), attributes(entry))
+    for k, name in enumerate(list(SERIES)[:-1]):
+        data[name] = ("time", rows.series[:, k].copy(), attributes(SERIES[name]))
+    time = sample_s * np.arange(len(rows.series))
+    coords = {
+        "time": ("time", time, {"units": "s", "long_name": "time after the warm-up"}),
+        "z": ("z", grid.z, {"units": "m", "long_name": "axial distance from the anode"}),
+        "r": ("r", grid.r, {"units": "m", "long_name": "radius"}),
+    }
+    # "s" is a unit here, not a calendar: decode with decode_times=False
+    return xr.Dataset(data, coords=coords)

@@ -1,0 +1,126 @@
+"""What the compiled loops share: the constants of a run, and the arrays that they advance.
+
+Arrays on the grid are (n_z, n_r), indexed [i, j]; column i is active for lower[i] <= j < upper[i].
+Axial face i lies between columns i - 1 and i, radial face j between rows j - 1 and j. The bounds
+are unsigned: a loop that might begin below zero would pick an index at every access, and not
+vectorise. So neighbours in a row are j - ONE and j + ONE.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# No "nnan" or "ninf": a run that diverges is told by numbers that are not finite.
+FAST: dict[str, Any] = {
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
+}
+
+ONE = np.uint64(1)
+
+# Columns of `Model.table`, one row per electron temperature; coefficients in SI, energies in eV.
+(
+    IONIZATION,
+    INELASTIC,
+    EVENTS,
+    MOMENTUM,
+    COULOMB,
+    COULOMB_LOG,
+    WALL_COLLISIONS,  # of electrons, per ion that reaches the wall
+    WALL_ENERGY,  # lost by electrons, per ion that reaches the wall
+) = range(8)
+
+
+class Model(NamedTuple):
+    """Everything the compiled loops need that does not change in time."""
+
+    dz: float  # m
+    dr: float  # m
+    exit_column: int  # the first one beyond the channel
+    lower: np.ndarray  # (n_z,), rows of the plasma
+    upper: np.ndarray
+    area: np.ndarray  # (n_r,), of a row's cross-section, m^2
+    per_area: np.ndarray
+    perimeter: np.ndarray  # (n_r + 1,), area of a radial face per length along z, m
+    ion_mass: float  # kg
+    ion_sound_squared: float  # k_B T_i / m, m^2/s^2
+    electron_sound_squared: float  # e / m, per eV of T_e
+    neutral_speed: float  # m/s
+    neutral_diffusion: float  # m^2/s
+    neutral_inflow: float  # 1/(m^2 s)
+    voltage: float  # V_0 - V_c, V
+    resistance: float  # ohm
+    conduction_factor: float  # kappa = conduction_factor * mu * n * T_e
+    drift_weight: float  # 1: rates see the electrons' drift energy; 0: they do not
+    boundary_T_e_eV: float  # eV
+    cfl: float
+    omega_ce: np.ndarray  # (n_z,), rad/s
+    anomalous: np.ndarray  # (n_z,), 1/s
+    table: np.ndarray  # (temperatures, 8)
+    table_step_eV: float
+
+
+class Gas(NamedTuple):
+    """Conserved quantities of ions and neutrals, and the velocities that follow; (n_z, n_r)."""
+
+    n: np.ndarray  # n_i, m^-3
+    flux_z: np.ndarray  # n_i u_iz, 1/(m^2 s)
+    flux_r: np.ndarray
+    neutrals: np.ndarray  # m^-3
+    u_z: np.ndarray  # m/s
+    u_r: np.ndarray
+
+
+class State(NamedTuple):
+    """Arrays that the loops advance in place."""
+
+    gas: Gas
+    stage: Gas  # of the Runge-Kutta step
+    E: np.ndarray  # (n_z, n_r), axial field, V/m
+    log_n: np.ndarray  # (n_z, n_r), ln(n_i m^3)
+    T_e_eV: np.ndarray  # (n_z,)
+    energy: np.ndarray  # (n_z,), 1.5 N T_e, eV/m
+    drift_eV: np.ndarray  # (n_z,), kinetic energy of the electrons' drift
+    ionization: np.ndarray  # (n_z,), rate coefficient, m^3/s
+    reference_field: np.ndarray  # (n_z,), -dphi*/dz, V/m
+    wall: np.ndarray  # (n_z,), ions lost to walls in the last step, 1/(m s)
+    side: np.ndarray  # (n_z,), ions that left through the sides of the plume, 1/(m s)
+    current: np.ndarray  # (1,), A
+    left: np.ndarray  # (1,), atoms and ions that left since the start
+
+
+class Fluxes(NamedTuple):
+    """Of ion density, ion momentum along z and along r, and neutrals; one row more than cells."""
+
+    n: np.ndarray
+    z: np.ndarray
+    r: np.ndarray
+    neutrals: np.ndarray
+
+
+class Work(NamedTuple):
+    """Scratch arrays of the heavy step."""
+
+    slopes: Gas
+    axial: Fluxes  # (n_z + 1, n_r)
+    radial: Fluxes  # (n_z, n_r + 1), times the perimeter
+    rates: Fluxes  # (n_z, n_r), net inflow per volume
+    born: np.ndarray  # (n_r,)
+
+
+class Columns(NamedTuple):
+    """Sums over r, (n_z,) each: of densities times row areas."""
+
+    n: np.ndarray  # 1/m
+    flux: np.ndarray  # 1/s, with what the sides of the plume carry
+    n_neutrals: np.ndarray  # sum of n_i n_n, 1/m^4
+    n_n: np.ndarray  # sum of n_i^2
+    log_ref: np.ndarray  # ln(n_ref)
+    nu: np.ndarray  # 1/s
+    conductance: np.ndarray  # mu N, 1/(m V s) * m^2
+    loss: np.ndarray  # eV/(m s)
+    loss_slope: np.ndarray  # 1/(m s)
+    heating: np.ndarray  # eV/(m s)
+    electron_flux: np.ndarray  # 1/s
+    upper: np.ndarray
+    right: np.ndarray

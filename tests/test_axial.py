@@ -1,0 +1,211 @@
+"""The axial model's averages, balances, starts and options: exact, on short runs."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.thruster.axial.grid import cell_faces
+from ep2sindy.thruster.verdict import diagnose, judge_status
+
+POINT = ep.OperatingPoint(300.0, 5.0)
+BRIEF = {
+    "duration_s": 3e-4, "warm_up_s": 1e-4, "n_cells": 40, "stretch": 1.0, "progress": False,
+}  # fmt: skip
+ZONE = (0.015, 0.025)
+
+
+def simulate(thruster=None, point=POINT, **settings):
+    return ep.simulate(thruster or ep.Thruster(), point, **(BRIEF | settings))
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate()
+
+
+def largest(balance):
+    return max(float(np.abs(balance[name]).max()) for name in balance if name != "residual")
+
+
+@pytest.mark.parametrize("settings", [{}, {"stretch": 2.0}, {"reconstruct": False}])
+def test_the_balance_of_a_zone_closes_over_every_sample(settings):
+    balance = ep.zone_balance(simulate(**settings), ZONE)
+    assert float(np.abs(balance["residual"]).max()) < 1e-6 * largest(balance)  # float32 fields
+    ions = balance["change_i"] - balance["inflow_i"] - balance["ionization"] + balance["wall_loss"]
+    assert float(np.abs(ions).max()) < 1e-6 * largest(balance)
+
+
+@pytest.mark.parametrize(
+    "thruster",
+    [
+        ep.Thruster(),
+        ep.Thruster(anode=ep.AnodeSheath()),
+        ep.Thruster(propellant=ep.propellant("xenon"), charge_states=2),
+        ep.Thruster(propellant=ep.propellant("krypton"), conduction_coulomb=0.7),
+    ],
+    ids=["default", "anode sheath", "two charges", "krypton"],
+)
+def test_mass_and_energy_are_conserved(thruster):
+    field = simulate(thruster)
+    assert field.attrs["mass_balance"] == pytest.approx(1.0, abs=1e-6)  # float32 fields
+    assert field.attrs["energy_balance"] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_where_the_power_goes_adds_up(run):
+    lost = sum(run[name] for name in ("P_inelastic", "P_wall", "P_anode", "P_cathode"))
+    heated = run["P_in"] - run["P_ions"]
+    assert float(lost.mean()) == pytest.approx(float(heated.mean()), rel=0.3)  # the rest is stored
+    volts = run["P_in"] / run["I_d"]
+    assert np.all(volts < 300.0 - 20.0)  # what cathode and resistor leave to the plasma
+
+
+def test_samples_are_averages_over_their_step():
+    fine = simulate(sample_s=1e-6, duration_s=1e-4, cfl=0.2)
+    coarse = simulate(sample_s=1e-5, duration_s=1.6e-4, cfl=0.2)
+    blocks = fine["n_i"].values[:100].astype(float).reshape(10, 10, 40).mean(axis=1)
+    # each sample is cut into equal steps, so these differ, and the coupled code is of first order
+    np.testing.assert_allclose(blocks, coarse["n_i"].values[:10], rtol=2e-2)
+    instants = fine["n_i"].values[9:100:10]  # at the ends of the coarse samples
+    assert np.abs(instants / coarse["n_i"].values[:10] - 1.0).max() > 0.1
+
+
+def test_instantaneous_samples_on_request():
+    field = simulate(averaged=False)
+    assert "ionization" not in field
+    assert "mass_balance" not in field.attrs
+    assert float(np.abs(field["n_i"] - simulate()["n_i"]).max()) > 0.0
+    np.testing.assert_array_equal(field["n_i"].values[-1], field["end_n_i"].values.astype("f4"))
+
+
+def test_the_average_of_a_product_is_not_the_product_of_averages(run):
+    product = run["n_i"] * run["n_n"] * run["R_ion"]
+    assert not np.allclose(run["ionization"], product, rtol=1e-4)
+    assert 0.9 < float((run["ionization"] / product).median()) < 1.1
+    zone = ep.Zone(z=ZONE)
+    data = ep.zone_average(run, zone, states=["n_i"], products=["R_ion*n_i*n_n", "n_i*u_iz"])
+    kept = ep.zone_average(run, zone, states=["n_i"], inputs=["ionization", "flux_i"])
+    np.testing.assert_array_equal(data.inputs, kept.inputs)
+    assert data.units["<R_ion*n_i*n_n>"] == "m^-3 s^-1"
+
+
+def test_a_restart_goes_on_to_the_last_digit(tmp_path):
+    whole = simulate(duration_s=6e-4)
+    first = simulate(duration_s=3e-4)
+    first.to_netcdf(tmp_path / "first.nc", engine="h5netcdf")
+    for initial in (first, tmp_path / "first.nc", ep.Restart(first)):
+        rest = simulate(initial=initial, warm_up_s=0.0, duration_s=2e-4)
+        after = whole.isel(time=slice(first.sizes["time"], None))
+        np.testing.assert_array_equal(rest["n_i"], after["n_i"].values[: rest.sizes["time"]])
+        np.testing.assert_array_equal(rest["I_d"], after["I_d"].values[: rest.sizes["time"]])
+
+
+def test_a_restart_on_another_grid_is_interpolated_and_says_so(run):
+    field = simulate(initial=run, n_cells=60, warm_up_s=0.0)
+    assert field.attrs["initial"].endswith("interpolated from 40 to 60 cells")
+    guessed = simulate(n_cells=60, warm_up_s=0.0)
+    for name, near in {"n_i": 0.2, "n_n": 0.1}.items():  # in one sample n_i changes by a tenth
+        there = run[name].isel(time=-1).interp(z=field["z"]).dropna("z")
+        off = np.abs(field[name].isel(time=0) / there - 1.0).median()
+        assert off < near
+    assert np.abs(guessed["n_n"].isel(time=0) / there - 1.0).median() > 0.1
+
+
+def test_a_restart_at_another_operating_point_is_a_continuation(run):
+    field = simulate(point=ep.OperatingPoint(310.0, 5.0), initial=run, warm_up_s=0.0)
+    assert "interpolated" not in field.attrs["initial"]
+    same = simulate(initial=run, warm_up_s=0.0)
+    np.testing.assert_allclose(field["n_n"][0], same["n_n"][0], rtol=1e-3)
+    assert 0.0 < float(field["I_d"][0] - same["I_d"][0]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda run: simulate(ep.Thruster(inner_radius=0.034), initial=run),
+         r"only in the same thruster: inner_radius was 0\.035 and is 0\.034; start from ColdStart"),
+        (lambda run: simulate(ep.Thruster(propellant=ep.propellant("krypton")), initial=run),
+         r"only in the same thruster: propellant was"),
+        (lambda run: simulate(initial=run[["n_i"]]), r"must be a run of simulate, which keeps"),
+        (lambda run: simulate(initial="there/is/none.nc"), r"no such run to go on from: /"),
+        (lambda run: simulate(stretch=0.5), r"stretch must be between 1 .* got 0\.5"),
+        (lambda run: simulate(cfl=1.5), r"cfl must be above 0 and at most 1, got 1\.5"),
+        (lambda run: ep.SoftStart(resistance=-1.0), r"SoftStart\.resistance must be .* positive"),
+        (lambda run: ep.zone_balance(run, (0.03, 0.06)), r"must hold cells and end before the la"),
+        (lambda run: ep.zone_balance(run[["n_i"]], ZONE), r"simulate with averaged=True"),
+    ],
+)  # fmt: skip
+def test_bad_input_says_the_way_out(run, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(run)
+
+
+@pytest.mark.parametrize("start", [ep.ColdStart(), ep.SoftStart(hold_s=1e-4), ep.GuessedStart()])
+def test_every_start_runs_and_is_named(start):
+    field = simulate(initial=start)
+    assert field.attrs["status"] != "diverged"
+    assert field.attrs["initial"] == start.label
+
+
+def test_a_soft_start_holds_back_until_it_is_released():
+    held, free = (
+        simulate(initial=start, warm_up_s=0.0)["I_d"].values
+        for start in (ep.SoftStart(hold_s=5e-4), ep.ColdStart())
+    )
+    assert held[0] < 6.0  # of 280 V over 40 ohm, 7 A, most is the plasma's
+    assert held.max() > 2.0 * held[0]  # let go
+    assert free.max() > 20.0  # it ignites
+
+
+def test_two_charges_are_ionised_further():
+    thruster = ep.Thruster(propellant=ep.propellant("xenon"), charge_states=2)
+    field = simulate(thruster)
+    share = float((field["n_i2"] / field["n_i"]).mean())
+    assert 1e-3 < share < 0.3
+    exit_speed = field["u_iz2"].isel(z=-1).mean() / field["u_iz"].isel(z=-1).mean()
+    assert 1.1 < float(exit_speed) < 1.5  # sqrt(2) for ions that fell all the way
+
+
+def test_first_order_fluxes_damp():
+    sharp, blunt = (simulate(reconstruct=on, duration_s=1e-3) for on in (True, False))
+    assert float(blunt["I_d"].std()) < float(sharp["I_d"].std())
+
+
+def test_a_stretched_grid_has_long_cells_in_the_plume():
+    thruster = ep.Thruster()
+    lengths = np.diff(cell_faces(thruster, 100, 2.0))
+    assert lengths.sum() == pytest.approx(thruster.domain_length)
+    assert lengths[-1] / lengths[0] == pytest.approx(2.0, rel=0.02)
+    assert np.all(np.abs(np.diff(lengths)) < 0.1 * lengths[:-1])  # smooth
+    np.testing.assert_allclose(np.diff(cell_faces(thruster, 50, 1.0)), 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("f_Hz", "status"), [(15e3, "oscillating"), (58e3, "oscillating"), (143e3, "transit")]
+)
+def test_a_transit_oscillation_is_told_from_breathing(f_Hz, status):
+    t = 1.5e-6 * np.arange(4000)
+    assert judge_status(4.0 + np.sin(2e0 * np.pi * f_Hz * t), 1.5e-6) == status
+
+
+@pytest.mark.parametrize(("amplitude", "cycle"), [(6.0, "strong"), (2.0, "weak")])
+def test_a_result_names_its_cycle(amplitude, cycle):
+    t = 1.5e-6 * np.arange(4000)
+    current = 4.0 + amplitude * np.sin(2.0 * np.pi * 14e3 * t)
+    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
+    assert diagnose(field, diverged=False)["cycle"] == cycle
+
+
+def test_rates_that_do_not_cover_the_run_say_so():
+    T = np.linspace(1.0, 12.0, 30)
+    xenon = ep.XenonFits()
+    table = ep.PropellantTable(
+        name="cold xenon", mass=xenon.mass, ionization_eV=12.13, excitation_eV=8.32,
+        T_e_eV=tuple(T),
+        ionization_rate=tuple(xenon.ionization(T)),
+        excitation_rate=tuple(xenon.events(T) - xenon.ionization(T)),
+        momentum_rate=tuple(xenon.momentum(T)),
+    )  # fmt: skip
+    field = simulate(ep.Thruster(propellant=table))
+    assert "cover T_e up to 12 eV, the run reached" in field.attrs["rates"]
+    assert simulate().attrs["rates"] == "covered"

@@ -1,0 +1,359 @@
+"""`+exp=simulate`: one run, a scan with points that break, and what studies say of simulations."""
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from omegaconf import DictConfig
+
+from ep2sindy.app.build import Configured
+from ep2sindy.app.runner import run_config
+from ep2sindy.app.schema import study_of
+from ep2sindy.figures import breathing
+from ep2sindy.figures.stability import curves_figure, stability_figure
+from ep2sindy.studies.parametric import study as parametric
+from ep2sindy.studies.parametric.opening import point_sources
+from ep2sindy.studies.simulate import Study
+from ep2sindy.studies.simulate_scan import Simulated, compile_kernels, scan_points, value_text
+from ep2sindy.studies.simulate_view import Outcome
+from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, doubts
+from tests import programs
+
+VOLTAGES = "scan={operating_point.voltage:[-5.0,250.0,300.0,5000.0]}"
+FIGURES = ("current", "spectrum", "profiles", "maps")
+GOOD = {
+    "status": "oscillating", "cycle": "strong", "f_kHz": 14.0, "I_d_mean": 4.0, "I_d_std": 5.0,
+    "parameters": "{}", "mass_balance": 1.0, "energy_balance": 0.9996, "rates": "covered",
+}  # fmt: skip
+
+
+def composed(*overrides: str) -> DictConfig:
+    return programs.composed("+exp=simulate", *overrides)
+
+
+def toy(folder: Path) -> list[str]:
+    """Overrides that run the experiment on short, coarse simulations, in this process."""
+    return [
+        "thruster=two_cycles",  # a set that says all of itself: the default one is tuned
+        "data.stretch=1.0",
+        f"output={folder}/outputs",
+        f"data.cache={folder}/cache",
+        "data.duration_s=6.0e-4",
+        "data.warm_up_s=0.0",
+        "data.n_cells=24",
+        "data.progress=false",
+        "parallel=serial",
+    ]
+
+
+def log_of(folder: Path) -> str:
+    return " ".join((folder / "run.log").read_text().split())
+
+
+def summary_of(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_config(composed(*toy(tmp_path_factory.mktemp("one")))).folder
+
+
+@pytest.fixture(scope="module")
+def field(one: Path) -> xr.Dataset:
+    with xr.open_dataset(one / "field.nc", engine="h5netcdf", decode_times=False) as stored:
+        return stored.load()
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A voltage that cannot be, two that breathe, one whose run breaks at once."""
+    return run_config(composed(*toy(tmp_path_factory.mktemp("scan")), VOLTAGES)).folder
+
+
+def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset) -> None:
+    summary = summary_of(one)
+    assert (summary["experiment"], summary["file"]) == ("simulate", "field.nc")
+    assert summary["status"] == field.attrs["status"] == "oscillating"
+    assert summary["I_d_mean"] == pytest.approx(float(field["I_d"].mean()))
+    assert summary["I_beam_mean"] == pytest.approx(float(field["I_beam"].mean()))
+    assert summary["thrust_N"] == pytest.approx(float(field["thrust"].mean()))
+    assert summary["initial"] == "guessed profiles"
+    assert "warnings" not in summary
+    power = summary["power_W"]
+    parts = sum(value for name, value in power.items() if name != "P_in")
+    assert parts == pytest.approx(power["P_in"])
+    assert power["stored"] == pytest.approx(0.0, abs=0.02 * power["P_in"])  # nothing is lost
+    log = log_of(one)
+    assert f"oscillating, {summary['cycle']} cycle, from guessed profiles" in log
+    assert re.search(r"breathing frequency │ \d+\.\d\d kHz", log)
+    assert re.search(r"thrust │ \d+\.\d mN", log)
+    assert "out/in mass 1.0000, energy 1.0000" in log
+    assert "work of the field on the ions" in log
+
+
+def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
+    page = (one / "report.html").read_text()
+    for name in FIGURES:
+        assert (one / "figures" / f"{name}.png").stat().st_size > 2e4
+        assert f"figures/{name}.png" in page
+    profiles = pd.read_csv(one / "tables" / "profiles.csv")
+    assert len(profiles) == 24
+    for end in ("low", "high", "min", "max"):
+        assert f"n_n_{end}" in profiles
+    assert (profiles["n_i_min"] <= profiles["n_i_low"]).all()
+    assert (profiles["n_i_high"] <= profiles["n_i_max"]).all()
+    assert {"performance.csv", "power.csv", "spectrum.csv"} <= {
+        path.name for path in (one / "tables").iterdir()
+    }
+
+
+def test_every_panel_of_a_run_shows_something(field: xr.Dataset) -> None:
+    window = breathing.last_periods(field["time"].values, field.attrs["f_kHz"], 3.0)
+    seconds = float(np.ptp(field["time"].values[window]))
+    assert seconds == pytest.approx(3e-3 / field.attrs["f_kHz"], abs=4e-6)
+    drawn = [
+        breathing.current_figure(field, window),
+        breathing.spectrum_figure(field, f_kHz=14.0, f_max_Hz=3e5, transit_Hz=6e4),
+        breathing.profile_figure(field),
+        breathing.map_figure(field, window),
+    ]
+    for figure in drawn:
+        assert figure.axes
+        assert all(ax.has_data() for ax in figure.axes)
+
+
+def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
+    r = xr.DataArray([0.04, 0.05], dims="r", coords={"r": [0.04, 0.05]})
+    names = ["n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization"]
+    both = xr.concat([field[names], 2.0 * field[names]], dim=r["r"])
+    for name in names:
+        both[name].attrs = field[name].attrs
+    both = both.assign({name: field[name] for name in ("I_d", "I_beam")})
+    both.attrs = field.attrs
+    expected = (0.04 + 2.0 * 0.05) / 0.09 * field["n_i"].values
+    np.testing.assert_allclose(breathing.along_z(both["n_i"]), expected, rtol=1e-5)
+    outcome = Outcome(both, periods=3.0, f_max_Hz=None)
+    for name, figure in outcome.figures().items():
+        assert figure.draw().axes
+        assert ("Averaged over r" in figure.caption) == (name in ("profiles", "maps"))
+    assert outcome.tables()["profiles"]["n_i_mean"].to_numpy() == pytest.approx(
+        expected.mean(axis=0), rel=1e-5
+    )
+
+
+def test_a_point_that_breaks_keeps_its_row_and_the_others_stand(scan: Path) -> None:
+    points = summary_of(scan)["points"]
+    assert [point["status"] for point in points] == [
+        "failed", "oscillating", "oscillating", "diverged",
+    ]  # fmt: skip
+    assert [point["operating_point.voltage"] for point in points] == [-5.0, 250.0, 300.0, 5000.0]
+    assert "voltage must be finite and positive" in points[0]["message"]
+    for point in points[1:3]:
+        assert point["I_d_mean"] > 1.0
+        assert point["mass_balance"] == pytest.approx(1.0, abs=1e-3)
+    assert points[3]["thrust_N"] is None
+    rows = pd.read_csv(scan / "tables" / "points.csv")
+    assert rows["status"].tolist() == [point["status"] for point in points]
+    log = log_of(scan)
+    assert "4 points: 1 failed, 2 oscillating, 1 diverged" in log
+    assert "operating_point.voltage=-5: OperatingPoint.voltage must be finite" in log
+    assert (scan / "figures" / "curves.png").stat().st_size > 2e4
+    assert "figures/curves.png" in (scan / "report.html").read_text()
+
+
+def test_scanned_runs_are_kept(scan: Path) -> None:
+    (kept,) = [path for path in scan.parents if (path / "cache").exists()][:1]
+    assert len(list((kept / "cache").glob("*.nc"))) == 3  # one of them diverged, one never ran
+
+
+def test_a_scan_where_nothing_can_be_run_is_an_error(tmp_path: Path) -> None:
+    config = composed(*toy(tmp_path), "scan={operating_point.voltage:[-5.0,-6.0]}")
+    with pytest.raises(ValueError, match="a scan needs a point that can be run: .*got -5"):
+        run_config(config)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("scan={operating_point.volts:[1]}", "data.operating_point.volts must be there"),
+        ("scan={thruster.transport.c:[1]}", "data.thruster.transport.c must be there"),
+        ("scan={n_cells:[]}", "scan must be like {operating_point.voltage: [250,300]}"),
+        ("scan={n_cells:30}", "scan must be like"),
+        ("scan={}", "scan must be like"),
+        ("scan={n_cells:[30,30]}", "each value once"),
+        ("figures.periods=0", "figures.periods must be a positive number"),
+        ("+scans=1", "unknown keys ['scans']"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_before_a_run(
+    override: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        study_of(Study, composed(*toy(tmp_path), override))
+
+
+def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
+    data = Configured(composed().data, "data")
+    points = scan_points(data, {"thruster.transport.c_plume": [0.01, 0.02], "cfl": [0.5]})
+    transport = [point.data.settings["thruster"]["transport"] for point in points]
+    assert [each["c_plume"] for each in transport] == [0.01, 0.02]
+    assert transport[0]["_target_"] == "ep2sindy.AnomalousTransport"
+    assert transport[0]["c_channel"] == transport[1]["c_channel"] > 0.0
+    assert points[0].label == "thruster.transport.c_plume=0.01, cfl=0.5"
+    assert points[0].data.settings["progress"] is False
+    assert "transport" not in data.settings["thruster"]
+
+
+def test_kernels_are_compiled_without_a_trace(tmp_path: Path) -> None:
+    config = composed(*toy(tmp_path), VOLTAGES)
+    points = scan_points(
+        Configured(config.data, "data"), {"operating_point.voltage": [-5.0, 300.0]}
+    )
+    compile_kernels([point.data for point in points])
+    assert not (tmp_path / "cache").exists()
+
+
+def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: Path) -> None:
+    on_file = ["data=file", f"data.path={predator_prey}", f"output={tmp_path}"]
+    with pytest.raises(ValueError, match="data must be a simulation, .*open_field gave none; choo"):
+        run_config(composed(*on_file))
+
+
+def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
+    folder = run_config(composed(*toy(tmp_path), "data.operating_point.voltage=5000.0")).folder
+    summary = summary_of(folder)
+    assert (summary["status"], summary["n_samples"]) == ("diverged", 0)
+    assert summary["warnings"] == ["the simulation diverged: the end of its record is no physics"]
+    assert "The run broke after 0 samples: there is nothing to draw." in log_of(folder)
+    assert 'class="warning">the simulation diverged' in (folder / "report.html").read_text()
+
+
+def test_whoever_studies_a_run_that_broke_is_told_why(tmp_path: Path) -> None:
+    broken = [*toy(tmp_path)[:-1], "data.operating_point.voltage=5000.0"]
+    with pytest.raises(DivergedError, match="200 samples or more .* it diverged after 0; try"):
+        run_config(programs.composed("+exp=weak", *broken))
+
+
+def test_an_operating_point_that_broke_has_a_row_of_its_own(tmp_path: Path) -> None:
+    point = "points=[{V_D_V: 5000.0, mdot_mg_s: 5.0}]"
+    config = programs.composed("+exp=parametric", *toy(tmp_path), point)
+    study = study_of(parametric.Study, config)
+    (source,) = point_sources(study.source, study.parameters, study.points)
+    opened = source.open([])
+    assert (opened.status, opened.trajectory) == ("diverged", None)
+
+
+def rows(points: Sequence[tuple]) -> pd.DataFrame:
+    columns = ["x", "y", "h", "status", "I_d_std"]
+    known = {"cycle": "weak", "f_kHz": 14.0, "I_d_mean": 4.0, "thrust_N": 0.08}
+    table = pd.DataFrame(points, columns=columns).assign(**known, anode_efficiency=0.5)
+    moves = table["status"].isin(["oscillating", "transit"])
+    return table.assign(f_kHz=table["f_kHz"].where(moves))
+
+
+STATUSES = ("oscillating", "steady", "decaying", "transit", "diverged", "failed")
+
+
+def test_a_stability_map_names_every_cell() -> None:
+    cells = [(str(k % 3), str(k // 3), "a", s, 0.5 * k) for k, s in enumerate(STATUSES)]
+    figure = stability_figure(rows(cells), ["x", "y"], {"x": "voltage (V)", "y": "flow (mg/s)"})
+    panel = figure.axes[0]
+    texts = [text.get_text() for text in panel.texts]
+    assert texts[0] == "0.00 A\n14.0 kHz\nweak"
+    assert [text.splitlines()[-1] for text in texts[1:]] == list(STATUSES[1:])
+    assert texts[3] == "1.50 A\n14.0 kHz\ntransit"
+    assert not any("A" in text for text in texts[4:])  # their current says nothing
+    hatches = [patch.get_hatch() for patch in panel.patches]
+    assert hatches[0] is None
+    assert len(set(hatches)) == len(STATUSES)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list(STATUSES[1:])
+
+
+def test_more_parameters_have_a_panel_each() -> None:
+    cells = [(x, y, h, "oscillating", 1.0) for h in "abc" for x in "12" for y in "34"]
+    labels = {"x": "x", "y": "y", "h": "wall"}
+    figure = stability_figure(rows(cells), ["x", "y", "h"], labels)
+    panels = [ax for ax in figure.axes if ax.get_title()]
+    assert [ax.get_title() for ax in panels] == ["wall: a", "wall: b", "wall: c"]
+    assert all(len(ax.texts) == 4 for ax in panels)
+
+
+@pytest.mark.parametrize("along", ["x", "I_d_std"])
+def test_curves_tell_statuses_by_markers(along: str) -> None:
+    points = rows([(s, "0", "a", s, 0.5 * k) for k, s in enumerate(STATUSES)])
+    figure = curves_figure(points, along, "voltage (V)")
+    assert all(ax.has_data() for ax in figure.axes)
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == list(STATUSES)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({}, None),
+        ({"status": "steady"}, "the simulation is steady: there is no oscillation"),
+        ({"status": "decaying"}, "dies out"),
+        ({"status": "diverged"}, "the simulation diverged"),
+        ({"status": "transit", "f_kHz": 150.0}, "oscillates at 150 kHz, above 60 kHz"),
+        ({"rates": "the rates of krypton cover T_e up to 100 eV"}, "the rates of krypton"),
+        ({"mass_balance": 1.002}, "mass balance does not close: (out + stored)/in is 1.0020"),
+        ({"energy_balance": float("nan")}, "energy balance does not close"),
+    ],
+)
+def test_what_is_amiss_with_a_simulation_is_said(change: dict, message: str | None) -> None:
+    found = amiss(GOOD | change)
+    assert len(found) == (message is not None)
+    if message is not None:
+        assert message in found[0]
+        assert doubts(GOOD | change) == ([] if "status" in change else found)
+
+
+def test_a_record_that_broke_late_can_be_studied() -> None:
+    long = xr.Dataset(coords={"time": np.arange(300.0)}, attrs=GOOD | {"status": "diverged"})
+    check_recorded(long)
+    check_recorded(xr.Dataset(coords={"time": np.arange(3.0)}, attrs=GOOD))
+    with pytest.raises(DivergedError, match="it diverged after 100"):
+        check_recorded(long.isel(time=slice(100)))
+
+
+def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_path: Path) -> None:
+    """150 V: the discharge is steady, and its start has died out after a few tenths of a ms."""
+    folder = run_config(
+        programs.composed(
+            "+exp=weak",
+            *(each for each in toy(tmp_path) if each != "parallel=serial"),
+            "data.operating_point.voltage=150.0",
+            "data.warm_up_s=4.0e-4",
+            "n_windows=50",
+            "n_points=[10]",
+        )
+    ).folder
+    warning = "the simulation is steady: there is no oscillation to learn from"
+    assert summary_of(folder)["warnings"] == [warning]
+    assert f'<p class="warning">{warning}' in (folder / "report.html").read_text()
+    assert warning in log_of(folder)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (250.0, "250"),
+        (0.0077, "0.0077"),
+        ("BN", "BN"),
+        (None, "null"),
+        ([1, 2.5], "[1, 2.5]"),
+        ({"_target_": "ep2sindy.ColdStart"}, "ColdStart"),
+        ({"_target_": "ep2sindy.ColdStart", "n_i": 1e17}, "ColdStart(n_i=1e+17)"),
+    ],
+)
+def test_values_as_tables_have_them(value: object, text: str) -> None:
+    assert value_text(value) == text
+
+
+def test_a_failed_point_has_no_numbers() -> None:
+    assert dict(Simulated("failed", message="why").numbers) == {}
