@@ -1,19 +1,16 @@
 """How far the embedded thruster model can be relied on: `python -m benchmarks.source`.
 
 One cycle at every operating point, from hard and soft starts, on several grids and time steps;
-balances; no alternation of T_e; and, with EP2SINDY_DATA=folder, LANDMARK's three fluid cases.
+balances; no alternation of T_e; and the cycles beside the default set.
 Prints the tables of docs/thruster.md; tests/test_thruster_reference.py holds them.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -22,7 +19,6 @@ import ep2sindy as ep
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.search.front import fit_support
-from ep2sindy.thruster.landmark import read_landmark_rates
 
 POINTS = {point.label: point for point in ep.OPERATING_POINTS}
 DOWNSTREAM = (1.5e-2, 2.5e-2)  # m
@@ -40,9 +36,7 @@ VARIANTS: dict[str, dict] = {
     "CFL 0.2": {"cfl": 0.2},
     "uniform, N = 100": {"stretch": 1.0},
 }
-RATE_TABLE = Path(os.environ.get("EP2SINDY_DATA", ".")) / "landmark_rates.csv"
-# Means over 1.5 to 2 ms of HallThruster.jl's stored runs, N = 200: I_d and its deviation (A).
-LANDMARK = {1: (8.19, 0.40), 2: (8.09, 0.09), 3: (7.88, 3.34)}
+NEIGHBOURS = (160, 145, 130, 115, 100, 80)  # 1/c2; the default is 145, two_cycles has 80
 
 
 @cache
@@ -77,25 +71,14 @@ def alternation_eV(label: str, *, n_steps: int = 4000) -> float:
         ep.Thruster(), POINTS[label], initial=run, averaged=False, sample_s=1.5e-8,
         duration_s=1.5e-8 * n_steps, warm_up_s=0.0, progress=False,
     )  # fmt: skip
-    change = np.diff(steps["T_e_eV"].values.astype(float), axis=0)
-    windows = np.lib.stride_tricks.sliding_window_view(change, 5, axis=0)
+    return lasting_swing(steps["T_e_eV"].values.astype(float))
+
+
+def lasting_swing(T: np.ndarray) -> float:
+    """Largest half swing of a column of (steps, cells) that turns in every one of five steps."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.diff(T, axis=0), 5, axis=0)
     in_turn = np.all(windows[..., 1:] * windows[..., :-1] < 0.0, axis=-1)
     return float(np.max(0.5 * np.abs(windows).min(axis=-1), where=in_turn, initial=0.0))
-
-
-def landmark_run(case: int, **settings) -> xr.Dataset:
-    """LANDMARK's case on HallThruster.jl's grid: N = 200, inner radius 34.5 mm."""
-    rates = read_landmark_rates(RATE_TABLE)
-    thruster = replace(ep.landmark_thruster(case, rates), inner_radius=0.0345)
-    return ep.simulate(
-        thruster, ep.LANDMARK_POINT, duration_s=2e-3, warm_up_s=0.0, n_cells=200,
-        reconstruct=case > 1, progress=False, **settings,
-    )  # fmt: skip
-
-
-def late(run: xr.Dataset) -> xr.Dataset:
-    """The part that HallThruster.jl averages: from 1.5 to 2 ms."""
-    return run.sel(time=slice(1.5e-3, 2e-3))
 
 
 def row(run: xr.Dataset) -> str:
@@ -133,20 +116,27 @@ def print_balances() -> None:
         print(f"{label:10s} {residual:.1e}  {share:.5f}  {mass:.7f}  {energy:.7f}  {turns:.1e} eV")
 
 
-def print_landmark() -> None:
-    if not RATE_TABLE.exists():
-        print("\nLANDMARK: name the folder of landmark_rates.csv with EP2SINDY_DATA")
-        return
-    print("\nLANDMARK, N = 200, 1.5 to 2 ms: I_d mean / std (A), theirs")
-    for case, theirs in LANDMARK.items():
-        part = late(landmark_run(case))["I_d"]
-        print(f"case {case}: {float(part.mean()):.2f} / {float(part.std()):.2f}, {theirs}")
+def print_neighbours() -> None:
+    """Which cycle a guessed and a hard start reach beside the default set."""
+    print("\nI_d std (A) / f (kHz) from a guessed | a hard start, 4 to 8 ms, by c2")
+    for label in ("300V_2mgs", "400V_5mgs"):
+        for inverse in NEIGHBOURS:
+            thruster = ep.Thruster(transport=ep.AnomalousTransport(c_plume=1 / inverse))
+            runs = [
+                ep.simulate(
+                    thruster, POINTS[label], duration_s=4e-3, warm_up_s=4e-3, initial=initial,
+                    progress=False,
+                )
+                for initial in (None, ep.ColdStart())
+            ]  # fmt: skip
+            cells = [f"{r.attrs['I_d_std']:.2f} / {r.attrs['f_kHz']:.1f}" for r in runs]
+            print(f"{label:10s} 1/{inverse:<4d} {cells[0]:14s} | {cells[1]}")
 
 
 def main() -> None:
-    """Print every table, or those that are named: cycles, balances, landmark."""
+    """Print every table, or those that are named: cycles, balances, neighbours."""
     parts: dict[str, Callable[[], None]] = {
-        "cycles": print_cycles, "balances": print_balances, "landmark": print_landmark,
+        "cycles": print_cycles, "balances": print_balances, "neighbours": print_neighbours,
     }  # fmt: skip
     for name in sys.argv[1:] or parts:
         began = time.process_time()

@@ -46,7 +46,7 @@ def advected_error(n_cells, stretch=1.0):
     model = build_model(thruster, point, faces)
     dz, z = lengths_and_centres(faces)
     parameters = to_json({"thruster": thruster})
-    state = GuessedStart().state(model, z, parameters)
+    state = GuessedStart().begin(model, z, parameters).state
 
     def pulse(shift):
         return 1e17 * (1.0 + np.exp(-(((z - 0.018 - shift) / 0.004) ** 2)))
@@ -130,7 +130,7 @@ def test_diverged_run_comes_back_marked_and_finite(thruster, point, n_samples):
 def test_verdict_follows_the_late_amplitude(growth_per_record, level, verdict):
     t = np.linspace(0.0, 1.0, 4000)
     current = 4.0 + level * np.exp(growth_per_record * (t - 0.7)) * np.sin(200.0 * np.pi * t)
-    assert judge_status(current) == verdict
+    assert judge_status(current, sample_s=float(t[1])) == verdict
 
 
 @pytest.mark.parametrize(

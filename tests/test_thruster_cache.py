@@ -6,6 +6,7 @@ import xarray as xr
 
 from ep2sindy.machine import files
 from ep2sindy.thruster import cache
+from ep2sindy.thruster.axial.starts import ColdStart, SoftStart
 from ep2sindy.thruster.cache import simulate_cached
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 
@@ -42,6 +43,8 @@ def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, size):
 @pytest.mark.parametrize(
     ("thruster", "point", "change"),
     [
+        (Thruster(), POINT, {"initial": ColdStart()}),
+        (Thruster(), POINT, {"averaged": False}),
         (Thruster(series_resistance=2.0), POINT, {}),
         (Thruster(), OperatingPoint(300.0, 5.0, neutral_speed=281.0), {}),
         (Thruster(), POINT, {"n_cells": 41}),
@@ -50,6 +53,19 @@ def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, size):
 def test_other_parameters_have_another_file(tmp_path, thruster, point, change):
     simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     simulate_cached(thruster, point, cache=tmp_path, **(BRIEF | change))
+    assert len(kept(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (ColdStart(), ColdStart(n_i=4e17)),
+        (SoftStart(hold_s=1e-5), SoftStart(hold_s=2e-5)),
+    ],
+)
+def test_other_starts_have_another_file(tmp_path, one, other):
+    for initial in (one, other, one):
+        simulate_cached(Thruster(), POINT, cache=tmp_path, initial=initial, **BRIEF)
     assert len(kept(tmp_path)) == 2
 
 

@@ -103,8 +103,7 @@ def zone_average(
     """
     check_field(field)
     columns = {name: [(name, 1)] for name in (*states, *inputs)}
-    factors_of = {f"<{p.replace(' ', '')}>": split_factors(p) for p in products}
-    columns |= {column: _kept_average(field, factors) for column, factors in factors_of.items()}
+    columns |= {f"<{p.replace(' ', '')}>": _averaged(field, split_factors(p)) for p in products}
     used = list(dict.fromkeys(name for factors in columns.values() for name, _ in factors))
     _check_names(field, used, [*states, *inputs, *products])
     slices = zone_slices(field, zone or Zone())
@@ -122,7 +121,7 @@ def zone_average(
         input_names=list(columns)[len(states) :],
         units={
             column: unit_product((field[name].attrs["units"], power) for name, power in factors)
-            for column, factors in (columns | _known(field, factors_of)).items()
+            for column, factors in columns.items()
         },
         label=label,
     )
@@ -196,18 +195,13 @@ def point(
 Factors = list[tuple[str, int]]
 
 
-def _kept_average(field: xr.Dataset, factors: Factors) -> Factors:
-    """The variable that holds the time average of a product, where the field has one."""
+def _averaged(field: xr.Dataset, factors: Factors) -> Factors:
+    """A product, or the variable that holds its average in time, where the field has one."""
     for name, variable in field.data_vars.items():
         kept = variable.attrs.get("average_of")
         if kept is not None and sorted(split_factors(kept)) == sorted(factors):
             return [(str(name), 1)]
     return factors
-
-
-def _known(field: xr.Dataset, columns: Mapping[str, Factors]) -> dict[str, Factors]:
-    """Products whose factors the field has, all of them: these tell the unit by themselves."""
-    return {c: f for c, f in columns.items() if all(name in field for name, _ in f)}
 
 
 def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str]) -> None:

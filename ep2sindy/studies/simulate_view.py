@@ -15,10 +15,10 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures, places
 from ep2sindy.signals.spectrum import power_spectrum
 from ep2sindy.studies.simulated import status_text
+from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.verdict import TRANSIT_HZ
 
 LEAST_SAMPLES = 16  # fewer cannot be drawn
-POWERS = ("P_in", "P_ions", "P_inelastic", "P_wall", "P_anode", "P_cathode")
 AVERAGED = " Averaged over r by area."
 CAPTIONS = {
     "current": "Discharge current over the record (above) and over the part that is shaded there, "

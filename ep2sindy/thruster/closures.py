@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.propellants import PropellantTable
 
-TABLE_STEP_EV = 0.02  # linear interpolation is then within 2e-4 of the formulas above 2 eV
+TABLE_STEP_EV = 0.02  # linear interpolation is then within 5e-4 of the formulas above 2 eV
 TABLE_TOP_EV = 200.0  # a mean energy beyond counts as divergence: the fits end below
 
 # Columns, one row per temperature; coefficients in SI, energies in eV.

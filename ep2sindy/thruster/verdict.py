@@ -19,7 +19,7 @@ DECAYED_SHARE = 0.7  # of the amplitude earlier in the record
 STRONG_SHARE = 0.9  # of the mean: a larger standard deviation is that of the strong cycle
 
 
-def judge_status(current: Float[np.ndarray, " time"], sample_s: float | None = None) -> str:
+def judge_status(current: Float[np.ndarray, " time"], sample_s: float) -> str:
     """Say what the current does at the end of the record: oscillates, in one of two ways, or not.
 
     The second half is cut into four blocks: steady if the last one varies by less than 2 % of
@@ -35,13 +35,9 @@ def judge_status(current: Float[np.ndarray, " time"], sample_s: float | None = N
         return "steady"
     if last < DECAYED_SHARE * first:
         return "decaying"
-    if sample_s is not None and _frequency(late, sample_s) > TRANSIT_HZ:
+    if dominant_frequency(sample_s * np.arange(late.size), late) > TRANSIT_HZ:
         return "transit"
     return "oscillating"
-
-
-def _frequency(current: Float[np.ndarray, " time"], sample_s: float) -> float:
-    return dominant_frequency(sample_s * np.arange(current.size), current)
 
 
 def diagnose(field: xr.Dataset, *, diverged: bool) -> dict[str, Any]:

@@ -11,10 +11,10 @@ NEEDED = ("dn_i_dt", "dn_n_dt", "face_flux_i", "face_flux_n", "ionization", "wal
 def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
     """Terms of d<n>/dt in the cells whose centres lie in z = (from, to) in m, in m^-3/s, per time.
 
-    field: a run of `simulate` with averages, of singly charged ions; the zone must end before
-    the last cell. Returns `change_i`, `change_n` (of the zone averages), `inflow_i`, `inflow_n`
-    (through its two ends, less what leaves), `ionization`, `wall_loss` and `residual`: the change
-    of n_i + n_n less its inflow, which is rounding.
+    field: a run of `simulate` with averages; the zone must end before the last cell. Returns, of
+    ions of all charges together, `change_i`, `change_n` (of the zone averages), `inflow_i`,
+    `inflow_n` (through its two ends, less what leaves), `ionization`, `wall_loss` and `residual`:
+    the change of ions and neutrals less their inflow, which is rounding.
     Raises ValueError for a field without averages, or a zone without cells or at the last one.
     """
     if missing := [name for name in NEEDED if name not in field]:
@@ -32,12 +32,17 @@ def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
     first, beyond = int(inside[0]), int(inside[-1]) + 1
     dz = field["dz"].values[first:beyond].astype(float)
 
+    def summed(name: str) -> np.ndarray:
+        """Over the charge states that the run has."""
+        found = [field[each].values for each in (name, f"{name}2") if each in field]
+        return np.sum(found, axis=0, dtype=float)
+
     def mean(name: str) -> np.ndarray:
-        return field[name].values[:, first:beyond].astype(float) @ dz / dz.sum()
+        return summed(name)[:, first:beyond] @ dz / dz.sum()
 
     def inflow(name: str) -> np.ndarray:
-        through = field[name].values
-        return (through[:, first].astype(float) - through[:, beyond]) / dz.sum()
+        through = summed(name)
+        return (through[:, first] - through[:, beyond]) / dz.sum()
 
     terms = {
         "change_i": mean("dn_i_dt"),

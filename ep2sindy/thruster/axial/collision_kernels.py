@@ -62,7 +62,7 @@ def loss_with_slope(table, row, share, column, per_eV, loss, slope):
 def collisions(state, model, rows, w):
     """Collision frequency w[0] and mobility w[1], losses w[3] and w[5] with slopes w[4] and w[6].
 
-    Losses: inelastic, to the walls, in eV/(m^3 s). rows: (2, n + 2). False where the table ends.
+    Losses: inelastic, to the walls, in eV/(m^3 s). rows: (n + 2,). False where the table ends.
     """
     table, row, share, T, drift = model.table, rows, w[8], state.T_e_eV, state.drift_eV
     nu, mobility, value, n, nn = w[0], w[1], w[7], state.n_e, state.n_n

@@ -102,6 +102,9 @@ def advance(state, model, sample_s, averaged, fields, series):
             add_instant(sums, state, dt, work)
             left -= dt
         add_changes(sums, state, 1.0)
+        for i in range(size):
+            reached = state.T_e_eV[i] + model.drift_weight * state.drift_eV[i] * 2.0 / 3.0
+            state.hottest_eV[0] = max(state.hottest_eV[0], reached)
         for k in range(fields.shape[0]):
             for i in range(size - 2):
                 fields[k, row, i] = sums.cells[k, i + 1] / weight

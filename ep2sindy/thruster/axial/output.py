@@ -33,7 +33,8 @@ AVERAGES = {
     "dn_n_dt": (recorded.CHANGE_N, "m^-3/s", "change of n_n over the sample"),
 }
 OF_CHARGE = ("n_i", "u_iz", "flux_i", "face_flux_i", "dn_i_dt")
-PRODUCTS = {"ionization": "n_i*n_n*R_ion", "flux_i": "n_i*u_iz"}  # whose averages they are
+# Products whose averages they are; a second charge state is ionised by rates of its own.
+PRODUCTS = {"ionization": "n_i*n_n*R_ion", "flux_i": "n_i*u_iz"}
 
 SERIES = {  # variable -> unit, long name
     "I_d": ("A", "discharge current"),
@@ -43,7 +44,7 @@ SERIES = {  # variable -> unit, long name
     "I_wall": ("A", "ion current to the channel walls"),
     "mass_flow_i": ("kg/s", "ions leaving through the cathode plane"),
     "mass_flow_n": ("kg/s", "neutrals leaving through the cathode plane"),
-    "mass_out": ("kg", "propellant that left through the cathode plane since the start"),
+    "mass_out": ("kg", "propellant that left through the cathode plane since the first sample"),
     "P_in": ("W", "power that the plasma takes from the supply"),
     "P_ions": ("W", "work of the field on the ions"),
     "P_inelastic": ("W", "electron power lost in ionisation and excitation"),
@@ -91,7 +92,7 @@ def series_of(
 def as_dataset(
     fields: Mapping[str, tuple[Float[np.ndarray, "samples cells"], str, str]],
     series: Mapping[str, Float[np.ndarray, " samples"]],
-    end: Mapping[str, Float[np.ndarray, " cells"]],
+    end: Mapping[str, tuple[Float[np.ndarray, " cells"], str]],
     *,
     sample_s: float,
     faces: Float[np.ndarray, " faces"],
@@ -100,14 +101,14 @@ def as_dataset(
     data: dict[str, Any] = {}
     for name, (values, unit, text) in fields.items():
         notes = {"units": unit, "long_name": text}
-        if name in PRODUCTS:
+        if name in PRODUCTS and (name != "ionization" or "n_i2" not in fields):
             notes["average_of"] = PRODUCTS[name]
         data[name] = (("time", "z"), values, notes)
     for name, column in series.items():
         unit, text = SERIES[name]
         data[name] = (("time",), column, {"units": unit, "long_name": text})
-    for name, profile in end.items():  # for a restart, in SI units, T_e and energies in eV
-        data[name] = (("z",), profile, {"units": "1", "long_name": "state at the end of the run"})
+    for name, (profile, unit) in end.items():
+        data[name] = (("z",), profile, {"units": unit, "long_name": "at the end, for a restart"})
     data["dz"] = (("z",), np.diff(faces), {"units": "m", "long_name": "length of the cell"})
     n_samples = len(next(iter(series.values())))
     notes = {"units": "s", "long_name": "time after the warm-up"}

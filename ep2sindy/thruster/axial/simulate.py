@@ -23,13 +23,21 @@ from ep2sindy.thruster.axial.output import (
 )
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.starts import (
+    Beginning,
     GuessedStart,
     Restart,
     Start,
     end_of,
     stored_energy,
 )
-from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, PER_CHARGE, SERIES_SUMS, Model, State
+from ep2sindy.thruster.axial.state_kernels import (
+    CELL_SUMS,
+    CURRENT,
+    PER_CHARGE,
+    SERIES_SUMS,
+    Model,
+    State,
+)
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import uncovered
 from ep2sindy.thruster.verdict import diagnose, performance
@@ -88,12 +96,14 @@ def simulate_as(
         thruster, point, faces, cfl=settings.cfl, reconstruct=settings.reconstruct,
         coldest_eV=settings.coldest_T_e_eV,
     )  # fmt: skip
-    with _bar(settings, start, point.label, progress) as bar:
-        record = run(model, start, lengths_and_centres(faces)[1], parameters, settings, bar)
+    beginning = start.begin(model, lengths_and_centres(faces)[1], parameters)
+    with tqdm(desc=point.label, unit="sample", disable=not progress) as bar:
+        record = run(model, beginning, settings, bar)
     field = _dataset(record, model, settings, point, faces)
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
         "parameters": parameters,
+        "initial": f"{start.label}, {beginning.note}" if beginning.note else start.label,
         **_attributes(field, record, model, point, thruster, settings.sample_s),
     }
     return field
@@ -117,27 +127,23 @@ class Record:
     state: State
     stored_J: tuple[float, float]
     diverged: bool
-    start: str
 
 
-def run(
-    model: Model,
-    start: Start,
-    z: Float[np.ndarray, " cells"],
-    parameters: str,
-    settings: Settings,
-    bar: tqdm,
-) -> Record:
-    """Start, hold, warm up and record; a run that breaks ends with its last whole sample."""
-    state, goes_on = start.state(model, z, parameters), start.goes_on(z)
+def run(model: Model, beginning: Beginning, settings: Settings, bar: tqdm) -> Record:
+    """Hold, warm up and record; a run that breaks ends with its last whole sample."""
+    state, step = beginning.state, settings.sample_s
     charges, size = state.n_i.shape
     n_fields = len(CELL_SUMS) + PER_CHARGE * (charges - 1)
-    quiet = model if start.resistance is None else model._replace(resistance=start.resistance)
-    n_hold, n_warm_up, n_samples = _rows(settings, start)
-    whole = goes_on or first_fields(state, model)
+    quiet = model
+    if beginning.resistance is not None:
+        quiet = model._replace(resistance=beginning.resistance)
+    n_hold, n_warm_up = round(beginning.hold_s / step), round(settings.warm_up_s / step)
+    n_samples = round(settings.duration_s / step) + 1
+    bar.total = n_hold + n_warm_up + n_samples
+    whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
         whole = whole and _pass(each, state, settings, n_rows, n_fields, bar)
-    before = stored_energy(state, model)
+    before, state.hottest_eV[0] = stored_energy(state, model), 0.0
     fields = np.empty((n_fields, n_samples if whole else 0, size - 2), np.float32)
     series = np.empty((fields.shape[1], len(SERIES_SUMS)))
     filled = _fill(model, state, settings, fields, series, bar)
@@ -147,7 +153,6 @@ def run(
         state,
         (before, stored_energy(state, model)),
         diverged=filled < n_samples,
-        start=start.told(z),
     )
 
 
@@ -156,18 +161,6 @@ def first_fields(state: State, model: Model) -> bool:
     start_density(state)
     rows, work = np.zeros(state.n_n.size, np.uint64), np.zeros((26, state.n_n.size))
     return electron_step(state, model, 0.0, rows, work)
-
-
-def _rows(settings: Settings, start: Start) -> tuple[int, int, int]:
-    """Samples that the start holds, of the warm-up, and of the record."""
-    step = settings.sample_s
-    held, warm_up = round(start.hold_s / step), round(settings.warm_up_s / step)
-    return held, warm_up, round(settings.duration_s / step) + 1
-
-
-def _bar(settings: Settings, start: Start, label: str, progress: bool) -> tqdm:
-    total = sum(_rows(settings, start))
-    return tqdm(total=total, desc=label, unit="sample", disable=not progress)
 
 
 def _pass(
@@ -231,7 +224,7 @@ def _attributes(
     sample_s: float,
 ) -> dict[str, Any]:
     """Verdict, performance, balances, and what a restart needs beside the profiles."""
-    attributes = {"initial": record.start, **diagnose(field, diverged=record.diverged)}
+    attributes = diagnose(field, diverged=record.diverged)
     if field.sizes["time"]:
         mean = {name: float(field[name].mean()) for name in ("I_d", "V_d", "thrust", "I_wall")}
         attributes |= performance(
@@ -242,9 +235,9 @@ def _attributes(
         attributes["energy_balance"] = energy_balance(field, record, seconds)
         if "dn_n_dt" in field:
             attributes["mass_balance"] = mass_balance(field, model, seconds)
-    hottest = float(field["T_e_eV"].max()) if field.sizes["time"] else 0.0
+    hottest = float(record.state.hottest_eV[0])
     attributes["rates"] = uncovered(thruster.propellant, hottest) or "covered"
-    attributes["end_I_d"] = float(record.state.instant[0])
+    attributes["end_I_d"] = float(record.state.instant[CURRENT])
     return attributes
 
 

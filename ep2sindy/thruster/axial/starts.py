@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.thruster.axial.state_kernels import SERIES_SUMS, Model, State
-from ep2sindy.thruster.checks import check_not_negative, check_positive
+from ep2sindy.thruster.axial.state_kernels import CURRENT, SERIES_SUMS, Model, State
+from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
 
 Profile = Float[np.ndarray, " cells"]
@@ -23,6 +23,11 @@ END = "end_"
 SPECIES = ("n_i", "flux_i")  # of every charge
 CELLS = ("n_n", "T_e_eV", "energy_e", "drift_eV", "E_z", "wall_loss_rate")
 RATES = ("R_ion", "R_double", "R_second")
+UNITS = {
+    "n_i": "m^-3", "flux_i": "m^-2/s", "n_n": "m^-3", "T_e_eV": "eV", "energy_e": "eV*m^-3",
+    "drift_eV": "eV", "E_z": "V/m", "wall_loss_rate": "1/s",
+    **dict.fromkeys(RATES, "m^3/s"),
+}  # fmt: skip
 # A discharge goes on in another one only where these are the same.
 FIXED = (
     "channel_length", "domain_length", "inner_radius", "outer_radius", "propellant",
@@ -30,50 +35,49 @@ FIXED = (
 )  # fmt: skip
 
 
+class Beginning(NamedTuple):
+    """A first state, and how a run goes on from it.
+
+    whole: it is complete, as another run left it. resistance: in ohm, that is in series for the
+    first hold_s, before the run begins; None has the thruster's. note: what became of a start.
+    """
+
+    state: State
+    whole: bool = False
+    hold_s: float = 0.0
+    resistance: float | None = None
+    note: str = ""
+
+
 @runtime_checkable
 class Start(Protocol):
-    """What the alternatives share: the first state, and what is done before the run begins."""
+    """What the alternatives share: a name that no other start has, and the first state.
 
-    @property
-    def hold_s(self) -> float: ...  # with `resistance` in series, before the run begins
-
-    @property
-    def resistance(self) -> float | None: ...  # ohm
+    z: centres of all cells, ghosts included, in m; parameters: of the run, as JSON.
+    """
 
     @property
     def label(self) -> str: ...
 
-    def state(self, model: Model, z: Profile, parameters: str) -> State: ...
-
-    def goes_on(self, z: Profile) -> bool: ...  # the state is whole, as another run left it
-
-    def told(self, z: Profile) -> str: ...  # the label, and what became of it on these cells
+    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning: ...
 
 
 @dataclass(frozen=True)
 class GuessedStart:
     """A plasma that looks like a discharge: a hump of T_e at the exit, neutrals used up there."""
 
-    hold_s: float = 0.0
-    resistance: float | None = None
-
     @property
     def label(self) -> str:
         return "guessed profiles"
 
-    def goes_on(self, z: Profile) -> bool:
-        return False
-
-    def told(self, z: Profile) -> str:
-        return self.label
-
-    def state(self, model: Model, z: Profile, parameters: str) -> State:
-        place = z / _channel_length(parameters)  # 1 at the exit
+    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
+        channel_length = json.loads(parameters)["thruster"]["channel_length"]
+        place = z / channel_length  # 1 at the exit
         n_i = np.full(z.size, 5e17)
         u_i = -1000.0 + 8000.0 * place
         n_n = model.neutral_inflow / model.neutral_speed * np.clip(1.0 - place, 0.05, 1.0)
         T_e = model.anode_T_e_eV + 10.0 * np.exp(-0.5 * ((place - 1.0) / 0.4) ** 2)
-        return _state(model, parameters, n_i, n_i * u_i, n_n, T_e)
+        return Beginning(_state(parameters, [n_i], [n_i * u_i], n_n, T_e))
 
 
 @dataclass(frozen=True)
@@ -86,26 +90,18 @@ class ColdStart:
     n_i: float = 3e17
     u_i: float = 1000.0
     T_e_eV: float = 3.0
-    hold_s: float = 0.0
-    resistance: float | None = None
 
     def __post_init__(self) -> None:
         check_positive(self, "n_i", "u_i", "T_e_eV")
 
     @property
     def label(self) -> str:
-        return "a cold, uniform plasma"
+        return f"a uniform plasma of {self.n_i} m^-3, {self.T_e_eV} eV, {self.u_i} m/s"
 
-    def goes_on(self, z: Profile) -> bool:
-        return False
-
-    def told(self, z: Profile) -> str:
-        return self.label
-
-    def state(self, model: Model, z: Profile, parameters: str) -> State:
-        n_i = np.full(z.size, self.n_i)
+    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
+        n_i, T_e = np.full(z.size, self.n_i), np.full(z.size, self.T_e_eV)
         n_n = np.full(z.size, model.neutral_inflow / model.neutral_speed)
-        return _state(model, parameters, n_i, self.u_i * n_i, n_n, np.full(z.size, self.T_e_eV))
+        return Beginning(_state(parameters, [n_i], [self.u_i * n_i], n_n, T_e))
 
 
 @dataclass(frozen=True)
@@ -123,16 +119,11 @@ class SoftStart:
 
     @property
     def label(self) -> str:
-        return f"a quiet discharge of {self.resistance:g} ohm, released"
+        return f"a discharge kept quiet by {self.resistance} ohm for {self.hold_s} s"
 
-    def goes_on(self, z: Profile) -> bool:
-        return False
-
-    def told(self, z: Profile) -> str:
-        return self.label
-
-    def state(self, model: Model, z: Profile, parameters: str) -> State:
-        return GuessedStart().state(model, z, parameters)
+    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
+        guessed = GuessedStart().begin(model, z, parameters)
+        return guessed._replace(hold_s=self.hold_s, resistance=self.resistance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,15 +132,12 @@ class Restart:
 
     run: a Dataset of `simulate`, or the path of a NetCDF file of one. The operating point, the
     transport and the circuit may differ; on another grid the profiles are interpolated.
-    Raises ValueError where it is no such run, or was another thruster's.
+    Raises ValueError where it is no such run, it diverged, or was another thruster's.
     """
 
     run: xr.Dataset | str | Path
-    hold_s: float = 0.0
-    resistance: float | None = None
 
     def __post_init__(self) -> None:
-        check_not_negative(self, "hold_s")
         object.__setattr__(self, "run", _ended(self.run))
 
     @property
@@ -164,33 +152,27 @@ class Restart:
             digest.update(self._end[name].values.tobytes())
         return f"the end of another run ({digest.hexdigest()[:12]})"
 
-    def state(self, model: Model, z: Profile, parameters: str) -> State:
+    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
         _check_same_thruster(self._end.attrs["parameters"], parameters)
-        points, same = self._end["z"].values, self.goes_on(z)
+        points = self._end["z"].values
+        same = np.array_equal(points, z[1:-1])
         charges = json.loads(parameters)["thruster"]["charge_states"]
 
         def cells(name: str) -> Profile:
             values = self._end[END + name].values
-            return np.interp(z, points, values) if not same else np.pad(values, 1, mode="edge")
+            return np.pad(values, 1, mode="edge") if same else np.interp(z, points, values)
 
-        first = [[cells(_of(name, k)) for k in range(charges)] for name in SPECIES]
-        state = _state(model, parameters, first[0], first[1], cells("n_n"), cells("T_e_eV"))
+        ions, flux = ([cells(_of(name, k)) for k in range(charges)] for name in SPECIES)
+        state = _state(parameters, ions, flux, cells("n_n"), cells("T_e_eV"))
         state.drift_eV[1:-1] = cells("drift_eV")[1:-1]
-        state.instant[0] = float(self._end.attrs["end_I_d"])
-        if same:
-            state.energy[:], state.E[:] = cells("energy_e"), cells("E_z")
-            state.wall_loss[:] = cells("wall_loss_rate")
-            for k, name in enumerate(RATES[: 1 if charges == 1 else 3]):
-                state.rates[k] = cells(name)
-        return state
-
-    def goes_on(self, z: Profile) -> bool:
-        return np.array_equal(self._end["z"].values, z[1:-1])
-
-    def told(self, z: Profile) -> str:
-        if self.goes_on(z):
-            return self.label
-        return f"{self.label}, interpolated from {self._end.sizes['z']} to {z.size - 2} cells"
+        state.instant[CURRENT] = float(self._end.attrs["end_I_d"])
+        if not same:
+            return Beginning(state, note=f"interpolated from {points.size} to {z.size - 2} cells")
+        state.energy[:], state.E[:] = cells("energy_e"), cells("E_z")
+        state.wall_loss[:] = cells("wall_loss_rate")
+        for k, name in enumerate(RATES[: 1 if charges == 1 else 3]):
+            state.rates[k] = cells(name)
+        return Beginning(state, whole=True)
 
 
 def _of(name: str, k: int) -> str:
@@ -198,30 +180,28 @@ def _of(name: str, k: int) -> str:
     return name if k == 0 else f"{name}{k + 1}"
 
 
-def end_of(state: State) -> dict[str, Profile]:
-    """What `Restart` takes up, by the names of a Dataset's variables."""
+def end_of(state: State) -> dict[str, tuple[Profile, str]]:
+    """What `Restart` takes up, with units, by the names of a Dataset's variables."""
     charges = len(state.n_i)
     cells = (state.n_n, state.T_e_eV, state.energy, state.drift_eV, state.E, state.wall_loss)
     kept = dict(zip(CELLS, cells, strict=True))
     for k in range(charges):
         kept |= {_of("n_i", k): state.n_i[k], _of("flux_i", k): state.flux_i[k]}
     kept |= {name: state.rates[k] for k, name in enumerate(RATES[: 1 if charges == 1 else 3])}
-    return {END + name: values[1:-1].copy() for name, values in kept.items()}
+    return {END + n: (v[1:-1].copy(), UNITS[n.rstrip("2")]) for n, v in kept.items()}
 
 
 def _state(
-    model: Model,
     parameters: str,
-    n_i: Profile | list[Profile],
-    flux_i: Profile | list[Profile],
+    n_i: Sequence[Profile],
+    flux_i: Sequence[Profile],
     n_n: Profile,
     T_e_eV: Profile,
 ) -> State:
     """A state of these profiles; one profile of ions stands for singly charged ones."""
     size, charges = n_n.size, json.loads(parameters)["thruster"]["charge_states"]
-    n = np.array(n_i, dtype=float).reshape(-1, size)
-    g = np.array(flux_i, dtype=float).reshape(-1, size)
-    if len(n) < charges:  # a hundredth of the ions has lost two electrons
+    n, g = np.array(n_i), np.array(flux_i)
+    if len(n) < charges:  # a hundredth of the electrons belongs to ions that lost two
         n = np.concatenate([0.99 * n, 0.005 * n])
         g = np.concatenate([0.99 * g, 0.005 * np.sqrt(2.0) * g])
     n_e = n.T @ np.arange(1.0, charges + 1.0)
@@ -230,16 +210,13 @@ def _state(
         n_i=n, flux_i=g, n_n=n_n.copy(), T_e_eV=T_e_eV.copy(), energy=1.5 * n_e * T_e_eV,
         drift_eV=zeros[0], n_e=n_e, flux_q=zeros[1], log_n=np.ones((2, size)), E=zeros[2],
         rates=zeros[3:], wall_loss=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
+        hottest_eV=np.zeros(1),
     )  # fmt: skip
 
 
 def stored_energy(state: State, model: Model) -> float:
     """Heat of the electrons in J."""
     return E_CHARGE * model.area * float(state.energy[1:-1] @ model.dz[1:-1])
-
-
-def _channel_length(parameters: str) -> float:
-    return float(json.loads(parameters)["thruster"]["channel_length"])
 
 
 def _ended(run: xr.Dataset | str | Path) -> xr.Dataset:
@@ -253,6 +230,11 @@ def _ended(run: xr.Dataset | str | Path) -> xr.Dataset:
         raise ValueError(
             f"a restart must be a run of simulate, which keeps its end (end_n_n, ...): this one "
             f"has {list(run.data_vars)[:12]}"
+        )
+    if run.attrs["status"] == "diverged":
+        raise ValueError(
+            "a run goes on only from one that lived: this one diverged, and its end is no physics; "
+            "start from ColdStart or SoftStart"
         )
     return run
 

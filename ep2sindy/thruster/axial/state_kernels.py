@@ -109,6 +109,7 @@ class State(NamedTuple):
     rates: np.ndarray  # (3, n + 2), m^3/s: X -> X+, X -> X2+, X+ -> X2+
     wall_loss: np.ndarray  # (n + 2,), 1/s, of singly charged ions
     instant: np.ndarray  # (series,), the series' present values
+    hottest_eV: np.ndarray  # (1,), highest temperature that rates were taken at, sample by sample
 
 
 class Sums(NamedTuple):
