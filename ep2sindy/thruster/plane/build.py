@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.thruster import closures as axial
 from ep2sindy.thruster.anode import FixedAnode
-from ep2sindy.thruster.closures import TABLE_STEP_EV, WALL_COLLISION, WALL_POWER, closure_table
+from ep2sindy.thruster.closures import TABLE_STEP_EV, closure_table
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plane import state_kernels as kernels
@@ -44,19 +45,23 @@ def check_thruster(thruster: Thruster) -> None:
         )
 
 
-def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 12"]:
-    """The closures over T_e as `closure_table` has them, wall losses per ion that gets there.
+def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
+    """The closures over T_e, wall losses per ion that reaches the wall; columns as in `kernels`.
 
     The axial model has electrons arrive at scale * ratio * sqrt(e T_e/m) n / gap, times
     1/(1 - gamma); here the flux of ions to the wall, which is computed, stands for the factor
     ratio * sqrt(e T_e/m) n / gap.
     """
-    table = closure_table(thruster)
-    T = TABLE_STEP_EV * np.arange(len(table))
+    axial_table = closure_table(thruster)
+    T = TABLE_STEP_EV * np.arange(len(axial_table))
     T[0] = 0.1 * TABLE_STEP_EV
     bohm = np.sqrt(E_CHARGE * T / thruster.propellant.mass)
     ions = SHEATH_DENSITY_RATIO * bohm / thruster.gap  # 1/s
-    table[:, [WALL_COLLISION, WALL_POWER]] /= ions[:, None]
+    table = np.empty((T.size, 8))
+    for name in ("IONIZATION", "INELASTIC", "EVENTS", "MOMENTUM", "COULOMB", "COULOMB_LOG"):
+        table[:, getattr(kernels, name)] = axial_table[:, getattr(axial, name)]
+    table[:, kernels.WALL_COLLISIONS] = axial_table[:, axial.WALL_COLLISION] / ions
+    table[:, kernels.WALL_ENERGY] = axial_table[:, axial.WALL_POWER] / ions
     return table
 
 

@@ -18,6 +18,18 @@ FAST: dict[str, Any] = {
 
 ONE = np.uint64(1)
 
+# Columns of `Model.table`, one row per electron temperature; coefficients in SI, energies in eV.
+(
+    IONIZATION,
+    INELASTIC,
+    EVENTS,
+    MOMENTUM,
+    COULOMB,
+    COULOMB_LOG,
+    WALL_COLLISIONS,  # of electrons, per ion that reaches the wall
+    WALL_ENERGY,  # lost by electrons, per ion that reaches the wall
+) = range(8)
+
 
 class Model(NamedTuple):
     """Everything the compiled loops need that does not change in time."""
@@ -44,7 +56,7 @@ class Model(NamedTuple):
     cfl: float
     omega_ce: np.ndarray  # (n_z,), rad/s
     anomalous: np.ndarray  # (n_z,), 1/s
-    table: np.ndarray  # (temperatures, columns), as `plane_table` fills it
+    table: np.ndarray  # (temperatures, 8)
     table_step_eV: float
 
 
