@@ -58,6 +58,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.model.model import coef_matrix as coef_matrix
     from ep2sindy.model.rollout import Rollout as Rollout
     from ep2sindy.model.scores import r2 as r2
+    from ep2sindy.model.stability import LimitCycle as LimitCycle
+    from ep2sindy.model.stability import limit_cycle as limit_cycle
+    from ep2sindy.model.stability import share_reaching as share_reaching
     from ep2sindy.refinement.correction import Corrected as Corrected
     from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
     from ep2sindy.refinement.methods.gradient_descent import GradientDescent as GradientDescent
@@ -187,6 +190,7 @@ _FACE = {
     "model.model": "SparseModel coef_matrix",
     "model.rollout": "Rollout",
     "model.scores": "r2",
+    "model.stability": "LimitCycle limit_cycle share_reaching",
     "refinement.correction": "Corrected refine_with_correction",
     "refinement.methods.gradient_descent": "GradientDescent",
     "refinement.methods.multiple_shooting": "MultipleShooting",

@@ -1,0 +1,78 @@
+"""A free model in variables of order one, with its Jacobian: what solvers are given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.library.library import Library
+from ep2sindy.model.model import SparseModel
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledModel:
+    """y' = f(y) of states in units of `scale`, over time in units of `time_s`; used terms only.
+
+    terms, coef: (terms, n_states), of f. products, weights: (products, (1 + n_states) n_states),
+    of f, then of its derivatives by the first state, by the second, and so on.
+    """
+
+    terms: Library
+    coef: Float[np.ndarray, "terms n_states"]
+    products: Library
+    weights: Float[np.ndarray, "products f_and_jacobian"]
+
+    @staticmethod
+    def of(model: SparseModel, scale: Float[np.ndarray, " n_states"], time_s: float) -> ScaledModel:
+        """Of a model without inputs."""
+        used = np.flatnonzero(model.coef.any(axis=1))
+        if not len(used):
+            used = np.array([0])  # a library needs a term
+        library, numbers = model.library.take(used).over(model.states).scaled(scale)
+        coef = model.coef[used] * numbers[:, None] * (time_s / scale)
+        products, shares = library.with_derivatives(len(scale))
+        weights = np.einsum("tcp,te->pce", shares, coef).reshape(len(products), -1)
+        return ScaledModel(library, coef, products, weights)
+
+    @property
+    def n_states(self) -> int:
+        return self.coef.shape[1]
+
+    def with_departures(self) -> Callable[[float, np.ndarray], np.ndarray]:
+        """Slope of a state and, behind it, of n_states small departures from it, one per row."""
+        n = self.n_states
+        values, products = self.products.at_points(self.products.variables)
+        weights = self.weights
+
+        def slope(_: float, y: np.ndarray) -> np.ndarray:
+            values[:] = y[:n]
+            rates = products() @ weights
+            departures = y[n:].reshape(n, n) @ rates[n:].reshape(n, n)
+            return np.concatenate([rates[:n], departures.ravel()])
+
+        return slope
+
+    def slope(
+        self, y: Float[np.ndarray, "n_states points"]
+    ) -> Float[np.ndarray, "n_states points"]:
+        """f at many states."""
+        return self.coef.T @ _evaluated(self.terms, y)
+
+    def rate(self, y: Float[np.ndarray, "states points"]) -> Float[np.ndarray, " points"]:
+        """Frobenius norm of the Jacobian at many states: no smaller than its largest eigenvalue."""
+        jacobian = self.weights[:, len(y) :].T @ _evaluated(self.products, y)
+        return np.sqrt(np.einsum("jp,jp->p", jacobian, jacobian))
+
+
+def _evaluated(library: Library, y: np.ndarray) -> np.ndarray:
+    """(products, points): along points in one stretch, unlike `Library.evaluate`."""
+    columns = np.ones((len(y) + 1, y.shape[1]))
+    columns[:-1] = y
+    columns = library.with_functions(columns, axis=0)
+    theta = columns[library.table[:, 0]]
+    for factors in library.table.T[1:]:
+        theta *= columns[factors]
+    return theta
