@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS
+from ep2sindy.figures.style import COLOURS, GREY, legend_above, panel_grid
 from ep2sindy.library.equations import latex_derivative, latex_term_name
-from ep2sindy.search.front import ParetoFront
+from ep2sindy.search.front import Candidate, Cloud, ParetoFront
 from ep2sindy.selection.rule import selected
+
+# Errors below are drawn here, where a line says so: they are rounding, or zero.
+FLOOR = 1e-12
+
+TOP = 3.0  # errors above are marked at the edge: such a model is worse than none
+
+TERMS_A_LINE = 4  # of a title
 
 
 def front_figure(
@@ -21,44 +31,84 @@ def front_figure(
     *,
     label: str,
 ) -> Figure:
-    """Error against number of terms for every equation, the selected candidate marked.
+    """Error against number of terms for every equation, log, the selected candidate marked.
 
+    Behind the front, light, every support that the search proposed. Errors below FLOOR are drawn
+    on a line at it, those above TOP as marks at the upper edge.
     scores: by state, one per candidate, the lowest selected; label: what they are called.
     """
-    figure = Figure(figsize=(4.4 * len(fronts), 3.4), layout="constrained")
-    axes = figure.subplots(1, len(fronts), squeeze=False)[0]
+    figure, axes = panel_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
-        _front(ax, front)
         chosen = selected(front, scores[state])
         index = front.candidates.index(chosen)
-        ax.plot(
-            front.sizes[index],
-            front.errors[index],
-            "*",
-            ms=15,
-            color=COLOURS[1],
-            label=f"selected, {_score_label(label)} = {scores[state][index]:.4g}",
-        )
-        terms = ", ".join(f"${latex_term_name(name)}$" for name in chosen.terms)
-        ax.set_title(f"${latex_derivative(state)}$: {terms or '0'}", fontsize=9)
-        ax.legend(frameon=False, fontsize=8)
+        _front(ax, front, index)
+        score = f"{_score_label(label)} = {scores[state][index]:.4g}"
+        ax.set_title(f"${latex_derivative(state)}$: {_terms(chosen)}\n{score}", fontsize=9)
+    entries = {line.get_label(): line for ax in axes for line in ax.lines if _labelled(line)}
+    legend_above(figure, [entries[name] for name in _LAYERS if name in entries], size=9.0)
     return figure
 
 
-def _front(ax: Axes, front: ParetoFront) -> None:
-    """The best of every size as a line, runners-up as small dots."""
-    best = front.leading
-    ax.plot(
-        front.sizes[best], front.errors[best], "o-", c=COLOURS[0], ms=5, lw=1, label="best of size"
-    )
+# Legend entries, from the back to the front.
+_LAYERS = ("all supports fitted", "runners-up", "best of size", "selected")
+
+
+def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
+    """All supports, runners-up, the best of every size as a line, and the star."""
+    every, runners_up, best_of_size, star = _LAYERS
+    lowest = front.errors.min()
+    if front.cloud is not None:
+        _cloud(ax, front.cloud, label=every)
+        lowest = min(lowest, front.cloud.errors.min(initial=np.inf))
+    best, errors = front.leading, np.clip(front.errors, FLOOR, TOP)
     if not best.all():
-        others = front.sizes[~best], front.errors[~best]
-        ax.plot(*others, ".", color="#999999", ms=4, zorder=1, label="runners-up")
+        others = front.sizes[~best], errors[~best]
+        ax.plot(*others, "o", mfc="none", mec=COLOURS[0], ms=5, zorder=3, label=runners_up)
+    ax.plot(
+        front.sizes[best], errors[best], "o-", c=COLOURS[0], ms=5, lw=1, zorder=4,
+        label=best_of_size,
+    )  # fmt: skip
+    ax.plot(
+        front.sizes[chosen], errors[chosen], "*", ms=14, color=COLOURS[1], mec="white", mew=0.5,
+        zorder=5, label=star,
+    )  # fmt: skip
     rows = "held-out" if front.problem.test.any() else "training"
-    ax.set_xlabel("number of terms")
-    ax.set_ylabel(f"error, $1 - R^2$ ({rows} rows)")
-    ax.set_xticks(front.sizes[best].astype(int))
-    ax.set_ylim(0.0, 1.05 * max(1.0, min(front.errors[best].max(), 1.5)))
+    ax.set(xlabel="number of terms", ylabel=f"error, $1 - R^2$ ({rows} rows)", yscale="log")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_ylim(0.4 * max(FLOOR, float(lowest)), TOP)
+    ax.margins(x=0.06)
+    ax.grid(axis="y", alpha=0.25)
+    if lowest <= FLOOR:
+        ax.axhline(FLOOR, color=GREY, lw=0.8, ls=":", zorder=1)
+        ax.annotate(
+            rf"$10^{{{np.log10(FLOOR):.0f}}}$ or less", (0.02, FLOOR), (0, 3), fontsize=8,
+            xycoords=("axes fraction", "data"), textcoords="offset points", color="#666666",
+        )  # fmt: skip
+
+
+def _cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
+    """Light dots; where the model is worse than none by far, carets at the upper edge."""
+    above = cloud.errors > TOP
+    style: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
+    ax.plot(
+        cloud.sizes[~above], np.maximum(cloud.errors[~above], FLOOR), marker="o", ms=3.5,
+        label=label, **style,
+    )  # fmt: skip
+    if above.any():
+        sizes = np.unique(cloud.sizes[above])
+        at_edge = np.full(len(sizes), TOP)
+        ax.plot(sizes, at_edge, marker=6, ms=5, clip_on=False, **style)  # 6: a caret up
+
+
+def _terms(candidate: Candidate) -> str:
+    """Of a title; a few in a line."""
+    names = [f"${latex_term_name(name)}$" for name in candidate.terms]
+    lines = [names[k : k + TERMS_A_LINE] for k in range(0, len(names), TERMS_A_LINE)]
+    return ",\n".join(", ".join(line) for line in lines) or "0"
+
+
+def _labelled(line: Line2D) -> bool:
+    return not str(line.get_label()).startswith("_")
 
 
 def _score_label(label: str) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.library.equations import latex_derivative, latex_name
@@ -20,6 +21,22 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 # For panels of their own, whose colours need not be told apart from all others.
 MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
+
+
+def panel_grid(
+    n: int, *, width: float, height: float, extra: float, shared: bool = False, most: int = 4
+) -> tuple[Figure, Sequence[Axes]]:
+    """A canvas of n panels of this size in inches, at most so many in a row, none empty.
+
+    extra: height around them. shared: whether they share both axes.
+    """
+    n_rows = -(-n // most)
+    n_columns = -(-n // n_rows)
+    figure = Figure(figsize=(width * n_columns, height * n_rows + extra), layout="constrained")
+    axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=shared, sharey=shared).flat
+    for ax in axes[n:]:
+        ax.remove()
+    return figure, list(axes[:n])
 
 
 def framing(

@@ -46,17 +46,31 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
+class Cloud:
+    """Every distinct support that a search proposed: its number of terms, and its error.
+
+    errors: 1 - R2 as `ParetoFront.errors`, but from Gram matrices alone, so an exact fit has one
+    of some 1e-13, of either sign. Supports whose terms depend on each other have none.
+    """
+
+    sizes: Int[np.ndarray, " supports"]
+    errors: Float[np.ndarray, " supports"]
+
+
+@dataclass(frozen=True, eq=False)
 class ParetoFront:
     """The best candidates of every size, the empty model first.
 
     From `pareto_front` they are sorted by size, and within a size by error: the first of each
     size is the front proper, whose error falls, any others are runners-up. A joint search ranks
     by all of its points: at one of them errors may rise. problem: the rows they were fitted to.
+    cloud: all supports that these were taken from; None where a front was not made of any.
     """
 
     equation: str
     candidates: Sequence[Candidate]
     problem: Regression = field(repr=False)
+    cloud: Cloud | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", tuple(self.candidates))
@@ -134,7 +148,9 @@ def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> 
     """
     n_terms = len(problem.library)
     equation = problem.equations.index(supports.equation)
-    best = _best_of_each_size(problem, equation, supports.masks, depth)
+    sizes = supports.masks.sum(axis=1)
+    explained = _explained(problem, equation, supports.masks)
+    best = _best_of_each_size(sizes, explained, depth)
     empty = np.zeros((1, n_terms), dtype=np.bool_)
     chosen = Supports(
         equation=supports.equation,
@@ -148,7 +164,8 @@ def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> 
         np.array([-_score(c) for c in candidates]),
         depth=depth,
     )
-    return ParetoFront(supports.equation, [candidates[k] for k in order], problem)
+    cloud = _cloud(problem, equation, sizes, explained)
+    return ParetoFront(supports.equation, [candidates[k] for k in order], problem, cloud)
 
 
 def front_order(
@@ -188,20 +205,42 @@ def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
     ]
 
 
-def _best_of_each_size(
-    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"], depth: int
-) -> Int[np.ndarray, " best"]:
-    """Indices of the supports of least error, by number of terms, from Gram matrices alone."""
+def _explained(
+    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"]
+) -> Float[np.ndarray, " supports"]:
+    """By how much each support lowers the target's squares on the rows that judge.
+
+    From Gram matrices alone; NaN where terms depend on each other.
+    """
     train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
     coef = solve_masks(train.xx[0], np.where(masks, train.xy[0, equation], 0.0), masks)
-    explained = (coef * (2.0 * judge.xy[0, equation] - coef @ judge.xx[0])).sum(axis=1)
-    sizes = masks.sum(axis=1)
+    return (coef * (2.0 * judge.xy[0, equation] - coef @ judge.xx[0])).sum(axis=1)
+
+
+def _best_of_each_size(
+    sizes: Int[np.ndarray, " supports"], explained: Float[np.ndarray, " supports"], depth: int
+) -> Int[np.ndarray, " best"]:
+    """Indices of the supports of least error, by number of terms."""
     order = np.lexsort((-explained, sizes))
     order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
     _, first, count = np.unique(sizes[order], return_index=True, return_counts=True)
     rank = np.arange(len(order)) - np.repeat(first, count)
     return order[rank < depth]
+
+
+def _cloud(
+    problem: Regression,
+    equation: int,
+    sizes: Int[np.ndarray, " supports"],
+    explained: Float[np.ndarray, " supports"],
+) -> Cloud:
+    """Errors of all supports; the squares about the mean are not zero, or no R2 was taken."""
+    held_out = problem.test.any()
+    y = problem.test_target(equation) if held_out else problem.train_target(equation)
+    errors = (y @ y - explained) / np.square(y - y.mean()).sum()
+    fitted = np.isfinite(errors)
+    return Cloud(sizes[fitted], errors[fitted])
 
 
 def _fit(

@@ -35,7 +35,10 @@ from ep2sindy.studies.source import data_summary
 
 FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
 THESIS = "The same with the thesis's terms, fitted to these data."
-FRONT = "Error against number of terms; the star is selected."
+FRONT = (
+    "Error against number of terms: every support that the search proposed, and the best of each "
+    "size; the star is selected. Carets at the upper edge: models far worse than none."
+)
 
 
 @dataclass(frozen=True, eq=False)

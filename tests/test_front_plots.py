@@ -1,0 +1,113 @@
+"""Figures of fronts: a logarithmic scale, and behind the front all that was fitted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.figures.fronts import FLOOR, TOP, front_figure
+from ep2sindy.regression.differential import Differential
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.front import ParetoFront, fit_supports
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.synthetic.systems import lotka_volterra
+
+
+@pytest.fixture(scope="module")
+def searched() -> tuple[ParetoFront, np.ndarray]:
+    """A front of three candidates per size, and the supports that it was taken from."""
+    system = lotka_volterra()
+    run = system.trajectory(noise=0.05, rng=np.random.default_rng(0))
+    recipe = Recipe(Differential(), BestSubset(max_terms=4), Bootstraps(n=12), depth=3)
+    equation = recipe.searched([run], system.model.library, rng=0)[0]
+    return equation.front, equation.supports.masks
+
+
+def drawn(front: ParetoFront, *, index: int = 1) -> Axes:
+    scores = np.where(np.arange(len(front.candidates)) == index, 0.25, 1.0)
+    figure = front_figure({front.equation: front}, {front.equation: scores}, label="d_pareto")
+    return figure.axes[0]
+
+
+def line(ax: Axes, label: str) -> Line2D:
+    (found,) = [each for each in ax.lines if each.get_label() == label]
+    return found
+
+
+def test_the_cloud_holds_the_error_of_every_support_that_was_proposed(
+    searched: tuple[ParetoFront, np.ndarray],
+) -> None:
+    front, masks = searched
+    assert front.cloud is not None
+    fits = fit_supports(front.problem, front.equation, masks)
+    assert front.cloud.sizes.tolist() == [fit.n_terms for fit in fits]
+    # Gram matrices square the condition of the rows, some 1e3 here.
+    expected = [1.0 - fit.r2_test for fit in fits]
+    assert front.cloud.errors == pytest.approx(expected, rel=0, abs=1e-9)
+
+
+def test_errors_are_drawn_on_a_logarithmic_scale_with_all_supports_behind(
+    searched: tuple[ParetoFront, np.ndarray],
+) -> None:
+    front, masks = searched
+    ax = drawn(front)
+    assert ax.get_yscale() == "log"
+    every = line(ax, "all supports fitted")
+    assert front.cloud is not None
+    assert np.sum(front.cloud.errors > TOP) == 0
+    assert len(np.asarray(every.get_xdata())) == len(masks) > len(front.candidates)
+    best, others = line(ax, "best of size"), line(ax, "runners-up")
+    assert every.get_zorder() < others.get_zorder() < best.get_zorder()
+    low, high = ax.get_ylim()
+    assert low < front.errors.min()
+    assert high > front.errors.max()
+
+
+def test_the_star_is_the_selected_candidate(searched: tuple[ParetoFront, np.ndarray]) -> None:
+    front, _ = searched
+    ax = drawn(front, index=4)
+    star = line(ax, "selected")
+    assert star.get_xydata().ravel().tolist() == [front.sizes[4], front.errors[4]]  # type: ignore[union-attr]
+    assert r"$d_\mathrm{pareto}$ = 0.25" in ax.get_title()
+
+
+def test_errors_of_exact_fits_stand_on_a_line_that_says_so(
+    searched: tuple[ParetoFront, np.ndarray],
+) -> None:
+    front, _ = searched
+    exact = [
+        replace(each, r2_test=1.0 + 1e-15) if each.n_terms == 2 else each
+        for each in front.candidates
+    ]
+    ax = drawn(replace(front, candidates=exact, cloud=None))
+    heights = np.asarray(line(ax, "best of size").get_ydata())
+    assert heights.min() == FLOOR > ax.get_ylim()[0]
+    assert [text.get_text() for text in ax.texts] == ["$10^{-12}$ or less"]
+    assert not drawn(front).texts
+
+
+def test_supports_far_worse_than_none_are_marked_at_the_edge(
+    searched: tuple[ParetoFront, np.ndarray],
+) -> None:
+    front, _ = searched
+    assert front.cloud is not None
+    worse = front.cloud.errors.copy()
+    worse[-1] = 1e6
+    ax = drawn(replace(front, cloud=replace(front.cloud, errors=worse)))
+    assert ax.get_ylim()[1] == TOP
+    (carets,) = [each for each in ax.lines if np.asarray(each.get_ydata()).tolist() == [TOP]]
+    assert np.asarray(carets.get_xdata()).tolist() == [front.cloud.sizes[-1]]
+
+
+def test_many_equations_stand_in_rows_without_empty_panels(
+    searched: tuple[ParetoFront, np.ndarray],
+) -> None:
+    front, _ = searched
+    names = [f"x_{k}" for k in range(7)]
+    scores = dict.fromkeys(names, np.arange(float(len(front.candidates))))
+    figure = front_figure(dict.fromkeys(names, front), scores, label="EBIC")
+    assert len(figure.axes) == 7
+    assert figure.get_figwidth() < 20.0
