@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.frames import OFF_SCALE, STOPS, exits, framing
+from ep2sindy.figures.phase import phase_figure
 from ep2sindy.figures.series import (
     derivative_figure,
-    phase_figure,
     spectrum_figure,
     trajectory_figure,
 )
-from ep2sindy.figures.style import framing
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.integrated import Integrated
 from ep2sindy.model.model import SparseModel
@@ -50,7 +50,7 @@ def test_every_model_has_a_row_and_every_state_a_column(
     ):
         assert len(figure.axes) == 2 * n_models
         names = [ax.get_ylabel() for ax in figure.axes[::2]]
-        assert names[-1] == f"model {n_models - 1} (diverged)"
+        assert names[-1] == f"model {n_models - 1}\n(diverged)"
         assert all("m" in ax.get_title() for ax in figure.axes[:2])  # units
 
 
@@ -60,14 +60,15 @@ def test_phase_portraits_leave_no_empty_panel(
 ) -> None:
     models = rollouts(oscillation, n_models)
     figure = phase_figure(oscillation, models, plane=("x", "v"), duration_s=20.0)
-    assert [ax.get_title().removesuffix(" (diverged)") for ax in figure.axes] == list(models)
+    assert [ax.get_title().removesuffix("\n(diverged)") for ax in figure.axes] == list(models)
     labelled = [ax for ax in figure.axes if ax.get_xlabel()]
     assert len(labelled) == n_columns  # the lowest of every column
 
 
 def test_lines_end_with_the_duration(oscillation: Trajectory) -> None:
     figure = trajectory_figure(oscillation, rollouts(oscillation, 3), duration_s=5.0)
-    ends = [line.get_xdata()[-1] for ax in figure.axes for line in ax.lines]  # type: ignore[index]
+    lines = [line for ax in figure.axes for line in ax.lines if len(line.get_xdata()) > 1]  # type: ignore[arg-type]
+    ends = [line.get_xdata()[-1] for line in lines]  # type: ignore[index]
     assert max(ends) <= 5.0
     assert min(ends) > 5.0 - 2 * oscillation.dt_s
 
@@ -90,6 +91,75 @@ def test_a_model_that_runs_away_does_not_shrink_the_rest() -> None:
     assert framing(data, np.array([1e9, -1e9])) == pytest.approx((-0.2, 4.2))
     assert framing(data, np.array([2.0])) == pytest.approx((0.9, 3.1))
     assert framing(data, np.empty(0)) == framing(data, data)
+
+
+def test_rare_values_at_the_ends_of_a_derivative_set_no_scale() -> None:
+    data = np.sin(np.linspace(0.0, 20.0, 300))
+    spiked = np.concatenate([[40.0], data, [-70.0]])
+    assert framing(spiked, data) == pytest.approx((-73.35 - 2.15, 45.5), rel=0.03)
+    low, high = framing(spiked, data, rare=0.01)
+    assert -2.2 < low < -1.0 < 1.0 < high < 2.2
+    assert framing(data, data, rare=0.01) == framing(data, data)  # what is not rare stays
+    step = np.append(np.zeros(200), 1.0)  # all but a rare value alike: nothing else to go by
+    assert framing(step, step, rare=0.01) == pytest.approx((-0.05, 1.05))
+
+
+def test_an_edge_spike_does_not_flatten_the_derivative(oscillation: Trajectory) -> None:
+    states = oscillation.states.copy()
+    states[0] += 5.0  # a difference of 5 in one step of 0.06
+    spiked = Trajectory(oscillation.t, states, ("x", "v"))
+    model = SparseModel(
+        named_terms(("x", "v"), ("x", "v")), ("x", "v"), np.array([[0.0, -1.0], [1.0, 0.0]])
+    )
+    figure = derivative_figure(spiked, {"model": model}, smoother=NoSmoothing(), duration_s=20.0)
+    for ax in figure.axes:
+        assert np.abs(np.asarray(ax.lines[0].get_ydata())).max() > 30.0
+        assert np.abs(ax.get_ylim()).max() < 2.5
+        assert f"_{OFF_SCALE}" in [line.get_label() for line in ax.lines]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["data", OFF_SCALE]
+
+
+def test_a_curve_leaves_a_panel_where_it_crosses_the_edge() -> None:
+    x, y = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.array([0.0, 4.0, 0.0, -4.0, np.inf])
+    assert exits(x, y, (0.0, 4.0), (-1.0, 2.0)) == [(0.5, 2.0, 6), (2.25, -1.0, 7)]
+    assert exits(y, x, (-1.0, 2.0), (0.0, 4.0)) == [(2.0, 0.5, 5), (-1.0, 2.25, 4)]
+    assert exits(x, x, (0.0, 4.0), (0.0, 4.0)) == []
+    assert exits(x[:0], y[:0], (0.0, 4.0), (-1.0, 2.0)) == []
+    assert exits(np.array([0.0, 1.0]), np.array([9.0, 0.0]), (0.0, 1.0), (0.0, 2.0)) == [
+        (0.0, 2.0, 6)  # it begins outside
+    ]
+
+
+def test_runs_off_scale_are_marked_and_named_by_what_becomes_of_them(
+    oscillation: Trajectory,
+) -> None:
+    runs = rollouts(oscillation, 2)
+    words = {"model 0": "follows the data", "model 1": "diverges at 12.5 s"}
+    rows = trajectory_figure(oscillation, runs, duration_s=20.0, verdicts=words)
+    plane = phase_figure(oscillation, runs, plane=("x", "v"), duration_s=20.0, verdicts=words)
+    names = ["model 0\n(follows the data)", "model 1\n(diverges at 12.5 s)"]
+    assert [ax.get_ylabel() for ax in rows.axes[::2]] == names
+    assert [ax.get_title() for ax in plane.axes] == names
+    for figure, panels in ((rows, rows.axes[2:]), (plane, plane.axes[1:])):
+        assert OFF_SCALE in [text.get_text() for text in figure.legends[0].get_texts()]
+        for ax in panels:
+            marks = [line for line in ax.lines if line.get_label() == f"_{OFF_SCALE}"]
+            at_x, at_y = np.array([line.get_xydata()[0] for line in marks]).T  # type: ignore[index]
+            on_edge = [np.isin(at_y, ax.get_ylim()), np.isin(at_x, ax.get_xlim())]
+            assert np.any(on_edge, axis=0).all()
+    kept = rows.axes[0], rows.axes[1], plane.axes[0]
+    assert not any(line.get_label() == f"_{OFF_SCALE}" for ax in kept for line in ax.lines)
+
+
+def test_a_run_that_stops_inside_a_panel_is_marked_there(oscillation: Trajectory) -> None:
+    stopped = rolled(oscillation.t[:100], 1.2 * oscillation.states[:100], diverged=True)
+    figure = trajectory_figure(oscillation, {"model": stopped}, duration_s=20.0)
+    for ax, end in zip(figure.axes, 1.2 * oscillation.states[99], strict=True):
+        (cross,) = [line for line in ax.lines if line.get_label() == f"_{STOPS}"]
+        assert cross.get_xydata().tolist() == [[oscillation.t[99], end]]  # type: ignore[union-attr]
+    early = trajectory_figure(oscillation, {"model": stopped}, duration_s=2.0)
+    labels = [text.get_text() for text in early.legends[0].get_texts()]
+    assert labels == ["data"]  # it has not stopped yet
 
 
 def test_one_state_has_no_phase_portrait(oscillation: Trajectory) -> None:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.curves import Curves, diverged_within, first_part, limits_of, run_labels
+from ep2sindy.figures.frames import legend_marks, mark_exits
 from ep2sindy.figures.style import (
     COLOURS,
     DATA,
     GREY,
     MORE_COLOURS,
     axis_label,
-    framing,
     legend_above,
     power_unit,
     slope_label,
@@ -30,13 +31,7 @@ from ep2sindy.signals.spectrum import dominant_frequency, frequency_text, power_
 
 SINCE_START = "time since start of integration"
 
-
-@dataclass(frozen=True, eq=False)
-class _Curves:
-    """One curve per state over a shared abscissa, in the axis's own prefix."""
-
-    x: Float[np.ndarray, " points"]
-    y: Float[np.ndarray, "points n_states"]
+RARE = 0.01  # of a derivative's samples, low or high, may be edge spikes: they set no scale
 
 
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
@@ -44,7 +39,7 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figur
     n = len(run.state_names)
     figure = Figure(figsize=(9.0, 2.2 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, 2, squeeze=False, sharex="col", width_ratios=[3, 2])
-    states = _first(run.t, run.states, duration_s)
+    states = first_part(run.t, run.states, duration_s)
     spectra = _spectra(run.t, run.states, f_max_Hz)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
         row[0].plot(states.x, states.y[:, k], color=DATA, lw=1)
@@ -61,45 +56,70 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figur
 
 
 def trajectory_figure(
-    run: Trajectory, rollouts: Mapping[str, Rollout], *, duration_s: float
+    run: Trajectory,
+    rollouts: Mapping[str, Rollout],
+    *,
+    duration_s: float,
+    verdicts: Mapping[str, str] | None = None,
+    since: str = SINCE_START,
 ) -> Figure:
-    """A row per model: its run from the data's first sample (colour) over the data (grey)."""
-    data = _first(run.t, run.states, duration_s)
-    models = {_ending(n, r): _first(r.t, r.states, duration_s) for n, r in rollouts.items()}
+    """A row per model: its run from the data's first sample (colour) over the data (grey).
+
+    Carets mark where a run leaves the panel, a cross where one that diverged stops inside it.
+    verdicts: by name, what becomes of the run. since: what the time is counted from.
+    """
+    data = first_part(run.t, run.states, duration_s)
+    models = {name: first_part(r.t, r.states, duration_s) for name, r in rollouts.items()}
     titles = [axis_label(name, run.units[name]) for name in run.state_names]
-    figure, axes = _rows(data, models, titles=titles, x_label=_time_label(duration_s, SINCE_START))
-    _frame(axes, data, models)
+    figure, axes = _rows(
+        data, models, titles=titles, x_label=_time_label(duration_s, since),
+        labels=run_labels(rollouts, verdicts),
+    )  # fmt: skip
+    _frame(figure, axes, data, models, diverged=diverged_within(rollouts, duration_s))
     return figure
 
 
 def derivative_figure(
     run: Trajectory, models: Mapping[str, SparseModel], *, smoother: Smoother, duration_s: float
 ) -> Figure:
-    """A row per model: its right-hand side on the data (colour), the data's derivative (grey)."""
-    data = _first(run.t, smoother.derivative(run.t, run.states), duration_s)
+    """A row per model: its right-hand side on the data (colour), the data's derivative (grey).
+
+    Spikes of the derivative set no scale: carets mark where a curve leaves the panel.
+    """
+    data = first_part(run.t, smoother.derivative(run.t, run.states), duration_s)
     sides = {}
     for name, model in models.items():
         slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
         order = [model.states.index(state) for state in run.state_names]
-        sides[name] = _first(run.t, slopes[:, order], duration_s)
+        sides[name] = first_part(run.t, slopes[:, order], duration_s)
     titles = [slope_label(name, run.units[name]) for name in run.state_names]
     figure, axes = _rows(data, sides, titles=titles, x_label=_time_label(duration_s))
-    _frame(axes, data, sides)
+    _frame(figure, axes, data, sides, rare=RARE)
     return figure
 
 
-def spectrum_figure(run: Trajectory, rollouts: Mapping[str, Rollout], *, f_max_Hz: float) -> Figure:
+def spectrum_figure(
+    run: Trajectory,
+    rollouts: Mapping[str, Rollout],
+    *,
+    f_max_Hz: float,
+    verdicts: Mapping[str, str] | None = None,
+) -> Figure:
     """A row per model: power spectra of its run (colour) and of the data as long (grey).
 
     The dashed line marks the data's dominant frequency; a row says its model's.
+    verdicts: by name, what becomes of the run.
     """
     n_samples = max(len(rollout.t) for rollout in rollouts.values())
     data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz)
-    models = {_ending(n, r): _spectra(r.t, r.states, f_max_Hz) for n, r in rollouts.items()}
+    models = {name: _spectra(r.t, r.states, f_max_Hz) for name, r in rollouts.items()}
     titles = [
         f"power of {axis_label(name, power_unit(run.units[name]))}" for name in run.state_names
     ]
-    figure, axes = _rows(data, models, titles=titles, x_label=_frequency_label(f_max_Hz))
+    figure, axes = _rows(
+        data, models, titles=titles, x_label=_frequency_label(f_max_Hz),
+        labels=run_labels(rollouts, verdicts),
+    )  # fmt: skip
     for k, column in enumerate(axes.T):
         peak = prefixed(f_max_Hz)[0] * dominant_frequency(run.t, run.states[:, k])
         column[0].set_yscale("log")
@@ -110,118 +130,85 @@ def spectrum_figure(run: Trajectory, rollouts: Mapping[str, Rollout], *, f_max_H
             if not rollout.diverged:
                 text = frequency_text(dominant_frequency(rollout.t, rollout.states[:, k]))
                 ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=8)
-    return figure
-
-
-def phase_figure(
-    run: Trajectory, rollouts: Mapping[str, Rollout], *, plane: Sequence[str], duration_s: float
-) -> Figure:
-    """A panel per model in the plane of two states: its run (colour) over the data (grey)."""
-    pair = [run.state_names.index(name) for name in plane]
-    data = _first(run.t, run.states[:, pair], duration_s)
-    models = {
-        _ending(n, r): _first(r.t, r.states[:, pair], duration_s) for n, r in rollouts.items()
-    }
-    n_rows = -(-len(models) // 4)
-    n_columns = -(-len(models) // n_rows)
-    size = (2.6 * n_columns + 0.6, 2.6 * n_rows + 0.7)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
-    colours = MORE_COLOURS * n_rows
-    for ax, colour, (name, curves) in zip(axes.flat, colours, models.items(), strict=False):
-        ax.plot(*data.y.T, color=GREY, lw=1.4, label="data")
-        ax.plot(*curves.y.T, color=colour, lw=1.1)
-        ax.plot(*curves.y[:1].T, "o", color=colour, ms=4)
-        ax.set_title(name, fontsize=9)
-    x_limits, y_limits = _limits(data, models)
-    axes[0, 0].set(xlim=x_limits, ylim=y_limits)
-    for ax in axes[:, 0]:
-        ax.set_ylabel(axis_label(plane[1], run.units[plane[1]]))
-    for ax in axes.flat[len(models) :]:
-        ax.remove()
-    for ax in axes.flat[max(0, len(models) - n_columns) : len(models)]:  # none below it
-        ax.tick_params(labelbottom=True)
-        ax.xaxis.get_offset_text().set_visible(True)
-        ax.set_xlabel(axis_label(plane[0], run.units[plane[0]]))
-    for ax in axes[1:, 0]:  # the first panel's factor is everyone's
-        ax.yaxis.get_offset_text().set_visible(False)
     legend_above(figure, axes[0, 0].lines[:1], size=9.0)
     return figure
 
 
 def _rows(
-    data: _Curves, models: Mapping[str, _Curves], *, titles: Sequence[str], x_label: str
+    data: Curves,
+    models: Mapping[str, Curves],
+    *,
+    titles: Sequence[str],
+    x_label: str,
+    labels: Mapping[str, str] | None = None,
 ) -> tuple[Figure, np.ndarray]:
-    """A row per model, a column per state; the data in grey behind."""
+    """A row per model, a column per state; the data in grey behind. labels: of rows, by name."""
     n_rows, n_columns = len(models), len(titles)
     height = float(np.clip(5.0 / n_rows, 1.05, 2.2))
     size = (max(10.0, 2.6 * n_columns + 1.0), height * n_rows + 1.2)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey="col")
-    colours = MORE_COLOURS * n_rows
-    for row, colour, (name, curves) in zip(axes, colours, models.items(), strict=False):
+    for row, colour, (name, curves) in zip(axes, cycle(MORE_COLOURS), models.items(), strict=False):
         for k, ax in enumerate(row):
             # Wider than the model, so that it shows on both sides of one that follows it.
-            ax.plot(data.x, data.y[:, k], color=GREY, lw=2.0, label="data")
+            ax.plot(data.x, data.y[:, k], color=GREY, lw=2.4, label="data")
             ax.plot(curves.x, curves.y[:, k], color=colour, lw=1.1)
             ax.tick_params(labelsize=8)
             ax.yaxis.get_offset_text().set(size=8)
-        row[0].set_ylabel(
-            name.replace(", ", ",\n"), rotation=0, ha="right", va="center", fontsize=9
-        )
+        text = (labels or {}).get(name, name).replace(", ", ",\n")
+        row[0].set_ylabel(text, rotation=0, ha="right", va="center", fontsize=9)
     for ax in axes[1:].flat:  # columns share their axis, so the first row's factor is everyone's
         ax.yaxis.get_offset_text().set_visible(False)
     for column, title in zip(axes.T, titles, strict=True):
         column[0].set_title(title, fontsize=10)
         column[-1].set_xlabel(x_label)
-    legend_above(figure, axes[0, 0].lines[:1], size=9.0)
     return figure, axes
 
 
-def _frame(axes: np.ndarray, data: _Curves, models: Mapping[str, _Curves]) -> None:
-    for ax, limits in zip(axes[0], _limits(data, models), strict=True):
-        ax.set_ylim(limits)
-
-
-def _limits(data: _Curves, models: Mapping[str, _Curves]) -> list[tuple[float, float]]:
-    together = np.concatenate([curves.y for curves in models.values()])
-    return [framing(*pair) for pair in zip(data.y.T, together.T, strict=True)]
-
-
-def _first(
-    t: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, "samples n_states"],
-    duration_s: float,
-) -> _Curves:
-    """What lies in the first `duration_s`."""
-    since = t - t[:1]
-    shown = since <= duration_s
-    return _Curves(prefixed(duration_s)[0] * since[shown], values[shown])
+def _frame(
+    figure: Figure,
+    axes: np.ndarray,
+    data: Curves,
+    models: Mapping[str, Curves],
+    *,
+    rare: float = 0.0,
+    diverged: Collection[str] = (),
+) -> None:
+    """Limits of every column, marks where curves leave them, and the legend."""
+    for k, (column, limits) in enumerate(zip(axes.T, limits_of(data, models, rare), strict=True)):
+        column[0].set_ylim(limits)
+        drawn = zip(column, cycle(MORE_COLOURS), models.items(), strict=False)
+        for ax, colour, (name, model) in drawn:
+            for curves, shade in ((data, GREY), (model, colour)):
+                if len(curves.x):
+                    ends = float(curves.x[0]), float(curves.x[-1])
+                    stops = name in diverged and curves is model
+                    mark_exits(
+                        ax, curves.x, curves.y[:, k], colour=shade, limits=(ends, limits),
+                        diverged=stops,
+                    )  # fmt: skip
+    legend_above(figure, [*axes[0, 0].lines[:1], *legend_marks(axes.flat)], size=9.0)
 
 
 def _spectra(
     t: Float[np.ndarray, " samples"],
     states: Float[np.ndarray, "samples n_states"],
     f_max_Hz: float,
-) -> _Curves:
+) -> Curves:
     """Power of every state up to `f_max_Hz`; none for a run that stopped at once."""
     if len(t) < 8:
-        return _Curves(np.empty(0), np.empty((0, states.shape[1])))
+        return Curves(np.empty(0), np.empty((0, states.shape[1])))
     pairs = [power_spectrum(t, column) for column in states.T]
     frequency = pairs[0][0]
     power = np.stack([power for _, power in pairs], axis=1)
     shown = (frequency > 0.0) & (frequency <= f_max_Hz)
     drawable = np.maximum(power[shown], np.finfo(float).tiny)  # on a log scale
-    return _Curves(prefixed(f_max_Hz)[0] * frequency[shown], drawable)
+    return Curves(prefixed(f_max_Hz)[0] * frequency[shown], drawable)
 
 
 def _time_label(duration_s: float, what: str = "time") -> str:
-    return f"{what} ({prefixed(duration_s)[1]}s)"
+    return f"{what} ({prefixed(duration_s)[1].replace('u', 'µ')}s)"
 
 
 def _frequency_label(f_max_Hz: float) -> str:
     return f"frequency ({prefixed(f_max_Hz)[1]}Hz)"
-
-
-def _ending(name: str, rollout: Rollout) -> str:
-    return f"{name} (diverged)" if rollout.diverged else name

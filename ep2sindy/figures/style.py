@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-import numpy as np
-from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -37,21 +35,6 @@ def panel_grid(
     for ax in axes[n:]:
         ax.remove()
     return figure, list(axes[:n])
-
-
-def framing(
-    data: Float[np.ndarray, " samples"], models: Float[np.ndarray, " values"]
-) -> tuple[float, float]:
-    """Limits around data and models, within twice the data's range.
-
-    A model that runs away must not shrink the rest.
-    """
-    low, high = float(data.min()), float(data.max())
-    reach = 0.5 * (high - low)
-    bottom = max(low - reach, float(models.min(initial=low)))
-    top = min(high + reach, float(models.max(initial=high)))
-    margin = 0.05 * (top - bottom)
-    return bottom - margin, top + margin
 
 
 def legend_above(

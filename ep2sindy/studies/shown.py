@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures import series
+from ep2sindy.figures import phase, series
 from ep2sindy.model.integrated import Integrated
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Text
@@ -21,11 +21,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
+MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
-    "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
-    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
-    "phase": "Phase portraits of the integrated models (colour) over the data (grey).",
+    "trajectories": "Models integrated from the first sample (colour) over the data (grey). "
+    f"{MARKS}",
+    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey); "
+    "carets: a curve leaves the panel.",
+    "phase": "Phase portraits of the integrated models (colour) over the data (grey), dots where "
+    f"they start. {MARKS}",
     "spectra": "Power spectra of the integrated models (colour) and of the data over the same time "
     "(grey); the dashed line marks the data's dominant frequency, the number is the model's.",
 }
@@ -65,33 +69,48 @@ def run_figures(
     shown: Shown,
     *,
     formulation: object = None,
+    since: str = series.SINCE_START,
 ) -> dict[str, Captioned]:
     """Those of CAPTIONS that are named; phase portraits only of two states or more.
 
     formulation: its smoother takes the data's derivative; without one there are no derivatives.
+    since: what the times of runs are counted from.
     """
-    span, up_to = {"duration_s": shown.span_s(data)}, {"f_max_Hz": shown.up_to_Hz(data)}
+    span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
     rollouts = {name: integrated.rollout for name, integrated in models.items()}
+    verdicts = {name: integrated.verdict for name, integrated in models.items()}
     drawn: dict[str, Callable[[], Figure]] = {
-        "data": partial(series.data_figure, data, **span, **up_to),
-        "trajectories": partial(series.trajectory_figure, data, rollouts, **span),
-        "spectra": partial(series.spectrum_figure, data, rollouts, **up_to),
-    }
+        "data": partial(series.data_figure, data, duration_s=span, f_max_Hz=f_max_Hz),
+        "trajectories": partial(
+            series.trajectory_figure, data, rollouts, duration_s=span, verdicts=verdicts,
+            since=since,
+        ),
+        "spectra": partial(
+            series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, verdicts=verdicts
+        ),
+    }  # fmt: skip
     if smoother := getattr(formulation, "smoother", None):
         sides = {name: integrated.model for name, integrated in models.items()}
         drawn["derivatives"] = partial(
-            series.derivative_figure, data, sides, smoother=smoother, **span
+            series.derivative_figure, data, sides, smoother=smoother, duration_s=span
         )
     if len(plane := data.state_names[:2]) > 1:
-        drawn["phase"] = partial(series.phase_figure, data, rollouts, plane=plane, **span)
+        drawn["phase"] = partial(
+            phase.phase_figure, data, rollouts, plane=plane, duration_s=span, verdicts=verdicts
+        )
     return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
 
 
 def trajectories(
-    data: Trajectory, models: Mapping[str, Integrated], shown: Shown, caption: str
+    data: Trajectory,
+    models: Mapping[str, Integrated],
+    shown: Shown,
+    caption: str,
+    *,
+    since: str = series.SINCE_START,
 ) -> Captioned:
     """Trajectories of other models, or from other starts."""
-    (figure,) = run_figures(["trajectories"], data, models, shown).values()
+    (figure,) = run_figures(["trajectories"], data, models, shown, since=since).values()
     return replace(figure, caption=caption)
 
 
