@@ -1,6 +1,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from omegaconf import DictConfig
@@ -54,6 +55,21 @@ def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_pat
         assert words in page
         assert words in log
     assert "status" not in page  # least squares has none
+
+
+def test_held_out_times_count_from_the_start_of_the_held_out_part(
+    predator_prey: Path, tmp_path: Path
+) -> None:
+    config = constrained(
+        predator_prey, tmp_path, "~models.ionization", "~models.velocity", "figures.duration_s=1e-4"
+    )
+    drawn = programs.computed(config).outcome.figures()
+    for name in ("trajectories", "trajectories_started"):
+        (ax, *_) = reversed(drawn[name].draw().axes)
+        assert ax.get_xlabel() == "time since start of held-out part (µs)"
+        ends = [np.asarray(line.get_xdata())[[0, -1]] for line in ax.lines]
+        assert np.min(ends) == 0.0
+        assert np.max(ends) <= 100.0
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_every_model_has_a_row_and_every_state_a_column(
     ):
         assert len(figure.axes) == 2 * n_models
         names = [ax.get_ylabel() for ax in figure.axes[::2]]
-        assert names[-1] == f"model {n_models - 1}\n(diverged)"
+        assert names[-1] == f"model {n_models - 1}\n(diverges at 12.5 s)"
         assert all("m" in ax.get_title() for ax in figure.axes[:2])  # units
 
 
@@ -60,7 +60,7 @@ def test_phase_portraits_leave_no_empty_panel(
 ) -> None:
     models = rollouts(oscillation, n_models)
     figure = phase_figure(oscillation, models, plane=("x", "v"), duration_s=20.0)
-    assert [ax.get_title().removesuffix("\n(diverged)") for ax in figure.axes] == list(models)
+    assert [ax.get_title().partition("\n")[0] for ax in figure.axes] == list(models)
     labelled = [ax for ax in figure.axes if ax.get_xlabel()]
     assert len(labelled) == n_columns  # the lowest of every column
 
@@ -134,7 +134,7 @@ def test_runs_off_scale_are_marked_and_named_by_what_becomes_of_them(
     oscillation: Trajectory,
 ) -> None:
     runs = rollouts(oscillation, 2)
-    words = {"model 0": "follows the data", "model 1": "diverges at 12.5 s"}
+    words = {"model 0": "follows the data", "model 1": "which ended badly"}
     rows = trajectory_figure(oscillation, runs, duration_s=20.0, verdicts=words)
     plane = phase_figure(oscillation, runs, plane=("x", "v"), duration_s=20.0, verdicts=words)
     names = ["model 0\n(follows the data)", "model 1\n(diverges at 12.5 s)"]
@@ -149,6 +149,17 @@ def test_runs_off_scale_are_marked_and_named_by_what_becomes_of_them(
             assert np.any(on_edge, axis=0).all()
     kept = rows.axes[0], rows.axes[1], plane.axes[0]
     assert not any(line.get_label() == f"_{OFF_SCALE}" for ax in kept for line in ax.lines)
+
+
+def test_times_of_a_run_count_from_its_start(oscillation: Trajectory) -> None:
+    late = Trajectory(1e-6 * oscillation.t + 7e-3, oscillation.states, ("x", "v"))
+    runs = {"model": rolled(late.t[:100], 1.2 * late.states[:100], diverged=True)}
+    since = "time since noon"
+    figure = trajectory_figure(late, runs, duration_s=2e-5, since=since)
+    assert figure.axes[0].get_ylabel() == "model\n(diverges at 6.22 µs)"
+    assert {ax.get_xlabel() for ax in figure.axes} == {"time since noon (µs)"}
+    data = figure.axes[0].lines[0].get_xdata()
+    assert data == pytest.approx(oscillation.t[oscillation.t <= 20.0])  # type: ignore[comparison-overlap]
 
 
 def test_a_run_that_stops_inside_a_panel_is_marked_there(oscillation: Trajectory) -> None:

@@ -29,7 +29,7 @@ def first_part(
     """What lies in the first `duration_s`."""
     since = t - t[:1]
     shown = since <= duration_s
-    return Curves(prefixed(duration_s)[0] * since[shown], values[shown])
+    return Curves(time_unit(duration_s)[0] * since[shown], values[shown])
 
 
 def limits_of(data: Curves, models: Mapping[str, Curves], rare: float = 0.0) -> list[Limits]:
@@ -43,9 +43,25 @@ def diverged_within(rollouts: Mapping[str, Rollout], duration_s: float) -> set[s
     return {name for name, r in rollouts.items() if r.diverged and lasted[name] <= duration_s}
 
 
-def run_labels(
-    rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str] | None
-) -> dict[str, str]:
-    """A name, and below it what becomes of the run where that is known."""
-    known = verdicts or {name: "diverged" for name, r in rollouts.items() if r.diverged}
-    return {name: f"{name}\n({known[name]})" if name in known else name for name in rollouts}
+def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> dict[str, str]:
+    """A name, and below it what becomes of the run where that is known.
+
+    verdicts: by name; a run that diverged says itself when, counted from its start.
+    """
+    found = {}
+    for name, rollout in rollouts.items():
+        verdict = _diverges(rollout) if rollout.diverged else verdicts.get(name)
+        found[name] = f"{name}\n({verdict})" if verdict else name
+    return found
+
+
+def _diverges(rollout: Rollout) -> str:
+    lasted_s = float(rollout.t[-1] - rollout.t[0]) if len(rollout.t) else 0.0
+    factor, unit = time_unit(lasted_s)
+    return f"diverges at {factor * lasted_s:.3g} {unit}" if lasted_s else "diverges at once"
+
+
+def time_unit(duration_s: float) -> tuple[float, str]:
+    """Factor and unit that bring a duration between 1 and 1000: (1e6, "µs")."""
+    factor, prefix = prefixed(duration_s)
+    return factor, f"{prefix.replace('u', 'µ')}s"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from types import MappingProxyType
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,7 +22,7 @@ def phase_figure(
     *,
     plane: Sequence[str],
     duration_s: float,
-    verdicts: Mapping[str, str] | None = None,
+    verdicts: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """A panel per model in the plane of two states: its run (colour) over the data (grey).
 

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from itertools import cycle
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.curves import Curves, diverged_within, first_part, limits_of, run_labels
+from ep2sindy.figures.curves import (
+    Curves,
+    diverged_within,
+    first_part,
+    limits_of,
+    run_labels,
+    time_unit,
+)
 from ep2sindy.figures.frames import legend_marks, mark_exits
 from ep2sindy.figures.style import (
     COLOURS,
@@ -60,7 +68,7 @@ def trajectory_figure(
     rollouts: Mapping[str, Rollout],
     *,
     duration_s: float,
-    verdicts: Mapping[str, str] | None = None,
+    verdicts: Mapping[str, str] = MappingProxyType({}),
     since: str = SINCE_START,
 ) -> Figure:
     """A row per model: its run from the data's first sample (colour) over the data (grey).
@@ -103,7 +111,7 @@ def spectrum_figure(
     rollouts: Mapping[str, Rollout],
     *,
     f_max_Hz: float,
-    verdicts: Mapping[str, str] | None = None,
+    verdicts: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """A row per model: power spectra of its run (colour) and of the data as long (grey).
 
@@ -140,7 +148,7 @@ def _rows(
     *,
     titles: Sequence[str],
     x_label: str,
-    labels: Mapping[str, str] | None = None,
+    labels: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Figure, np.ndarray]:
     """A row per model, a column per state; the data in grey behind. labels: of rows, by name."""
     n_rows, n_columns = len(models), len(titles)
@@ -155,7 +163,7 @@ def _rows(
             ax.plot(curves.x, curves.y[:, k], color=colour, lw=1.1)
             ax.tick_params(labelsize=8)
             ax.yaxis.get_offset_text().set(size=8)
-        text = (labels or {}).get(name, name).replace(", ", ",\n")
+        text = labels.get(name, name).replace(", ", ",\n")
         row[0].set_ylabel(text, rotation=0, ha="right", va="center", fontsize=9)
     for ax in axes[1:].flat:  # columns share their axis, so the first row's factor is everyone's
         ax.yaxis.get_offset_text().set_visible(False)
@@ -207,7 +215,7 @@ def _spectra(
 
 
 def _time_label(duration_s: float, what: str = "time") -> str:
-    return f"{what} ({prefixed(duration_s)[1].replace('u', 'µ')}s)"
+    return f"{what} ({time_unit(duration_s)[1]})"
 
 
 def _frequency_label(f_max_Hz: float) -> str:

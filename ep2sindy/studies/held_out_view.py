@@ -16,6 +16,7 @@ from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.held_out import HeldOutRun, Judged
 from ep2sindy.studies.shown import (
+    MARKS,
     Shown,
     coefficients,
     equation_sections,
@@ -34,9 +35,10 @@ INTERVALS = (
 )
 CAPTIONS = {
     "trajectories": "Models integrated over held-out time from its first sample (colour) over the "
-    "data (grey).",
+    f"data (grey). {MARKS}",
     "trajectories_started": "The same from a start fitted to the first one and a half periods.",
 }
+SINCE = "time since start of held-out part"
 FIGURES = ("phase", "spectra")
 COMPARED = ("f_error", "nrmse", "amplitude_ratio")
 
@@ -85,7 +87,7 @@ class Outcome:
         sample = {name: each.from_sample.integrated for name, each in self.labelled.items()}
         fit = {name: each.from_fit.integrated for name, each in self.labelled.items()}
         runs = {
-            name: trajectories(self.held, models, self.shown, caption)
+            name: trajectories(self.held, models, self.shown, caption, since=SINCE)
             for (name, caption), models in zip(CAPTIONS.items(), (sample, fit), strict=True)
         }
         more = run_figures(FIGURES, self.held, sample, self.shown)
