@@ -1,16 +1,18 @@
 """What a study says, on the terminal, the page and in TensorBoard."""
 
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ep2sindy.report.document import Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.report.page import page_html
-from ep2sindy.report.screen import WIDTH, Screen
+from ep2sindy.report.screen import WIDTH, Screen, rich_table
 from ep2sindy.report.tensorboard import Board
 
 ROWS = pd.DataFrame({"n_terms": [1, 2], "r2": [0.5, float("nan")], "text": ["a < b", "[c]"]})
@@ -56,6 +58,29 @@ def test_numbers_read_alike_on_screen_and_page(log: str) -> None:
     for cells in (("2", "-"), ("1", "0.5")):
         assert all(f"<td>{cell}</td>" in page for cell in cells)
         assert any(all(cell in line for cell in cells) for line in log.splitlines())
+
+
+@pytest.mark.parametrize("width", [50, 80, WIDTH])
+def test_marks_and_terms_stay_whole_at_any_width(width: int) -> None:
+    """Piped, and in run.log, a row has no colour: the mark alone says what is selected."""
+    equation = "n_i' = -1.77e+18 n_i R_ion + 7.79e-34 n_i n_n^2 - 3.45e+05 n_i  <- selected"
+    table = Table(pd.DataFrame({"terms": ["2"], "R2 test": ["0.978"], "model": [equation]}))
+    console = Console(file=StringIO(), width=width, no_color=True)
+    console.print(rich_table(table))
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert max(map(len, lines)) <= width
+    for whole in ("<- selected", "-1.77e+18 n_i R_ion", "+ 7.79e-34 n_i n_n^2", "- 3.45e+05 n_i"):
+        assert sum(whole in line for line in lines) == 1
+
+
+def test_text_too_long_for_a_line_breaks_between_words() -> None:
+    console = Console(file=StringIO(), width=30)
+    text = "note: " + "word " * 20 + "[no markup]"
+    console.print(rich_table(Table(pd.DataFrame({"note": [text]}))))
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert max(map(len, printed.splitlines())) <= 30
+    assert printed.count("word") == 20
+    assert "[no markup]" in printed
 
 
 def test_a_page_marks_rows_and_escapes_text() -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table as RichTable
+from rich.text import Text as RichText
 
 from ep2sindy.library.equations import equation_text
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
@@ -80,5 +84,30 @@ def rich_table(table: Table) -> RichTable:
         rich.add_column(escape(str(name)), justify="right" if is_number else "left")
     for k, row in enumerate(cells):
         style = "bold green" if k in table.bold else "italic" if k in table.italic else None
-        rich.add_row(*map(escape, row), style=style, end_section=k in table.breaks)
+        rich.add_row(*map(Cell, row), style=style, end_section=k in table.breaks)
     return rich
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Text that breaks where a line does not hold it: before a sign, or a mark `<- selected`.
+
+    Words break as ever where what lies between is too long for a line.
+    """
+
+    text: str
+
+    def lines(self, width: int) -> list[str]:
+        found: list[str] = []
+        for part in re.split(r"(?= [+-] )|(?=  <- )", self.text):
+            if found and len(found[-1]) + len(part) <= width:
+                found[-1] += part
+            else:
+                found.append(part.lstrip() if found else part)
+        return found
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield RichText("\n".join(self.lines(options.max_width)))
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement.get(console, options, RichText(self.text))
