@@ -223,7 +223,41 @@ def test_a_figure_tells_fits_by_colour_and_quantities_by_marker_and_line() -> No
         assert [line.get_linestyle() for line in laws] == ["-", "--"]
     known = {entry.get_label(): entry for entry in figure.legends[0].legend_handles}
     found = [(known[name].get_marker(), known[name].get_linestyle()) for name in ("$a$", "$b$")]
-    assert found == [("o", "-"), ("^", "--")]
+    assert found == [("o", "None"), ("^", "--")]
+    assert known["free"].get_linestyle() == "-"
+
+
+def test_laws_of_different_fits_are_different_lines() -> None:
+    points = [(2.0, 1.0), (4.0, 1.5), (5.0, 3.0), (6.0, 2.0)]
+    estimates = pd.DataFrame(
+        {"m": m, "fit": fit, "quantity": q, "value": k + m * scale, "low": 0.0, "high": 20.0}
+        for k, (fit, names) in enumerate({"free": "Lp", "free_refined": "Lp", "tied": "Lq"}.items())
+        for q in names
+        for m, scale in points
+    )
+    law = control_law(
+        np.arange(4.0), np.array([[m] for m, _ in points]), polynomial(["m"], degree=1)
+    )
+    figure = trends_figure(
+        estimates,
+        estimates.iloc[:2],
+        {"free": {"L": law, "p": law}, "tied": {"L": law, "q": law}},
+        panels=[["L"], ["q", "p"]],
+        trends=[("m", {})],
+        labels={},
+    )
+    for ax in figure.axes:
+        laws = [line for line in ax.lines if len(line.get_xdata()) == 60]
+        assert [line.get_linestyle() for line in laws] == ["-", "--"]
+        assert len({line.get_color() for line in laws}) == 2
+    entries = {entry.get_label(): entry for entry in figure.legends[0].legend_handles}
+    assert [entries[name].get_linestyle() for name in ("free", "tied")] == ["-", "--"]
+    assert entries["free, refined"].get_linestyle() == "None"
+    assert [entries[name].get_marker() for name in ("$q$", "$p$")] == ["o", "^"]
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    lowest = legend.get_window_extent().y0
+    assert all(ax.get_window_extent().y1 < lowest for ax in figure.axes)
 
 
 def own_files(output: Path, *points: str) -> list[str]:
