@@ -7,7 +7,15 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from ep2sindy.discovery.regimes import Regimes, regimes
-from ep2sindy.figures.maps import ABSENT, GAP, coefficient_maps, quality_maps, regime_map
+from ep2sindy.figures.maps import (
+    ABSENT,
+    GAP,
+    HALF,
+    SINK,
+    coefficient_maps,
+    quality_maps,
+    regime_map,
+)
 from ep2sindy.figures.panels import COUNTS, SHARES
 from ep2sindy.thruster.parameters import Thruster
 
@@ -21,6 +29,8 @@ def study() -> xr.Dataset:
     """
     z, r = np.linspace(0.002, 0.022, 5), np.linspace(0.036, 0.049, 4)
     coef, weight = np.zeros((2, 2, 3, 5, 4))
+    share = np.ones((2, 3, 5, 4))
+    share[0, 2, :, 0] = 0.25  # of the bootstraps have n_i*u_iz at the inner wall
     coef[0, 2], weight[0, 2] = -40.0, -1.0
     coef[1, 0, :2], weight[1, 0, :2] = np.logspace(22, 24, 8).reshape(2, 4), 1.0
     coef[1, 1, 2:], weight[1, 1, 2:] = 3e4, 1.0
@@ -37,6 +47,7 @@ def study() -> xr.Dataset:
         {
             "coef": (dims, coef * masked),
             "weight": (dims, weight * masked),
+            "inclusion": (dims, share * masked),
             "weight_draws": (("draw", *dims), np.stack([weight * masked] * 3)),
             "r2_train": (("equation", "z", "r"), 0.9 * np.stack([masked] * 2)),
             "r2_test": (("equation", "z", "r"), np.stack([0.8 * masked, -3.0 * masked])),
@@ -120,17 +131,43 @@ def test_masked_cells_are_blank_and_absent_terms_are_not(coefficients: Figure) -
     assert (absent.compressed() == 0.0).all()
 
 
-def test_coefficients_fade_to_grey_with_r2(coefficients: Figure) -> None:
+def test_coefficients_fade_to_grey_with_r2_and_the_share_of_bootstraps(
+    coefficients: Figure,
+) -> None:
     """R2 is 0.8 for n_i' and -3 for n_n' in all fitted cells: the latter shows nothing but grey."""
-    for (ax, values), r2 in zip(maps(coefficients), [0.8] * 3 + [0.0] * 3, strict=True):
+    r2 = [0.8] * 3 + [0.0] * 3
+    for k, (ax, values) in enumerate(maps(coefficients)):
         (mesh,) = ax.collections
         alpha = np.asarray(mesh.get_alpha())
         masked = np.ma.getmaskarray(values)
         assert np.all(alpha[masked] == 1.0)  # white, over the grey
-        assert alpha[~masked] == pytest.approx(r2)
+        assert alpha[1:][~masked[1:]] == pytest.approx(r2[k])
+        inner_wall = (0.25 if k == 2 else 1.0) * r2[k]
+        assert alpha[0][~masked[0]] == pytest.approx(inner_wall)
         assert to_rgba(ax.get_facecolor()) == to_rgba(ABSENT)
         assert np.allclose(mesh.cmap(np.nan), to_rgba("white"))
-    assert "the same at $R^2$ = 0.5" in legend(coefficients)
+    assert HALF in legend(coefficients)
+
+
+def test_points_over_one_axis_fade_as_maps_do() -> None:
+    for r, share in ((0, 0.25), (1, 1.0)):
+        figure = coefficient_maps(study().isel(r=r, drop=True))
+        panels = np.array(figure.axes).reshape(2, -1)
+        sink, none = panels[0, -1].collections[1], panels[1, 0].collections[0]
+        shade = np.array(to_rgba(ABSENT)) + 0.8 * share * np.subtract(SINK, to_rgba(ABSENT))
+        assert sink.get_facecolor() == pytest.approx(np.tile(shade, (4, 1)), abs=1e-6)
+        assert none.get_facecolor() == pytest.approx(np.tile(to_rgba(ABSENT), (2, 1)), abs=1e-6)
+        assert HALF in legend(figure)
+
+
+def test_without_bootstraps_r2_alone_fades() -> None:
+    result = study()
+    result["inclusion"] *= np.nan
+    drawn = maps(coefficient_maps(result))
+    alphas = [np.asarray(ax.collections[0].get_alpha())[:, :-1] for ax, _ in drawn]
+    assert np.array(alphas) == pytest.approx(
+        np.repeat([0.8, 0.0], 3)[:, None, None] + np.zeros(16).reshape(4, 4)
+    )
 
 
 def test_maps_have_the_proportions_of_the_thruster(coefficients: Figure, quality: Figure) -> None:
@@ -174,11 +211,16 @@ def test_over_one_axis_coefficients_are_points_by_sign(
     panels = np.array(coefficient_maps(result, outline=Thruster()).axes).reshape(2, -1)
     for row, equation in zip(panels, coef, strict=True):
         for ax, values in zip(row, equation, strict=True):
-            for line, sign in zip(ax.lines, (1.0, -1.0), strict=False):
+            decade = np.abs(coef.sel(term=values["term"].item())).where(lambda x: x > 0.0)
+            wide = float(decade.max()) > 10.0 * float(decade.min())
+            assert ax.get_yscale() == ("log" if wide else "linear")
+            says = "not selected" in [text.get_text() for text in ax.texts]
+            assert says != bool((np.abs(values) > 0.0).any())
+            for marks, sign in zip(ax.collections, (1.0, -1.0), strict=True):
                 held = sign * values.values > 0.0
-                assert line.get_xdata() == pytest.approx(100.0 * coef[axis].values[held])
-                assert line.get_ydata() == pytest.approx(np.abs(values.values[held]))
-            assert [line.get_xdata()[0] for line in ax.lines[2:]] == pytest.approx(places)
+                expected = np.stack([100.0 * coef[axis].values, np.abs(values.values)], axis=1)
+                assert np.asarray(marks.get_offsets()) == pytest.approx(expected[held])
+            assert [line.get_xdata()[0] for line in ax.lines] == pytest.approx(places)
 
 
 def test_a_regime_map_shows_labels_and_leaves_invalid_points_blank() -> None:

@@ -14,6 +14,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.typing import ColorType
 
 from ep2sindy.discovery.regimes import Regimes
 from ep2sindy.figures.panels import (
@@ -32,9 +33,13 @@ from ep2sindy.thruster.parameters import Thruster
 
 ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
 
+DECADE = 10.0  # over which magnitudes along a line are drawn on a logarithmic scale
+
 GAP = 0.12  # half width of the colour bar's middle, where terms are absent
 
 SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
+
+HALF = r"the same at $R^2 \times$ share of bootstraps = 0.5"
 
 MEDIANS = "terms that act, with medians over the regime's points that have them"
 
@@ -46,14 +51,15 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
 
     result: as `studies.pointwise` gives it. Red is a positive coefficient (a source), blue a
     negative one, darker the larger its magnitude; grey a term that is not in the equation; white
-    a point without equations. Colours fade to that grey as the equation's R2 falls to 0. A column
-    has one scale of whole decades; terms that no point selected have no column. outline: the
-    thruster whose channel is drawn. Over one axis alone, magnitudes are points over it.
+    a point without equations. Colours fade to that grey as R2 of the equation, times the share of
+    the bootstraps that have the term, falls to 0. A column has one scale of whole decades; terms
+    that no point selected have no column. outline: the thruster whose channel is drawn. Over one
+    axis alone, magnitudes are points over it.
     """
     terms = [t for t in result["term"].values if (np.abs(result["coef"].sel(term=t)) > 0).any()]
     if not terms:
         raise ValueError("coefficient maps need a term: no point of the study selected any")
-    coef, r2 = result["coef"].sel(term=terms), result[r2_name(result)]
+    coef, trust = result["coef"].sel(term=terms), _trust(result)
     flat = len(space_axes(coef)) == 1
     shape = coef.sizes["equation"], len(terms)
     figure = map_figure(coef, shape, extra=1.1)
@@ -61,22 +67,37 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     for column, term in zip(axes.T, terms, strict=True):
         column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=10)
         if flat:
-            _signed_points(list(column), coef.sel(term=term))
+            _signed_points(list(column), coef.sel(term=term), trust.sel(term=term))
         else:
-            _signed_maps(figure, list(column), coef.sel(term=term), r2.clip(0.0, 1.0))
+            _signed_maps(figure, list(column), coef.sel(term=term), trust.sel(term=term))
     for row, equation in zip(axes, coef["equation"].values, strict=True):
         name = f"${latex_derivative(str(equation))}$"
         row[0].annotate(
-            name, (-0.42, 0.5), xycoords="axes fraction", fontsize=12, ha="right", va="center"
-        )
+            name, (-0.48 if flat else -0.42, 0.5), xycoords="axes fraction", fontsize=12,
+            ha="right", va="center",
+        )  # fmt: skip
     finish_panels(axes, coef, outline)
-    entries: dict[str, Any] = {"source (+)": SOURCE, "sink (−)": SINK}
+    (half,) = _faded(SOURCE, np.array([0.5]))
+    entries: dict[str, Any] = {"source (+)": SOURCE, "sink (−)": SINK, HALF: half}
     if not flat:
-        half = 0.5 * (np.array(to_rgb(SOURCE)) + np.array(to_rgb(ABSENT)))
-        entries |= {"the same at $R^2$ = 0.5": half, "not selected": ABSENT}
+        entries |= {"not selected": ABSENT}
     patches = [Patch(color=colour, label=label) for label, colour in entries.items()]
     legend_above(figure, patches, size=9.0)
     return figure
+
+
+def _trust(result: xr.Dataset) -> xr.DataArray:
+    """0 to 1 by equation, term and point: R2 times the share of bootstraps that have the term."""
+    share = result["inclusion"].fillna(1.0)  # unknown where there were no bootstraps
+    return result[r2_name(result)].clip(0.0, 1.0) * share
+
+
+def _faded(
+    colour: ColorType, trust: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, "points rgb"]:
+    """From the colour at 1 to the grey of absent terms at 0."""
+    full, none = (np.array(list(to_rgb(shade))) for shade in (colour, ABSENT))
+    return none + trust[:, None] * (full - none)
 
 
 def r2_name(result: xr.Dataset) -> str:
@@ -146,16 +167,23 @@ def _signed_colours() -> ListedColormap:
     )
 
 
-def _signed_points(column: Sequence[Axes], coef: xr.DataArray) -> None:
+def _signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArray) -> None:
     """Magnitudes of one term in all equations along the one axis, sources and sinks apart."""
     (axis,) = space_axes(coef)
-    for ax, values in zip(column, coef, strict=True):
+    sizes = np.abs(coef.values[np.isfinite(coef.values) & (coef.values != 0.0)])
+    scale = "log" if sizes.max() > DECADE * sizes.min() else "linear"
+    for ax, values, shown in zip(column, coef, trust, strict=True):
+        ax.set_yscale(scale)
+        if not (np.abs(values) > 0.0).any():
+            ax.text(
+                0.5, 0.5, "not selected", transform=ax.transAxes, ha="center", va="center",
+                color="#777777", fontsize=8,
+            )  # fmt: skip
         for sign, colour, marker in ((1, SOURCE, "^"), (-1, SINK, "v")):
             chosen = sign * values.values > 0
-            ax.semilogy(
-                CM * coef[axis].values[chosen], np.abs(values.values[chosen]), marker, ms=3,
-                color=colour,
-            )  # fmt: skip
+            at, magnitudes = CM * coef[axis].values[chosen], np.abs(values.values[chosen])
+            faded = _faded(colour, shown.fillna(1.0).values[chosen])
+            ax.scatter(at, magnitudes, s=10, marker=marker, c=faded, linewidths=0)
         ax.set_ylabel(_coef_unit(values), fontsize=7, labelpad=2)
 
 

@@ -19,10 +19,14 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.thruster.parameters import Thruster
 
+FADING = (
+    "It fades to grey where it says little: as the equation's R2 (held-out rows, if any), times "
+    "the share of the bootstraps that have the term, falls to 0."
+)
 CAPTIONS = {
     "coefficients": "Coefficient of every term at every point: its sign says source or sink, the "
-    "colour its order of magnitude, fading to grey as the equation's R2 falls to 0. Grey: the term "
-    "is not in the equation; blank: no equation.",
+    f"colour its order of magnitude. {FADING} Grey: the term is not in the equation; blank: no "
+    "equation.",
     "regimes": "Regimes: points where the same terms act, and how sure the bootstraps are.",
     "quality": "R2 on held-out rows if there are any, number of terms, and what became of the "
     "points if not all were fitted.",
@@ -30,7 +34,7 @@ CAPTIONS = {
 # Over one axis.
 LINE_CAPTIONS = CAPTIONS | {
     "coefficients": "Magnitude of every term's coefficient along the axis; the colour is its sign, "
-    "source or sink. No mark: the term is not in the equation, or there is no equation.",
+    f"source or sink. {FADING} No mark: the term is not in the equation, or there is no equation.",
 }
 
 
