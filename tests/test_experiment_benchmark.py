@@ -78,6 +78,9 @@ def test_the_thesis_stands_beside_our_cells(toy_run: Path) -> None:
 def test_terminal_and_page_show_both(toy_run: Path) -> None:
     log = (toy_run / "run.log").read_text()
     page = (toy_run / "report.html").read_text()
+    for name in ("benchmark", "attractors", "trajectories"):
+        assert f"figures/{name}.png" in page
+    assert "Identified by ours" in page
     for title in ("True equations on the front, %", "True equations selected, %", "True terms"):
         assert title in log
         assert title in page

@@ -50,12 +50,13 @@ def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> 
     """
     found = {}
     for name, rollout in rollouts.items():
-        verdict = _diverges(rollout) if rollout.diverged else verdicts.get(name)
+        verdict = when_it_diverges(rollout) if rollout.diverged else verdicts.get(name)
         found[name] = f"{name}\n({verdict})" if verdict else name
     return found
 
 
-def _diverges(rollout: Rollout) -> str:
+def when_it_diverges(rollout: Rollout) -> str:
+    """`diverges at 182 µs`, counted from its start."""
     lasted_s = float(rollout.t[-1] - rollout.t[0]) if len(rollout.t) else 0.0
     factor, unit = time_unit(lasted_s)
     return f"diverges at {factor * lasted_s:.3g} {unit}" if lasted_s else "diverges at once"

@@ -18,6 +18,7 @@ import pandas as pd
 from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.report.run import Run
 from ep2sindy.studies.benchmark_view import Outcome, published_cells
+from ep2sindy.studies.identified import first_realizations
 from ep2sindy.studies.kinds import Count, Deferred, Levels, Names
 from ep2sindy.studies.variants import Variant, built_variants, merits
 from ep2sindy.synthetic.draws import check_systems, realization
@@ -46,7 +47,10 @@ class Study:
         n_pieces = len(self.systems) * len(self.noises) * self.n_realizations
         with run.progress(n_pieces, "realization") as progress:
             outcomes = self.outcomes(variants, seed=run.seed, progress=progress)
-        return Outcome(variants, outcomes, cells(outcomes), published)
+        first = first_realizations(
+            variants, self.systems, self.noises, n_trajectories=self.n_trajectories, seed=run.seed
+        )
+        return Outcome(variants, outcomes, cells(outcomes), published, first)
 
     def outcomes(
         self,

@@ -10,15 +10,32 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ep2sindy.figures.attractors import attractor_figure
 from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure, merit_table
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Picture, Section, Table, Text, places
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Picture,
+    Section,
+    Table,
+    Text,
+    pictures,
+    places,
+)
+from ep2sindy.studies.identified import FirstRealizations
 from ep2sindy.studies.variants import Variant
 from ep2sindy.synthetic.draws import DRAWS
 
 FIGURE = (
     "Realizations in which all true equations are among the candidates (left), and are the ones "
     "selected (right), in %. A dash: the variant selects nothing, or N/A in the thesis."
+)
+EXAMPLE_FIGURES = {"attractors": False, "trajectories": True}  # over time
+EXAMPLES = (
+    "The first realization of every system and noise level: samples, truth, and the model that "
+    "{variant} selects, integrated from where the truth starts. True terms need not follow a "
+    "chaotic trajectory for long."
 )
 INTRODUCTION = (
     "Each realization draws an initial state, or for the Van der Pol oscillator its parameter, at "
@@ -56,13 +73,15 @@ def published_cells(thesis: Mapping[str, Any]) -> pd.DataFrame:
 class Outcome:
     """Every outcome, and counts of them.
 
-    published: the thesis's cells, as `cells` without the time.
+    published: the thesis's cells, as `cells` without the time. first: what is drawn of
+    the first realizations; None where no variant makes models.
     """
 
     variants: Mapping[str, Variant]
     outcomes: pd.DataFrame
     cells: pd.DataFrame
     published: pd.DataFrame
+    first: FirstRealizations | None
 
     def models(self) -> dict[str, SparseModel]:
         return {}
@@ -76,13 +95,24 @@ class Outcome:
 
     def figures(self) -> dict[str, Captioned]:
         draw = partial(benchmark_figure, self.cells, thesis=self.published)
-        return {"benchmark": Captioned(draw, FIGURE)}
+        found = {"benchmark": Captioned(draw, FIGURE)}
+        if self.first:
+            caption = EXAMPLES.format(variant=self.first.variant)
+            for name, over_time in EXAMPLE_FIGURES.items():
+                draw = partial(attractor_figure, self.first.found, over_time=over_time)
+                found[name] = Captioned(draw, caption)
+        return found
 
     def sections(self) -> list[Section]:
         n = int(self.cells["n"].iloc[0])
         levels = "/".join(f"{100 * noise:g}" for noise in self.cells["noise"].unique())
         counted = f"{n} realizations of every system and noise level."
         about: list[Block] = [Text(counted), Text(INTRODUCTION, page_only=True)]
+        drawn = []
+        if self.first:
+            drawn = [
+                Section(f"Identified by {self.first.variant}", pictures(list(EXAMPLE_FIGURES)))
+            ]
         tables = [
             Section(f"{TITLES[m]}; noise {levels} %", [_readable(self.cells, self.published, m)])
             for m in MERITS
@@ -90,6 +120,7 @@ class Outcome:
         variants = [Text(f"{n}: {v}", page_only=True) for n, v in self.variants.items()]
         return [
             Section("Realizations", [*about, Picture("benchmark")]),
+            *drawn,
             *tables,
             Section("Variants", variants),
         ]

@@ -1,0 +1,80 @@
+"""Figures of identified systems: which panels there are, and what each holds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.figures.attractors import attractor_figure
+from ep2sindy.figures.frames import OFF_SCALE
+from ep2sindy.model.rollout import Rollout
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.studies.identified import FirstRealizations, first_realizations
+from ep2sindy.studies.variants import Variant
+from ep2sindy.synthetic.draws import realization
+
+SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]
+
+
+@pytest.fixture(scope="module")
+def first() -> FirstRealizations:
+    variants: dict[str, Variant] = {"bagged": Recipe(bootstraps=Bootstraps(n=2)), "ours": Recipe()}
+    found = first_realizations(variants, SYSTEMS, NOISES, n_trajectories=1, seed=0)
+    assert found is not None
+    return found
+
+
+def test_first_realizations_are_those_that_the_benchmark_searches(first: FirstRealizations) -> None:
+    assert first.variant == "ours"
+    places = [(each.system, each.noise) for each in first.found]
+    assert places == [("lorenz", 0.0), ("lorenz", 0.05), ("oscillator", 0.0), ("oscillator", 0.05)]
+    for each in first.found:
+        _, (run,) = realization(each.system, each.noise, 0)
+        assert np.array_equal(each.samples.states, run.states)
+        assert np.array_equal(each.truth.t, run.t)
+        noise = each.samples.states - each.truth.states
+        rms = np.sqrt(np.square(each.truth.states).mean(axis=0))
+        assert noise.std(axis=0) == pytest.approx(each.noise * rms, rel=0.1)
+        assert each.right
+        assert np.array_equal(each.rollout.states[0], each.truth.states[0])
+    lorenz = first.found[0]
+    early = lorenz.truth.t < 1.0
+    assert lorenz.rollout.states[early] == pytest.approx(lorenz.truth.states[early], abs=0.05)
+
+
+@pytest.mark.parametrize("over_time", [False, True])
+def test_every_system_has_a_column_and_every_noise_level_a_row(
+    first: FirstRealizations, over_time: bool
+) -> None:
+    figure = attractor_figure(first.found, over_time=over_time)
+    panels = np.array(figure.axes).reshape(2, 2)
+    for ax, name in zip(panels[0], ("Lorenz", "damped oscillator"), strict=True):
+        assert ax.get_title() == f"{name}\ntrue terms"
+    for ax, noise in zip(panels[:, 0], ("noise 0 %", "noise 5 %"), strict=True):
+        assert ax.get_ylabel().startswith(noise)
+    assert panels[1, 0].get_xlabel() == ("time (s)" if over_time else "$x$")
+    assert panels[0, 0].get_ylabel().endswith("$x$" if over_time else "$z$")
+    for ax, each in zip(panels.T.ravel(), first.found, strict=True):
+        samples, truth, model = ax.lines[:3]
+        assert len(truth.get_xdata()) == each.truth.n_samples
+        assert len(model.get_xdata()) == len(each.rollout.t)
+        assert 500 < len(samples.get_xdata()) <= 1500
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "samples", "truth", "identified model",
+    ]  # fmt: skip
+
+
+def test_a_model_that_diverges_neither_sets_the_scale_nor_goes_unsaid(
+    first: FirstRealizations,
+) -> None:
+    each = first.found[2]
+    away = each.truth.states[:400] * np.exp(each.truth.t[:400, None])
+    ended = Rollout(each.truth.t[:400], away, True, "", ("x", "v"), np.empty((400, 0)), (), {})
+    figure = attractor_figure([replace(each, rollout=ended, right=False)], over_time=True)
+    (ax,) = figure.axes
+    assert ax.get_title().endswith("other terms, diverges at 3.99 s")
+    assert np.abs(ax.get_ylim()).max() < 2.0 * np.abs(each.samples.states[:, 0]).max()
+    marks = [line for line in ax.lines if line.get_label() == f"_{OFF_SCALE}"]
+    assert marks
+    assert all(line.get_ydata()[0] in ax.get_ylim() for line in marks)
