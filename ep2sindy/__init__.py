@@ -52,8 +52,10 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.machine.parallel import Dask as Dask
     from ep2sindy.machine.parallel import Loky as Loky
     from ep2sindy.machine.parallel import Serial as Serial
-    from ep2sindy.model.integrated import Integrated as Integrated
-    from ep2sindy.model.integrated import integrate as integrate
+    from ep2sindy.model.free_run import Bounds as Bounds
+    from ep2sindy.model.free_run import FreeRun as FreeRun
+    from ep2sindy.model.free_run import Verdict as Verdict
+    from ep2sindy.model.free_run import free_run as free_run
     from ep2sindy.model.model import SparseModel as SparseModel
     from ep2sindy.model.model import coef_matrix as coef_matrix
     from ep2sindy.model.rollout import Rollout as Rollout
@@ -98,6 +100,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.selection.criteria import BIC as BIC
     from ep2sindy.selection.criteria import EBIC as EBIC
     from ep2sindy.selection.criteria import AICc as AICc
+    from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore
     from ep2sindy.selection.integral import IntegralScore as IntegralScore
     from ep2sindy.selection.knees import Knee as Knee
     from ep2sindy.selection.knees import LogKnee as LogKnee
@@ -105,6 +108,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.selection.resampled import CrossValidation as CrossValidation
     from ep2sindy.selection.resampled import Stability as Stability
     from ep2sindy.selection.rule import selected as selected
+    from ep2sindy.signals.attractor import Cycle as Cycle
+    from ep2sindy.signals.attractor import find_cycle as find_cycle
     from ep2sindy.signals.kalman import KalmanSmoother as KalmanSmoother
     from ep2sindy.signals.smoothers import NoSmoothing as NoSmoothing
     from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay
@@ -186,7 +191,7 @@ _FACE = {
     "library.equations": "equation_text",
     "library.library": "Library polynomial named_terms",
     "machine.parallel": "Serial Loky Dask",
-    "model.integrated": "Integrated integrate",
+    "model.free_run": "Bounds FreeRun Verdict free_run",
     "model.model": "SparseModel coef_matrix",
     "model.rollout": "Rollout",
     "model.scores": "r2",
@@ -211,11 +216,13 @@ _FACE = {
     "search.front": "Candidate ParetoFront fit_support pareto_front",
     "search.searches": "AdaptiveLasso STLSQ BestSubset",
     "selection.criteria": "AICc BIC EBIC",
+    "selection.free_run": "FreeRunScore",
     "selection.integral": "IntegralScore",
     "selection.knees": "Knee LogKnee",
     "selection.refined": "RefinedScore",
     "selection.resampled": "Stability CrossValidation",
     "selection.rule": "selected",
+    "signals.attractor": "Cycle find_cycle",
     "signals.kalman": "KalmanSmoother",
     "signals.smoothers": "SavitzkyGolay NoSmoothing",
     "signals.spectrum": "power_spectrum dominant_frequency",

@@ -31,7 +31,14 @@ ROOMS = [
 ]
 # What takes a second to import, and the modules that may load it, by themselves or through others.
 HEAVY = {
-    "torch": ("refinement", "selection.refined", "studies.parametric"),
+    # In selection the rules that refine, and what they share.
+    "torch": (
+        "refinement",
+        "selection.refined",
+        "selection.free_run",
+        "selection.systems",
+        "studies.parametric",
+    ),  # fmt: skip
     "hydra": ("app",),
     "omegaconf": ("app",),
     "matplotlib": ("figures", "report", "studies", "app"),

@@ -9,8 +9,9 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.many import MAX_ERROR, Ensemble
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.many import follow_together, refine_together
+from ep2sindy.refinement.many import Together, follow_together, refine_together
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.rows import Regression
 from ep2sindy.search.front import Candidate, ParetoFront
@@ -204,9 +205,11 @@ def test_models_of_different_terms_refined_together_are_those_refined_alone() ->
     )
     models = models_of_different_terms()
     method = MultipleShooting()
-    together, finished = refine_together(models, batch, method=method)
-    alone, _ = refine_together(models, batch, method=method, points_per_batch=1)
-    assert finished[0]
+    found = refine_together(models, batch, method=method)
+    together = found.models
+    alone = refine_together(models, batch, method=method, points_per_batch=1).models
+    assert found.finished[0]
+    assert found.loss[0] == pytest.approx(0.05**2 * 2.0, rel=0.5)
     for one, other, before in zip(together, alone, models, strict=True):
         np.testing.assert_allclose(one.coef, other.coef, rtol=1e-6)
         assert ((one.coef != 0.0) == (before.coef != 0.0)).all()
@@ -228,8 +231,11 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
         [PREY.trajectory()], states=("x", "y"), inputs=(), n_windows=3, window=50,
         rng=np.random.default_rng(0),
     )  # fmt: skip
-    (kept, good), finished = refine_together([wild, sound], batch, method=MultipleShooting())
-    assert finished.tolist() == [False, True]
+    found = refine_together([wild, sound], batch, method=MultipleShooting())
+    kept, good = found.models
+    assert found.finished.tolist() == [False, True]
+    assert found.loss[0] == np.inf
+    assert found.loss[1] < 1e-8
     np.testing.assert_array_equal(kept.coef, wild.coef)
     np.testing.assert_allclose(good.coef, sound.coef, rtol=1e-5, atol=1e-12)
     paths = follow_together([wild, sound], batch, method=MultipleShooting())
@@ -242,9 +248,9 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
 ) -> None:
     off = replace(PREY.model, coef=1.2 * PREY.model.coef)
 
-    def unfinished(models: list[SparseModel], *_: object, **__: object) -> tuple:
+    def unfinished(models: list[SparseModel], *_: object, **__: object) -> Together:
         better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
-        return [better, worse], np.zeros(2, dtype=np.bool_)
+        return Together([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
 
     monkeypatch.setattr("ep2sindy.selection.refined.refine_together", unfinished)
     run = PREY.trajectory()
@@ -252,7 +258,7 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
         [run], states=("x", "y"), inputs=(), n_windows=3, window=50, rng=np.random.default_rng(0)
     )
     both = Ensemble(PREY.model.library, ["x", "y"], np.repeat(off.coef[:, :, None], 2, axis=2))
-    found = _refined(both, batch)
+    found = _refined(both, batch, [unconstrained(off)] * 2)
     np.testing.assert_array_equal(found.coef[:, :, 0], PREY.model.coef)
     np.testing.assert_array_equal(found.coef[:, :, 1], off.coef)
 

@@ -12,7 +12,7 @@ from ep2sindy.figures.series import (
     trajectory_figure,
 )
 from ep2sindy.library.library import named_terms
-from ep2sindy.model.integrated import Integrated
+from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.smoothers import NoSmoothing
@@ -176,6 +176,6 @@ def test_a_run_that_stops_inside_a_panel_is_marked_there(oscillation: Trajectory
 def test_one_state_has_no_phase_portrait(oscillation: Trajectory) -> None:
     one = Trajectory(oscillation.t, oscillation.states[:, :1], ("x",))
     model = SparseModel(named_terms(("x",), ("x",)), ("x",), np.array([[-1.0]]))
-    integrated = {"model": Integrated(model, rolled(one.t, one.states), {}, 0.0)}
+    integrated = {"model": free_run(model, one)}
     figures = run_figures(("phase", "spectra"), one, integrated, Shown(20.0, None))
     assert list(figures) == ["spectra"]

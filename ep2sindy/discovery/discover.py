@@ -9,9 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.constraints.relations import Relation
+from ep2sindy.constraints.support import relations_of
 from ep2sindy.data.given import Runs, trajectories_of
-from ep2sindy.discovery.last_fit import assemble_model, last_fit
-from ep2sindy.discovery.recipe import Recipe, check_kind
+from ep2sindy.discovery.choice import choose
+from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.screen import N_LINES, one_screen
 from ep2sindy.model.display import model_html, model_lines
@@ -29,7 +31,8 @@ class Discovery:
     scores: by state, one per candidate of its front, the lowest selected.
     chosen: by state, the selected candidate as it stands in the model: where the noise of the
     samples is followed into the rows, fitted again with weights, with its covariance.
-    ambiguities: terms that these data cannot tell apart.
+    ambiguities: terms that these data cannot tell apart. note: how a rule that judges whole
+    systems of equations came to its model; empty for the others.
     """
 
     fronts: Mapping[str, ParetoFront] = field(repr=False)
@@ -37,6 +40,7 @@ class Discovery:
     chosen: Mapping[str, Candidate]
     model: SparseModel = field(repr=False)
     ambiguities: Sequence[Ambiguity]
+    note: str = ""
 
     def __repr__(self) -> str:
         notes = [f"note: {a.message}" for a in self.ambiguities][:MOST_NOTES]
@@ -52,7 +56,8 @@ class Discovery:
 
     def _headline(self) -> str:
         rule = self.model.provenance.get("selection", "a rule unknown")
-        return f"Discovery of {len(self.chosen)} equations, chosen by {rule}"
+        head = f"Discovery of {len(self.chosen)} equations, chosen by {rule}"
+        return f"{head}: {self.note}" if self.note else head
 
 
 def discover(
@@ -60,6 +65,8 @@ def discover(
     library: Library | None = None,
     recipe: Recipe | None = None,
     *,
+    relations: Sequence[Relation | str] = (),
+    terms: Mapping[str, Sequence[str]] | None = None,
     seed: int | np.random.Generator = 0,
 ) -> Discovery:
     """Find sparse equations for every state of the runs.
@@ -71,27 +78,34 @@ def discover(
     runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`.
     library: None means every product of the variables of the first run up to degree 2.
     recipe: None means Recipe(), the route for noisy data that we know to be best.
+    relations: between coefficients, such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in
+    the search, in the selection and in the model. terms: by state, all the terms of an equation
+    that is known but for its coefficients.
+    Raises ValueError for a relation or a term that the library or the states do not have.
     """
     trajectories = trajectories_of(runs)
     library = polynomial(trajectories[0].names, degree=2) if library is None else library
     recipe = Recipe() if recipe is None else recipe
     check_kind("library", library, Library, "ep.polynomial(['x', 'y'], degree=2)")
     check_kind("recipe", recipe, Recipe, "ep.Recipe(selection=ep.EBIC())")
-    equations = recipe.searched(trajectories, library, rng=np.random.default_rng(seed))
+    asked = Asked(relations_of(relations), terms or {})
+    check_asked(asked, library, trajectories[0].state_names)
+    equations = recipe.searched(trajectories, library, asked, rng=np.random.default_rng(seed))
     fronts = {equation.front.equation: equation.front for equation in equations}
-    scores, selected = recipe.choice(list(fronts.values()))
-    chosen = [last_fit(*pair) for pair in zip(fronts.values(), selected, strict=True)]
     labels = ", ".join(run.label for run in trajectories)
+    choice = choose(
+        list(fronts.values()),
+        recipe.selection,
+        asked.relations,
+        units=trajectories[0].units,
+        provenance=recipe.provenance | {"trajectories": labels},
+    )
     problems = dict.fromkeys(front.problem for front in fronts.values())
     return Discovery(
         fronts=fronts,
-        scores=dict(zip(fronts, scores, strict=True)),
-        chosen=dict(zip(fronts, chosen, strict=True)),
-        model=assemble_model(
-            library,
-            chosen,
-            units=trajectories[0].units,
-            provenance=recipe.provenance | {"trajectories": labels},
-        ),
+        scores=dict(zip(fronts, choice.scores, strict=True)),
+        chosen=dict(zip(fronts, choice.chosen, strict=True)),
+        model=choice.model,
         ambiguities=tuple(dict.fromkeys(a for problem in problems for a in ambiguities(problem))),
+        note=choice.note,
     )

@@ -14,7 +14,7 @@ from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.blocks import Block, Kept, blocks_of
-from ep2sindy.discovery.last_fit import last_fit
+from ep2sindy.discovery.choice import choose
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
@@ -251,13 +251,14 @@ def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit one trajectory; its spread over the bootstraps."""
     rng = np.random.default_rng(search.seed)
     equations = search.recipe.searched([run], search.library, rng=rng)
-    _, selected = search.recipe.choice([equation.front for equation in equations])
+    fronts = [equation.front for equation in equations]
+    chosen_of = choose(fronts, search.recipe.selection, units=run.units, provenance={}).chosen
     point = _nothing(search)
-    for row, (equation, chosen) in enumerate(zip(equations, selected, strict=True)):
+    for row, (equation, chosen) in enumerate(zip(equations, chosen_of, strict=True)):
         problem = equation.front.problem
         mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
         point["coef"][row] = 0.0
-        point["coef"][row, mask] = last_fit(equation.front, chosen).coef
+        point["coef"][row, mask] = chosen.coef
         point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
         point["weight"][row] = _shares(point["coef"][row] * problem.theta_scale)
         fits = equation.draws.fits(equation.number, equation.found, mask)

@@ -6,17 +6,46 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
+from ep2sindy.constraints.relations import Relation
+from ep2sindy.constraints.support import completed
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, resamples
-from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
+from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset, Search
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection, selected
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a user knows of the equations before they are searched.
+
+    relations: between coefficients. terms: by state, of an equation that is known but for its
+    coefficients; it is not searched.
+    """
+
+    relations: Sequence[Relation] = ()
+    terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def of(
+        self, equation: str, library: Library, found: Sequence[Bool[np.ndarray, "_ terms"]]
+    ) -> list[Bool[np.ndarray, "_ terms"]]:
+        """What was found for an equation in every draw, as far as it agrees with what is known.
+
+        Raises ValueError for a term that the library does not have.
+        """
+        if equation in self.terms:
+            known = np.zeros((1, len(library)), dtype=np.bool_)
+            known[0, [library.index(name) for name in self.terms[equation]]] = True
+            return [known] * len(found)
+        if not self.relations:
+            return list(found)
+        return [completed(masks, library, equation, self.relations) for masks in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +81,18 @@ def check_kind(name: str, value: object, kind: type, example: str) -> None:
         raise ValueError(f"{name} must be a {kind.__name__}, such as {example}: {value!r} came")
 
 
+def check_asked(asked: Asked, library: Library, states: Sequence[str]) -> None:
+    """Raise ValueError for a state or a term that is not there, or an equation without terms."""
+    named = [(state, term) for r in asked.relations for _, state, term in r.factors]
+    named += [(state, term) for state, terms in asked.terms.items() for term in terms]
+    for state, term in named:
+        if state not in states:
+            raise ValueError(f"unknown state {state!r}; there are {list(states)}")
+        library.index(term)
+    if empty := [state for state, terms in asked.terms.items() if not terms]:
+        raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
+
+
 @dataclass(frozen=True)
 class Recipe:
     """Rows, search, bootstraps, the rule that selects, and how many candidates it sees per size.
@@ -76,26 +117,24 @@ class Recipe:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")
 
     def searched(
-        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
+        self,
+        runs: Sequence[Trajectory],
+        library: Library,
+        asked: Asked | None = None,
+        *,
+        rng: np.random.Generator | int,
     ) -> list[SearchedEquation]:
         """Assemble the rows, search every bootstrap of them, and fit what is found."""
-        rng = np.random.default_rng(rng)
+        rng, asked = np.random.default_rng(rng), asked or Asked()
         equations = []
         for problem in self.formulation.assemble(runs, library, rng=rng):
             draws = resamples(problem, self.bootstraps, rng=rng)
             for k in range(len(problem.equations)):
-                found = draws.searched(self.search, k)
+                found = asked.of(problem.equations[k], library, draws.searched(self.search, k))
                 supports = pooled(draws, k, found)
                 front = pareto_front(problem, supports, depth=self.depth)
                 equations.append(SearchedEquation(draws, k, found, supports, front))
         return equations
-
-    def choice(
-        self, fronts: Sequence[ParetoFront]
-    ) -> tuple[list[Float[np.ndarray, " candidates"]], list[Candidate]]:
-        """Scores of the candidates of every front, and the one selected from each."""
-        scores = self.selection.scores(fronts)
-        return scores, [selected(*pair) for pair in zip(fronts, scores, strict=True)]
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
@@ -103,7 +142,8 @@ class Recipe:
         """The supports alone: what a benchmark counts."""
         rng = np.random.default_rng(rng)
         fronts = [equation.front for equation in self.searched(runs, library, rng=rng)]
-        _, chosen = self.choice(fronts)
+        scores = self.selection.scores(fronts)
+        chosen = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
         return Finding(
             kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
             selected={c.equation: frozenset(c.terms) for c in chosen},

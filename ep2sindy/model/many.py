@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -63,6 +63,19 @@ class DrivenWindows:
             steps_s, drive, smoothed[starts].T, run.columns(states).T[:, samples[1:]]
         )
 
+    @staticmethod
+    def free(
+        start: Float[np.ndarray, "n_states windows"], *, step_s: float, n_samples: int
+    ) -> DrivenWindows:
+        """Equal steps from any starts, nothing driven and no samples to follow."""
+        n_steps = N_SUBSTEPS * (n_samples - 1)
+        return DrivenWindows(
+            np.full((n_steps, start.shape[1]), step_s / N_SUBSTEPS),
+            np.empty((0, n_steps, 3, start.shape[1])),
+            start,
+            np.empty((len(start), 0, start.shape[1])),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
@@ -112,24 +125,50 @@ class Ensemble:
             [replace(self, coef=block)._errors(windows, centre, spread) for block in blocks]
         )
 
+    def paths(
+        self, windows: DrivenWindows, *, centre: np.ndarray, spread: np.ndarray
+    ) -> Float[np.ndarray, "models windows samples n_states"]:
+        """Where every model runs from every start, the start included; NaN once it diverged.
+
+        As `errors` for the rest. As many samples as the steps of the windows reach.
+        """
+        start = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)
+        found = [start]
+        for x, bounded in self._run(windows, centre[:, None, None], spread[:, None, None]):
+            found.append(np.where(bounded, x, np.nan))
+        return np.stack(found).transpose(2, 3, 0, 1)
+
     def _errors(self, windows: DrivenWindows, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        n_samples = windows.truth.shape[1]
+        shape = (self.coef.shape[2], windows.start.shape[1])
+        total, bounded = np.zeros(shape), np.ones(shape, dtype=np.bool_)
+        for k, (x, inside) in enumerate(self._run(windows, centre, spread)):
+            with np.errstate(over="ignore"):
+                total += np.square((x - windows.truth[:, k, None]) / spread).mean(axis=0)
+            bounded = inside
+        return np.where(bounded, np.minimum(total / n_samples, MAX_ERROR), MAX_ERROR)
+
+    def _run(
+        self, windows: DrivenWindows, centre: np.ndarray, spread: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """States (states, models, windows) at every sample after the start, and which are bounded.
+
+        A run that left its bounds stays where it last was inside.
+        """
         # States first: each operation then runs along models and windows, in one stretch.
         x = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)
-        total = np.zeros(x.shape[1:])
         bounded = np.ones(x.shape[1:], dtype=np.bool_)
-        n_samples = windows.truth.shape[1]
-        # What overflows has left the bounds: seen at the next sample, it stays where it was.
-        with np.errstate(over="ignore", invalid="ignore"):
-            for k in range(n_samples):
-                moved = x
+        for k in range(len(windows.steps_s) // N_SUBSTEPS):
+            moved = x
+            # What overflows has left the bounds.
+            with np.errstate(over="ignore", invalid="ignore"):
                 for step in range(k * N_SUBSTEPS, (k + 1) * N_SUBSTEPS):
                     drive = windows.drive[:, step]
                     at = (drive[:, 0], drive[:, 1], drive[:, 2])
                     moved = rk4_step(self._derivative, moved, at, windows.steps_s[step])
-                bounded &= (np.abs(moved - centre) <= BLOW_UP * spread).all(axis=0)
-                x = np.where(bounded, moved, x)
-                total += np.square((x - windows.truth[:, k, None]) / spread).mean(axis=0)
-        return np.where(bounded, np.minimum(total / n_samples, MAX_ERROR), MAX_ERROR)
+                bounded = bounded & (np.abs(moved - centre) <= BLOW_UP * spread).all(axis=0)
+            x = np.where(bounded, moved, x)
+            yield x, bounded
 
     def _derivative(self, x: np.ndarray, drive: np.ndarray) -> np.ndarray:
         """x and the result: (states, models, windows). drive: (inputs, windows)."""

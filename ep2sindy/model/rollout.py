@@ -15,6 +15,10 @@ from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library
 from ep2sindy.model.inputs import Drive, driven, spline
 
+# Evaluations of the right-hand side that a run may take: a hundred times what an oscillation
+# takes that its samples resolve. A model that blows up in steps ever smaller stops there.
+CALLS, CALLS_PER_SAMPLE = 20_000, 200
+
 
 @runtime_checkable
 class Equations(Protocol):
@@ -147,14 +151,23 @@ def _integrated(
 ) -> Rollout:
     """From x0 over t, in units of `scale`, until a state exceeds `blow_up` of them."""
 
-    def too_large(t: float, y: np.ndarray) -> float:
-        return blow_up - float(np.abs(y).max())
+    calls = 0
+    rhs = _scaled_rhs(model, drive, scale)
 
+    def counted(t: float, y: np.ndarray) -> np.ndarray:
+        nonlocal calls
+        calls += 1
+        return rhs(t, y)
+
+    def too_large(t: float, y: np.ndarray) -> float:
+        return -1.0 if calls > budget else blow_up - float(np.abs(y).max())
+
+    budget = CALLS + CALLS_PER_SAMPLE * len(t)
     too_large.terminal = True  # type: ignore[attr-defined]
     # An overflow on the way to a blow-up is caught by the event, or ends the solver.
     with np.errstate(over="ignore", invalid="ignore"):
         solution = solve_ivp(
-            _scaled_rhs(model, drive, scale),
+            counted,
             (t[0], t[-1]),
             x0 / scale,
             method="DOP853",
@@ -167,7 +180,7 @@ def _integrated(
         t=solution.t,
         states=solution.y.T * scale,
         diverged=solution.status != 0,
-        message=_ending_text(solution, blow_up, bound),
+        message=_ending_text(solution, blow_up, bound, exhausted=calls > budget),
         state_names=tuple(model.states),
         inputs=samples[: len(solution.t)],
         input_names=tuple(model.inputs),
@@ -193,11 +206,13 @@ def _scaled_rhs(
     return rhs
 
 
-def _ending_text(solution: object, blow_up: float, bound: str) -> str:
+def _ending_text(solution: object, blow_up: float, bound: str, *, exhausted: bool) -> str:
     status, t = solution.status, solution.t  # type: ignore[attr-defined]
     last = t[-1] if len(t) else float("nan")
     if status == 0:
         return f"integrated to t = {last:.6g} s"
+    if status == 1 and exhausted:
+        return f"the solver gave up at t = {last:.6g} s: its steps became too small for the samples"
     if status == 1:
         return f"a state grew past {blow_up:g} times {bound} at t = {last:.6g} s"
     return f"the solver stopped at t = {last:.6g} s: {solution.message}"  # type: ignore[attr-defined]

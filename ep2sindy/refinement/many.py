@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,33 +17,56 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import WindowBatch
 
 
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Models refined on the same windows, judged by none.
+
+    finished: which met the method's own test. loss: mean square of (trajectory - data) in the
+    batch's scale; infinite for a model whose refinement did not stay finite, which comes back as
+    it was.
+    """
+
+    models: Sequence[SparseModel]
+    finished: Bool[np.ndarray, " models"]
+    loss: Float[np.ndarray, " models"]
+
+
 def refine_together(
     models: Sequence[SparseModel],
     batch: WindowBatch,
     *,
     method: Method,
+    constraints: Sequence[Constraint] | None = None,
     n_reweights: int = 1,
     points_per_batch: int = 8,
-) -> tuple[list[SparseModel], Bool[np.ndarray, " models"]]:
+) -> Together:
     """Refine models of the same states on the same windows, with free starts, and judge none.
 
-    Returns them and which of them met the method's own test. A model whose refinement does not
-    stay finite comes back as it was. points_per_batch: as for `refine_many`; models may differ in
-    their terms as there. Raises ValueError for a model without terms.
+    constraints: one per model; None leaves all coefficients free. points_per_batch: as for
+    `refine_many`; models may differ in their terms as there.
+    Raises ValueError for a model without terms.
     """
     found: list[SparseModel] = []
-    finished = []
+    finished, losses = [], []
     for first in range(0, len(models), points_per_batch):
         chunk = models[first : first + points_per_batch]
-        relations = [unconstrained(model) for model in chunk]
+        relations = (
+            [unconstrained(model) for model in chunk]
+            if constraints is None
+            else list(constraints[first : first + points_per_batch])
+        )
         odes = [_scaled(m, batch, relation) for m, relation in zip(chunk, relations, strict=True)]
         problem = _unobserved(odes, [batch] * len(chunk), n_reweights=n_reweights)
         fit = method.fit(problem)
         for p, (model, ode) in enumerate(zip(chunk, problem.odes, strict=True)):
-            values = ode.free0.cpu().numpy() * fit.scaling[p, : len(ode.free0)]
-            found.append(with_coef(model, relations[p], values)[0] if fit.finite[p] else model)
+            free = ode.free0.cpu().numpy() * fit.scaling[p, : len(ode.free0)]
+            refined, _ = with_coef(model, relations[p], relations[p].coef(free))
+            found.append(refined if fit.finite[p] else model)
         finished.append(fit.finished & fit.finite)
-    return found, np.concatenate(finished)
+        with np.errstate(over="ignore", invalid="ignore"):
+            loss = np.square(fit.nodes - problem.data).mean(axis=(1, 2, 3))
+        losses.append(np.where(fit.finite, loss, np.inf))
+    return Together(found, np.concatenate(finished), np.concatenate(losses))
 
 
 def follow_together(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import prod
 from typing import ClassVar
 
 import numpy as np
@@ -14,6 +13,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import coef_matrix
 from ep2sindy.search.front import ParetoFront
+from ep2sindy.selection.combinations import combinations, joint_scores
 from ep2sindy.selection.resampled import _within_one_error
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import dominant_frequency
@@ -69,19 +69,6 @@ class IntegralScore:
         errors = records.errors(ensemble_of(fronts, places), starts, lengths)
         limit = _within_one_error(errors, n_independent)
         return joint_scores(fronts, places, errors.mean(axis=1), limit=limit)
-
-
-def combinations(
-    fronts: Sequence[ParetoFront], most: int
-) -> Int[np.ndarray, "combinations fronts"]:
-    """Every choice of one candidate per front, by index. Raises ValueError for more than `most`."""
-    counts = [len(front.candidates) for front in fronts]
-    if prod(counts) > most:
-        raise ValueError(
-            f"at most {most} combinations of candidates are integrated: {counts} candidates make "
-            f"{prod(counts)}; lower depth or the search's max_terms, or raise max_combinations"
-        )
-    return np.indices(counts).reshape(len(counts), -1).T
 
 
 def ensemble_of(
@@ -142,29 +129,6 @@ def records_of(fronts: Sequence[ParetoFront]) -> Records:
             f"{list(runs[0].state_names)}"
         )
     return Records(runs, [KalmanSmoother().smooth(run.t, run.columns(equations)) for run in runs])
-
-
-def joint_scores(
-    fronts: Sequence[ParetoFront],
-    places: Int[np.ndarray, "combinations fronts"],
-    errors: Float[np.ndarray, " combinations"],
-    *,
-    limit: float,
-) -> list[Float[np.ndarray, " candidates"]]:
-    """Scores of candidates from the errors of their combinations.
-
-    limit: errors up to there cannot be told from the least; of these the combination of fewest
-    terms wins. A candidate's score is the least error of all combinations with it, no less than
-    the limit; the winner's are a hair below.
-    """
-    n_terms = sum(f.sizes[k] for f, k in zip(fronts, places.T, strict=True))
-    winner = np.lexsort((errors, n_terms, errors > limit))[0]
-    scores = np.maximum(errors, limit)
-    scores[winner] = np.nextafter(limit, 0.0)
-    return [
-        np.array([scores[column == k].min() for k in range(len(front.candidates))])
-        for front, column in zip(fronts, places.T, strict=True)
-    ]
 
 
 def _half_period(records: Records) -> float:

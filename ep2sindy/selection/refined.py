@@ -9,21 +9,20 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
+from ep2sindy.constraints.relations import Constraint, Relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.many import MAX_ERROR, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.many import follow_together, refine_together
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
 from ep2sindy.search.front import ParetoFront
-from ep2sindy.selection.integral import combinations, ensemble_of, joint_scores, records_of
-from ep2sindy.selection.rule import FLOOR
+from ep2sindy.selection.combinations import admissible, combinations, joint_scores, smallest
+from ep2sindy.selection.integral import ensemble_of, records_of
+from ep2sindy.selection.rule import FLOOR, Decision
+from ep2sindy.selection.systems import budget, system_of
 
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
 LEAST_PAIRS = 3
-
-# Steps of all windows of all points that are refined together: more leave the cache.
-BATCH_STEPS = 6000
 
 # Standard errors that the winner may lie above the best.
 N_ERRORS = 2.0
@@ -74,19 +73,44 @@ class RefinedScore:
         max_combinations, or records too short for two windows.
         """
         places = combinations(fronts, self.max_combinations)
+        errors, limit = self._judged(fronts, places, ())
+        return joint_scores(fronts, places, errors, limit=limit)
+
+    def decide(self, fronts: Sequence[ParetoFront], relations: Sequence[Relation] = ()) -> Decision:
+        """As `scores`, and the winner refined on windows of all the data.
+
+        Raises ValueError for relations that no combination has the terms for, too.
+        """
+        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
+        errors, limit = self._judged(fronts, places, relations)
+        winner = smallest(fronts, places, errors, limit=limit)
+        scores = joint_scores(fronts, places, errors, limit=limit, winner=winner)
+        found = system_of(fronts, places[winner], relations).refined_on_all(records_of(fronts).runs)
+        return Decision(scores, found, self.label)
+
+    def _judged(
+        self,
+        fronts: Sequence[ParetoFront],
+        places: Int[np.ndarray, "combinations fronts"],
+        relations: Sequence[Relation],
+    ) -> tuple[Float[np.ndarray, " combinations"], float]:
+        """Error of every combination on windows it was not refined on, and the limit."""
         records = records_of(fronts)
-        ensemble = ensemble_of(fronts, places)
+        systems = [system_of(fronts, choice, relations) for choice in places]
+        coef = np.stack([system.model.coef for system in systems], axis=2)
+        ensemble = replace(ensemble_of(fronts, places), coef=coef)
+        constraints = [system.constraint for system in systems]
         halves = self._halves(records.runs, ensemble)
         spread = np.concatenate(records.smoothed).std(axis=0)
         residuals = np.concatenate(
             [
-                _residuals(_refined(ensemble, own), other) * (other.scale[: len(spread)] / spread)
+                _residuals(_refined(ensemble, own, constraints), other)
+                * (other.scale[: len(spread)] / spread)
                 for own, other in (halves, halves[::-1])
             ],
             axis=1,
         )
-        errors, limit = _errors_and_limit(residuals)
-        return joint_scores(fronts, places, errors, limit=limit)
+        return _errors_and_limit(residuals)
 
     def _halves(self, runs: Sequence[Trajectory], ensemble: Ensemble) -> list[WindowBatch]:
         """The first windows of all pairs, and the second."""
@@ -144,19 +168,23 @@ def _by_size(ensemble: Ensemble) -> Int[np.ndarray, " models"]:
     return order[n_terms[order] > 0]
 
 
-def _refined(ensemble: Ensemble, batch: WindowBatch) -> Ensemble:
+def _refined(ensemble: Ensemble, batch: WindowBatch, constraints: Sequence[Constraint]) -> Ensemble:
     """Every model refined on the same windows; one without terms has nothing to refine."""
     order = _by_size(ensemble)
     if not order.size:
         return ensemble
-    method, together = _budget(batch)
-    models, finished = refine_together(
-        _models(ensemble, order), batch, method=method, points_per_batch=together
+    method, together = budget(batch)
+    found = refine_together(
+        _models(ensemble, order),
+        batch,
+        method=method,
+        constraints=[constraints[k] for k in order],
+        points_per_batch=together,
     )
     coef = ensemble.coef.copy()
-    coef[:, :, order] = np.stack([model.coef for model in models], axis=2)
+    coef[:, :, order] = np.stack([model.coef for model in found.models], axis=2)
     refined = replace(ensemble, coef=coef)
-    doubtful = order[~finished]
+    doubtful = order[~found.finished]
     before, after = (
         _bounded_squares(_residuals(replace(each, coef=each.coef[:, :, doubtful]), batch))
         for each in (ensemble, refined)
@@ -175,22 +203,12 @@ def _residuals(
     found = np.repeat(still[None], ensemble.coef.shape[2], axis=0)
     order = _by_size(ensemble)
     if order.size:
-        method, together = _budget(batch)
+        method, together = budget(batch)
         paths = follow_together(
             _models(ensemble, order), batch, method=method, points_per_batch=together
         )
         found[order] = paths - batch.data
     return found
-
-
-def _budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:
-    """How long to refine, and how many models together.
-
-    The regression's coefficients are close: whole windows at once, and few iterations. Those
-    that need more are the wrong ones.
-    """
-    method = MultipleShooting(first_block=batch.data.shape[1], tolerance=1e-3, max_iter=10)
-    return method, max(1, BATCH_STEPS // batch.steps.size)
 
 
 def _errors_and_limit(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import process_time
 
@@ -14,27 +13,12 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.model.integrated import Integrated, integrate
+from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.signals.spectrum import dominant_frequency
 
 DIVERGED = 10.0  # residual, in std, of samples that a run does not reach
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOutRun:
-    """A model integrated over the held-out part.
-
-    f_error: dominant frequency of the first state against the data's, minus one.
-    amplitude_ratio: by state, standard deviation against the data's. NaN where it diverged; the
-    frequency also where it died out.
-    """
-
-    integrated: Integrated
-    f_error: float
-    amplitude_ratio: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +31,8 @@ class Judged:
     """
 
     model: SparseModel
-    from_sample: HeldOutRun
-    from_fit: HeldOutRun
+    from_sample: FreeRun
+    from_fit: FreeRun
     cpu_s: float
     status: str | None
     loss: float
@@ -103,28 +87,11 @@ def judge(
     """Integrate a fitted model over the held-out part, from its first sample and from a fit."""
     return Judged(
         model=model,
-        from_sample=_run(model, held, initial=None),
-        from_fit=_run(model, held, initial=_fitted_start(model, held)),
+        from_sample=free_run(model, held),
+        from_fit=free_run(model, held, initial=_fitted_start(model, held)),
         cpu_s=cpu_s,
         status=status,
         loss=loss,
-    )
-
-
-def _run(
-    model: SparseModel, held: Trajectory, *, initial: Float[np.ndarray, " n_states"] | None
-) -> HeldOutRun:
-    """Integrate over all of the held-out part, and compare."""
-    integrated = integrate(model, held, held.n_samples, initial=initial)
-    first = held.state_names[0]
-    f_data_Hz = dominant_frequency(held.t, held.columns([first])[:, 0])
-    ratio = integrated.rollout.states.std(axis=0) / held.columns(model.states).std(axis=0)
-    if integrated.rollout.diverged:
-        ratio = np.full(len(model.states), np.nan)
-    return HeldOutRun(
-        integrated=integrated,
-        f_error=integrated.frequency_Hz[first] / f_data_Hz - 1.0,
-        amplitude_ratio=dict(zip(model.states, ratio.tolist(), strict=True)),
     )
 
 

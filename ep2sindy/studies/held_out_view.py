@@ -11,10 +11,11 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.equations import equation_text
+from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
-from ep2sindy.studies.held_out import HeldOutRun, Judged
+from ep2sindy.studies.held_out import Judged
 from ep2sindy.studies.shown import (
     MARKS,
     Shown,
@@ -74,7 +75,7 @@ class Outcome:
         return {name: each.model for name, each in self.judged.items()}
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        integrated = {name: each.from_sample.integrated for name, each in self.judged.items()}
+        integrated = {name: each.from_sample for name, each in self.judged.items()}
         rows = [row for name, each in self.judged.items() for row in _rows(name, each)]
         return {
             **rollout_tables(self.held, integrated),
@@ -84,8 +85,8 @@ class Outcome:
         }
 
     def figures(self) -> dict[str, Captioned]:
-        sample = {name: each.from_sample.integrated for name, each in self.labelled.items()}
-        fit = {name: each.from_fit.integrated for name, each in self.labelled.items()}
+        sample = {name: each.from_sample for name, each in self.labelled.items()}
+        fit = {name: each.from_fit for name, each in self.labelled.items()}
         runs = {
             name: trajectories(self.held, models, self.shown, caption, since=SINCE)
             for (name, caption), models in zip(CAPTIONS.items(), (sample, fit), strict=True)
@@ -144,9 +145,9 @@ def _rows(name: str, judged: Judged) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"method": name, "state": state, "text": text}
         for run, suffix in ((judged.from_sample, ""), (judged.from_fit, "_started")):
             row |= {
-                f"f_Hz{suffix}": run.integrated.frequency_Hz[state],
+                f"f_Hz{suffix}": run.frequency_Hz[state],
                 f"f_error{suffix}": run.f_error,
-                f"nrmse{suffix}": run.integrated.nrmse,
+                f"nrmse{suffix}": run.nrmse,
                 f"amplitude_ratio{suffix}": run.amplitude_ratio[state],
             }
         rows.append(row | {"loss": judged.loss, "status": judged.status, "cpu_s": judged.cpu_s})
@@ -155,21 +156,21 @@ def _rows(name: str, judged: Judged) -> list[dict[str, Any]]:
 
 def _readable(label: str, judged: Judged) -> dict[str, Any]:
     sample, fit = judged.from_sample, judged.from_fit
-    frequency = frequency_text(sample.integrated.frequency_Hz[judged.model.states[0]])
+    frequency = frequency_text(sample.frequency_Hz[judged.model.states[0]])
     return {
         "method": label,
         "f": _or_verdict(sample, f"{frequency} ({100 * sample.f_error:+.1f} %)"),
-        "nrmse": sample.integrated.nrmse,
+        "nrmse": sample.nrmse,
         **{f"amplitude {state}": ratio for state, ratio in sample.amplitude_ratio.items()},
-        "start fitted": _or_verdict(fit, f"{100 * fit.f_error:+.1f} %, {fit.integrated.nrmse:.2f}"),
+        "start fitted": _or_verdict(fit, f"{100 * fit.f_error:+.1f} %, {fit.nrmse:.2f}"),
         "status": judged.status,
         "CPU s": judged.cpu_s,
     }
 
 
-def _or_verdict(run: HeldOutRun, text: str) -> str:
+def _or_verdict(run: FreeRun, text: str) -> str:
     """The text, or what became of a model that has no frequency."""
-    return run.integrated.verdict if np.isnan(run.f_error) else text
+    return run.text if np.isnan(run.f_error) else text
 
 
 def judged_summary(judged: Judged) -> dict[str, Any]:
@@ -185,12 +186,12 @@ def judged_summary(judged: Judged) -> dict[str, Any]:
     }
 
 
-def run_summary(run: HeldOutRun) -> dict[str, Any]:
-    first = run.integrated.model.states[0]
+def run_summary(run: FreeRun) -> dict[str, Any]:
+    first = run.model.states[0]
     return {
-        "f_kHz": 1e-3 * run.integrated.frequency_Hz[first],
+        "f_kHz": 1e-3 * run.frequency_Hz[first],
         "f_error": run.f_error,
-        "nrmse": run.integrated.nrmse,
+        "nrmse": run.nrmse,
         "amplitude_ratio": run.amplitude_ratio[first],
-        "verdict": run.integrated.verdict,
+        "verdict": run.text,
     }

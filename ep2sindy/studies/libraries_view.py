@@ -13,7 +13,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
-from ep2sindy.model.integrated import Integrated
+from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import (
     Block,
@@ -50,12 +50,12 @@ class Outcome:
     shown: Shown
 
     @property
-    def published(self) -> dict[str, Integrated]:
+    def published(self) -> dict[str, FreeRun]:
         """Models of published terms, where they could be fitted to our data."""
         return {n: r.published for n, r in self.results.items() if r.published is not None}
 
     @property
-    def selected(self) -> dict[str, Integrated]:
+    def selected(self) -> dict[str, FreeRun]:
         return {name: result.selected for name, result in self.results.items()}
 
     def models(self) -> dict[str, SparseModel]:
@@ -83,7 +83,7 @@ class Outcome:
             for state, column in zip(self.data.state_names, self.data.states.T, strict=True):
                 row[f"f_data_{state}_Hz"] = dominant_frequency(self.data.t, column)
                 row[f"f_model_{state}_Hz"] = model.frequency_Hz[state]
-            rows.append(row | {"nrmse": model.nrmse, "verdict": model.verdict})
+            rows.append(row | {"nrmse": model.nrmse, "verdict": model.text})
         return pd.DataFrame(rows)
 
     def figures(self) -> dict[str, Captioned]:
@@ -218,7 +218,7 @@ def _readable_front(result: LibraryResult, state: str) -> Table:
     return Table(pd.DataFrame(rows, columns=columns), bold=bold, italic=italic)
 
 
-def _trajectory_summary(integrated: Integrated, state: str) -> dict[str, Any]:
+def _trajectory_summary(integrated: FreeRun, state: str) -> dict[str, Any]:
     return {
         "f_kHz": 1e-3 * integrated.frequency_Hz[state],
         "nrmse": integrated.nrmse,

@@ -13,7 +13,7 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.last_fit import assemble_model
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
-from ep2sindy.model.integrated import Integrated, integrate, samples_in
+from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.search.front import Candidate, fit_support
 
@@ -27,10 +27,10 @@ class LibraryResult:
 
     recipe: Recipe
     discovery: Discovery
-    selected: Integrated
+    selected: FreeRun
     given: Mapping[str, Mapping[str, float]]
     refitted: Mapping[str, Candidate]
-    published: Integrated | None
+    published: FreeRun | None
 
 
 def result_of(
@@ -49,10 +49,10 @@ def result_of(
     return LibraryResult(
         recipe=recipe,
         discovery=found,
-        selected=integrate(found.model, data, n_samples),
+        selected=free_run(found.model, data, n_samples=n_samples),
         given=published,
         refitted=refitted,
-        published=_integrate_refitted(found, refitted, data, n_samples),
+        published=_run_refitted(found, refitted, data, n_samples),
     )
 
 
@@ -70,9 +70,9 @@ def _refitted(
     return fits
 
 
-def _integrate_refitted(
+def _run_refitted(
     found: Discovery, refitted: Mapping[str, Candidate], data: Trajectory, n_samples: int
-) -> Integrated | None:
+) -> FreeRun | None:
     if set(refitted) != set(data.state_names):
         return None
     model = assemble_model(
@@ -81,4 +81,4 @@ def _integrate_refitted(
         units=data.units,
         provenance={**found.model.provenance, "search": "published terms, refitted"},
     )
-    return integrate(model, data, n_samples)
+    return free_run(model, data, n_samples=n_samples)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import phase, series
-from ep2sindy.model.integrated import Integrated
+from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Text
 from ep2sindy.studies.kinds import PositiveOrAll
@@ -49,7 +49,7 @@ class Shown:
         return self.f_max_Hz or 0.5 / data.dt_s
 
 
-def rollout_tables(data: Trajectory, models: Mapping[str, Integrated]) -> dict[str, pd.DataFrame]:
+def rollout_tables(data: Trajectory, models: Mapping[str, FreeRun]) -> dict[str, pd.DataFrame]:
     """Model and data, sample by sample, so that the figures can be drawn again."""
     found = {}
     for name, integrated in models.items():
@@ -65,7 +65,7 @@ def rollout_tables(data: Trajectory, models: Mapping[str, Integrated]) -> dict[s
 def run_figures(
     names: Sequence[str],
     data: Trajectory,
-    models: Mapping[str, Integrated],
+    models: Mapping[str, FreeRun],
     shown: Shown,
     *,
     formulation: object = None,
@@ -103,7 +103,7 @@ def run_figures(
 
 def trajectories(
     data: Trajectory,
-    models: Mapping[str, Integrated],
+    models: Mapping[str, FreeRun],
     shown: Shown,
     caption: str,
     *,

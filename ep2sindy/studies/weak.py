@@ -133,7 +133,7 @@ class Outcome:
             of_model = {
                 "f": f"{f_text} ({100 * fitted.f_error:+.0f} %)" if steady else "-",
                 "nrmse": places(integrated.nrmse, 2),
-                "verdict": integrated.verdict,
+                "verdict": integrated.text,
             }
             for k, state in enumerate(states):
                 windows, score = self._windows(fitted, state), f"{fitted.r2[state]:.3f}"
@@ -201,7 +201,7 @@ def settings_table(fitted: Mapping[str, Fitted], dt_s: float) -> pd.DataFrame:
                     "f_Hz": integrated.frequency_Hz[state],
                     "f_error": each.f_error,
                     "nrmse": integrated.nrmse,
-                    "verdict": integrated.verdict,
+                    "verdict": integrated.text,
                 }
             )
     return pd.DataFrame(rows).astype({"n_points": "Int64", "half_width": "Int64"})
@@ -227,5 +227,5 @@ def _summary(fitted: Fitted, dt_s: float) -> dict[str, Any]:
         "f_kHz": 1e-3 * integrated.frequency_Hz[model.states[0]],
         "f_error": fitted.f_error,
         "nrmse": integrated.nrmse,
-        "verdict": integrated.verdict,
+        "verdict": integrated.text,
     }

@@ -10,7 +10,7 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.last_fit import assemble_model, reweighted
 from ep2sindy.library.library import Library
-from ep2sindy.model.integrated import Integrated, integrate, samples_in
+from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.rows import Formulation, Regression
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
@@ -58,7 +58,7 @@ class Fitted:
     setting: Setting
     r2: Mapping[str, float]
     half_width: Mapping[str, int]
-    integrated: Integrated
+    integrated: FreeRun
     f_error: float
 
 
@@ -166,7 +166,7 @@ def fit_settings(
             units=run.units,
             provenance={"formulation": repr(setting.formulation), "trajectories": run.label},
         )
-        integrated = integrate(model, run, n_samples)
+        integrated = free_run(model, run, n_samples=n_samples)
         results[name] = Fitted(
             setting=setting,
             r2={state: _r2_own_rows(*pair) for state, pair in found.items()},

@@ -1,0 +1,276 @@
+"""Selection by free run: systems of equations refined, and judged by the cycle they live on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.constraints.relations import Relation
+from ep2sindy.model.free_run import Bounds, FreeRun, Verdict, against_cycle, deviation, free_run
+from ep2sindy.model.many import DrivenWindows, Ensemble
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.stability import limit_cycle
+from ep2sindy.refinement.many import refine_together
+from ep2sindy.search.front import ParetoFront
+from ep2sindy.selection.combinations import admissible, combinations, joint_scores
+from ep2sindy.selection.folds import Fold, Stretch, folds_of
+from ep2sindy.selection.integral import Records, records_of
+from ep2sindy.selection.refined import RefinedScore
+from ep2sindy.selection.rule import FLOOR, Decision
+from ep2sindy.selection.systems import System, budget, system_of
+from ep2sindy.signals.attractor import Cycle, find_cycle
+
+LEAST_PERIODS = 6.0  # of a record, so that its folds leave windows of two
+
+# Periods of a trial run: enough for a transient to die out. A model without inputs runs on where
+# a stretch ends before.
+LEAST_RUN, MOST_RUN = 16.0, 30.0
+
+MAX_ERROR = 10.0  # of a system that dies, diverges or cannot be refined
+
+# Modulus of the second Floquet multiplier up to which a cycle counts as one that attracts: a
+# departure halves within 14 periods. Data of a few periods cannot tell less from none.
+PULL = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A system after all folds, where it was not fitted: the worst of them.
+
+    error: largest deviation from the data's cycle in units of its bound; one and less lives.
+    waveform: largest error of the waveform. loss: of the windows it was refined on.
+    """
+
+    system: System
+    error: float
+    waveform: float
+    loss: float
+
+
+@dataclass(frozen=True)
+class FreeRunScore:
+    """Judge systems of equations by running them freely: the smallest that lives wins.
+
+    The records are parted in `n_folds`. Every combination of candidates, one per equation, is
+    refined on windows of `window_periods` in all folds but one, and run from the first sample of
+    what was held out (smoothed, for noise in it is not the model's), in turn for every fold. It
+    lives if frequency, amplitudes and waveform keep within `bounds` of the data's cycle each time.
+    Of those that live with room to spare the smallest, by waveform among equals, is refined on
+    windows of all data and run over the longest record; it wins if it lives there too, on a cycle
+    that attracts. Where none attracts, one on a neutral cycle may win; where none lives, the one
+    that deviates least does; the note says so. Neither R2 nor the loss of the windows decides:
+    they are blind to where a trajectory ends. Only where the samples are followed to rounding,
+    the truth being in the library, the systems that do so compete alone.
+
+    Where a record has no period, or fewer than six, there is no cycle to keep to: RefinedScore
+    decides. score = the largest deviation from the cycle, in units of its bound; at most 10.
+    margin: systems that deviate by no more than this share of the bounds come first, however
+    small others are: what barely keeps within them here will not in another record.
+    max_combinations: more are refused. n_confirmed: systems refined on all data, at most.
+    """
+
+    bounds: Bounds = field(default_factory=Bounds)
+    n_folds: int = 3
+    n_windows: int = 20
+    window_periods: float = 2.0
+    margin: float = 0.6
+    n_confirmed: int = 8
+    max_combinations: int = 4096
+    label: ClassVar[str] = "free-run error"
+
+    def __post_init__(self) -> None:
+        least = {"n_folds": 2, "n_windows": 1, "n_confirmed": 1, "max_combinations": 1}
+        for name, fewest in least.items():
+            if getattr(self, name) < fewest:
+                raise ValueError(f"{name} must be at least {fewest}: {getattr(self, name)} came")
+        if not self.window_periods > 0.0:
+            raise ValueError(f"window_periods must be positive: {self.window_periods} came")
+        if not 0.0 < self.margin <= 1.0:
+            raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+        """Those of `decide`."""
+        return list(self.decide(fronts).scores)
+
+    def decide(self, fronts: Sequence[ParetoFront], relations: Sequence[Relation] = ()) -> Decision:
+        """Raises ValueError for rows without trajectories, a state without a front, more than
+        max_combinations, or relations that no combination has the terms for.
+        """
+        records = records_of(fronts)
+        cycles = _cycles(records)
+        if isinstance(cycles, str):
+            found = RefinedScore(max_combinations=self.max_combinations).decide(fronts, relations)
+            return replace(found, note=f"{cycles}: chosen by windows held out instead")
+        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
+        systems = [system_of(fronts, choice, relations) for choice in places]
+        trials = self._trials(records, cycles, systems)
+        errors = np.array([trial.error for trial in trials])
+        winner, model, note = self._winner(records, cycles, trials)
+        limit = max(1.0, float(errors[winner]))
+        scores = joint_scores(fronts, places, errors, limit=limit, winner=winner)
+        return Decision(scores, model, note)
+
+    def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
+        """Samples of a window."""
+        samples = [
+            self.window_periods / (cycle.frequency_Hz * run.dt_s)
+            for run, cycle in zip(records.runs, cycles, strict=True)
+        ]
+        return round(float(np.median(samples))) + 1
+
+    def _trials(
+        self, records: Records, cycles: Sequence[Cycle], systems: Sequence[System]
+    ) -> list[Trial]:
+        """Every system refined and run, fold by fold; one that lacks an equation cannot live."""
+        whole = [k for k, system in enumerate(systems) if system.model.coef.any(axis=0).all()]
+        whole.sort(key=lambda k: systems[k].n_terms)  # neighbours in a batch cost alike
+        trials = [Trial(system, MAX_ERROR, np.inf, np.inf) for system in systems]
+        if not whole:
+            return trials
+        some = [systems[k] for k in whole]
+        tried = [
+            self._tried(records, cycles, some, f) for f in folds_of(records.runs, self.n_folds)
+        ]
+        for k, worst in zip(whole, np.max(tried, axis=0), strict=True):
+            trials[k] = Trial(systems[k], *worst.tolist())
+        return trials
+
+    def _tried(
+        self, records: Records, cycles: Sequence[Cycle], systems: Sequence[System], fold: Fold
+    ) -> Float[np.ndarray, "systems 3"]:
+        """Error, waveform and loss of every system in one fold."""
+        first = systems[0].model
+        batch = fold.windows(
+            records.runs,
+            first.states,
+            first.inputs,
+            window=self._window(records, cycles),
+            n_windows=self.n_windows,
+            rng=np.random.default_rng(0),  # the folds make the draws differ, not luck
+        )
+        method, together = budget(batch)
+        refined = refine_together(
+            [system.model for system in systems],
+            batch,
+            method=method,
+            constraints=[system.constraint for system in systems],
+            n_reweights=0,  # states count by their standard deviation, as they are judged
+            points_per_batch=together,
+        )
+        coef = np.stack([model.coef for model in refined.models], axis=2)
+        ensemble = Ensemble(first.library, first.states, coef)
+        judged = [
+            self._judged(t, paths, cycle)
+            for t, paths, cycle in _paths(ensemble, fold.held, records, cycles)
+        ]
+        return np.column_stack([np.max(judged, axis=0), refined.loss])
+
+    def _judged(
+        self,
+        t: Float[np.ndarray, " samples"],
+        paths: Float[np.ndarray, "systems samples n_states"],
+        cycle: Cycle,
+    ) -> Float[np.ndarray, "systems 2"]:
+        """Error and waveform of every system over one stretch, transients left out."""
+        half = len(t) // 2
+        found = np.full((len(paths), 2), [MAX_ERROR, np.inf])
+        for row, path in zip(found, paths, strict=True):
+            if np.isfinite(path).all():
+                likeness = against_cycle(cycle, t[half:], path[half:])
+                error = deviation(*likeness, self.bounds)
+                if not np.isnan(error):
+                    row[:] = min(error, MAX_ERROR), likeness[2].max()
+        return found
+
+    def _winner(
+        self, records: Records, cycles: Sequence[Cycle], trials: Sequence[Trial]
+    ) -> tuple[int, SparseModel, str]:
+        """Which system, refined on all data, and how it came to win."""
+        exact = min(trial.loss for trial in trials) < FLOOR
+        living = [
+            k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)
+        ]
+        living.sort(key=lambda k: self._rank(trials[k]))
+        window = self._window(records, cycles)
+        resting = None
+        for k in living[: self.n_confirmed]:
+            model = trials[k].system.refined_on_all(records.runs, window=window, n_reweights=0)
+            run = self._confirmed(model, records)
+            if run.verdict is Verdict.LIVES:
+                if _attracts(run, cycles):
+                    return k, model, _note(trials, living, "")
+                resting = resting or (k, model)
+        if resting is not None:
+            return *resting, _note(trials, living, ", on a cycle that does not attract")
+        best = min(range(len(trials)), key=lambda k: (trials[k].error, trials[k].system.n_terms))
+        model = trials[best].system.refined_on_all(records.runs, window=window, n_reweights=0)
+        run = self._confirmed(model, records)
+        return best, model, f"none of {len(trials)} systems lives; the best of them: {run.text}"
+
+    def _rank(self, trial: Trial) -> tuple[bool, int, float]:
+        return trial.error > self.margin, trial.system.n_terms, trial.waveform
+
+    def _confirmed(self, model: SparseModel, records: Records) -> FreeRun:
+        """Over the longest record, from its first sample, smoothed."""
+        pairs = zip(records.runs, records.smoothed, strict=True)
+        run, x = max(pairs, key=lambda pair: np.ptp(pair[0].t))
+        return free_run(model, run, initial=x[0], bounds=self.bounds)
+
+
+def _cycles(records: Records) -> list[Cycle] | str:
+    """The cycle of every record, or what stands against there being one."""
+    found = []
+    for run, x in zip(records.runs, records.smoothed, strict=True):
+        cycle = find_cycle(run.t, run.columns(run.state_names)) and find_cycle(run.t, x)
+        name = f"record {run.label!r}" if run.label else "the record"
+        if cycle is None:
+            return f"{name} has no period"
+        if cycle.n_periods < LEAST_PERIODS:
+            return f"{name} holds {cycle.n_periods:.1f} periods of {LEAST_PERIODS:g}"
+        found.append(cycle)
+    return found
+
+
+def _paths(
+    ensemble: Ensemble,
+    held: Sequence[Stretch],
+    records: Records,
+    cycles: Sequence[Cycle],
+) -> Iterator[tuple[np.ndarray, np.ndarray, Cycle]]:
+    """Times and paths of every system over every stretch that was held out."""
+    joined = np.concatenate(records.smoothed)
+    centre, spread = joined.mean(axis=0), joined.std(axis=0)
+    for part in held:
+        run, x, cycle = records.runs[part.run], records.smoothed[part.run], cycles[part.run]
+        per_period = 1.0 / (cycle.frequency_Hz * run.dt_s)
+        first, n_samples = part.start, part.stop - part.start
+        if not ensemble.inputs:
+            n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))
+            start = x[first][:, None]
+            windows = DrivenWindows.free(start, step_s=run.dt_s, n_samples=n_samples)
+            t = run.dt_s * np.arange(n_samples)
+        else:
+            if n_samples < LEAST_RUN * per_period:  # inputs end with the record
+                first, n_samples = 0, run.n_samples
+            windows = DrivenWindows.of(
+                run, x, ensemble.states, ensemble.inputs, np.array([first]), n_samples - 1
+            )
+            t = run.t[first : first + n_samples]
+        yield t, ensemble.paths(windows, centre=centre, spread=spread)[:, 0], cycle
+
+
+def _attracts(run: FreeRun, cycles: Sequence[Cycle]) -> bool:
+    """Whether a departure from the model's cycle dies out; a driven model has no cycle alone."""
+    if run.model.inputs:
+        return True
+    period_s = 1.0 / cycles[0].frequency_Hz
+    cycle = limit_cycle(run.model, run.rollout.states[-1], period_s=period_s)
+    return cycle is not None and bool((np.abs(cycle.multipliers[1:]) <= PULL).all())
+
+
+def _note(trials: Sequence[Trial], living: Sequence[int], reservation: str) -> str:
+    return f"lives{reservation}; {len(living)} of {len(trials)} systems live where not fitted"

@@ -1,0 +1,216 @@
+"""What a record repeats: its period, its waveform over one period, and how two records compare."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.interpolate import make_interp_spline
+
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.trajectory import read_only
+from ep2sindy.signals.spectrum import dominant_frequency, is_uniform, power_spectrum
+
+LEAST_PERIODS = 3.0  # of a record that can be said to repeat
+
+LEAST_SHARE = 0.5  # of the variance that the waveform must explain, for a record to have a period
+
+MOST_HARMONICS = 16
+
+SAMPLES_PER_HARMONIC = 2.5  # of its period, at least: two would be the Nyquist limit
+
+PERIODS_TRACKED = 8.0  # that an instant's phase is taken from: breathing wanders over tens of them
+
+N_SHIFTS = 720  # of one waveform over another, before the best is refined
+
+N_QUANTILES = 256
+
+BANDS_PER_OCTAVE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle:
+    """A record that repeats: states = mean + Re sum_k harmonics[k - 1] exp(i k phase).
+
+    phase: (samples,) in rad, of the fundamental, followed along the record.
+    mean: (n_states,); harmonics: (n_harmonics, n_states), in the states' units.
+    share: of the states' variance, pooled, white noise left out, that the waveform explains.
+    """
+
+    frequency_Hz: float
+    phase: Float[np.ndarray, " samples"]
+    mean: Float[np.ndarray, " n_states"]
+    harmonics: Complex[np.ndarray, "n_harmonics n_states"]
+    share: float
+
+    @property
+    def std(self) -> Float[np.ndarray, " n_states"]:
+        """Of the waveform: what a state's standard deviation is without noise."""
+        return np.sqrt(0.5 * np.square(np.abs(self.harmonics)).sum(axis=0))
+
+    @property
+    def n_periods(self) -> float:
+        return float((self.phase[-1] - self.phase[0]) / (2.0 * np.pi))
+
+    def waveform(self, phase: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points n_states"]:
+        """The states over a period, at phases in rad."""
+        order = np.arange(1, len(self.harmonics) + 1)
+        return self.mean + (np.exp(1j * np.outer(phase, order)) @ self.harmonics).real
+
+
+def find_cycle(
+    t: Float[np.ndarray, " samples"],
+    states: Float[np.ndarray, "samples n_states"],
+    *,
+    n_harmonics: int | None = None,
+) -> Cycle | None:
+    """The period and waveform of a record; None where it has none.
+
+    t: (samples,) in s. The period is that of the state whose spectrum has the sharpest line; its
+    phase is followed by demodulation, and the waveform is a Fourier series in it, fitted to all
+    samples: white noise averages out. n_harmonics: None takes as many as the samples bear (BIC).
+    None is returned for fewer than three periods, or where the waveform explains less than half
+    of the variance: chaos, noise, a transient.
+    """
+    spread = states.std(axis=0)
+    # Rounding on a state that rests is no oscillation.
+    if not (spread > 1e-9 * np.abs(states).max(axis=0)).any():
+        return None
+    scaled = (states - states.mean(axis=0)) / zero_to_one(spread)
+    lines = [_line(t, column) for column in scaled.T]
+    leader = int(np.argmax([sharpness for _, sharpness in lines]))
+    rough_Hz = lines[leader][0]
+    if not rough_Hz * (t[-1] - t[0]) >= LEAST_PERIODS:
+        return None
+    phase = phase_along(t, scaled[:, leader], rough_Hz)
+    frequency_Hz = float(np.polynomial.Polynomial.fit(t, phase, 1).convert().coef[1]) / (2 * np.pi)
+    series, rest = _series(phase, scaled, n_harmonics, len(t) / (rough_Hz * (t[-1] - t[0])))
+    noise = len(t) * np.array([white_variance(t, column) for column in scaled.T])
+    known = np.maximum(np.square(scaled).sum(axis=0) - noise, 1e-12)
+    share = 1.0 - float(np.maximum(rest - noise, 0.0).sum() / known.sum())
+    if not (share >= LEAST_SHARE and frequency_Hz > 0.0):
+        return None
+    return Cycle(
+        frequency_Hz=frequency_Hz,
+        phase=read_only(phase),
+        mean=read_only(states.mean(axis=0) + series[0] * spread),
+        harmonics=(series[1::2] - 1j * series[2::2]) * spread,
+        share=share,
+    )
+
+
+def _line(t: np.ndarray, column: np.ndarray) -> tuple[float, float]:
+    """Dominant frequency in Hz, and the share of the power within two bins of it."""
+    rough_Hz = dominant_frequency(t, column)
+    if rough_Hz <= 0.0:
+        return 0.0, 0.0
+    frequency, power = power_spectrum(t, column)
+    near = np.abs(frequency - rough_Hz) <= 2.5 * frequency[1]
+    return rough_Hz, float(power[near].sum() / power.sum())
+
+
+def white_variance(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
+    """Variance of the white noise in samples of x: what the upper half of the spectrum goes on as.
+
+    The median of the power there: lines of a signal do not move it.
+    """
+    frequency, power = power_spectrum(t, x)
+    upper = power[len(power) // 2 :]
+    return float(np.median(upper) / np.log(2.0) * frequency[-1]) if upper.size else 0.0
+
+
+def phase_along(
+    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], frequency_Hz: float
+) -> Float[np.ndarray, " samples"]:
+    """Phase in rad of the component of x near a frequency, at every sample, without jumps.
+
+    x is demodulated, and averaged over eight periods, or half the record if that is less, under
+    a Hann window.
+    """
+    from scipy.signal import fftconvolve  # half a second that a search does not need
+
+    even = t if is_uniform(t) else np.linspace(t[0], t[-1], len(t))
+    values = x if even is t else make_interp_spline(t, x, k=min(3, len(t) - 1))(even)
+    turning = np.exp(-2j * np.pi * frequency_Hz * (even - even[0]))
+    step_s = (even[-1] - even[0]) / (len(even) - 1)
+    n = round(min(PERIODS_TRACKED / (frequency_Hz * step_s), 0.5 * len(even)))
+    window = np.hanning(max(n, 3) + 2)[1:-1]
+    slow = fftconvolve((values - values.mean()) * turning, window, mode="same")
+    drift = np.unwrap(np.angle(slow))
+    phase = 2.0 * np.pi * frequency_Hz * (even - even[0]) + drift
+    return phase if even is t else np.interp(t, even, phase)
+
+
+def _series(
+    phase: np.ndarray, scaled: np.ndarray, n_harmonics: int | None, samples_per_period: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Constant, then cosine and sine of every order, (1 + 2 n, n_states); squares that are left."""
+    most = int(np.clip(samples_per_period / SAMPLES_PER_HARMONIC, 1, MOST_HARMONICS))
+    most = min(most, max(1, (len(phase) - 1) // 4)) if n_harmonics is None else n_harmonics
+    turns = np.exp(1j * np.outer(phase, np.arange(1, most + 1)))
+    columns = np.empty((len(phase), 1 + 2 * most))
+    columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real, turns.imag
+    # The columns are ordered, so one factorisation holds the fits of every number of harmonics.
+    basis, triangle = np.linalg.qr(columns)
+    known = basis.T @ scaled
+    whole = np.square(scaled).sum(axis=0)
+    left = np.maximum(whole - np.cumsum(np.square(known), axis=0)[::2], 1e-12 * whole)
+    order = most
+    if n_harmonics is None:
+        price = np.log(len(phase)) * (1 + 2 * np.arange(most + 1)) * scaled.shape[1]
+        order = max(1, int(np.argmin(len(phase) * np.log(left).sum(axis=1) + price)))
+    kept = slice(0, 1 + 2 * order)
+    return np.linalg.solve(triangle[kept, kept], known[kept]), left[order]
+
+
+def waveform_errors(data: Cycle, other: Cycle) -> Float[np.ndarray, " n_states"]:
+    """RMS difference of two waveforms, in the data's standard deviations, at the best shift.
+
+    One shift for all states: a lag between them counts.
+    """
+    n = max(len(data.harmonics), len(other.harmonics))
+    ours, theirs = (np.pad(c.harmonics, ((0, n - len(c.harmonics)), (0, 0))) for c in (data, other))
+    std = zero_to_one(data.std)
+    order = np.arange(1, n + 1)
+    overlap = ((np.conj(ours) * theirs) / np.square(std)).sum(axis=1)
+    shifts = 2.0 * np.pi * np.arange(N_SHIFTS) / N_SHIFTS
+    best = shifts[np.argmax((np.exp(1j * np.outer(shifts, order)) @ overlap).real)]
+    for _ in range(3):  # Newton's method on the overlap, from within half a degree
+        turned = np.exp(1j * order * best) * overlap
+        curvature = (order**2 @ turned).real
+        best -= (order @ turned).imag / curvature if curvature > 0.0 else 0.0
+    off = np.square(np.abs(theirs * np.exp(1j * order * best)[:, None] - ours)).sum(axis=0)
+    return np.sqrt(np.square(other.mean - data.mean) + 0.5 * off) / std
+
+
+def distribution_distances(
+    data: Float[np.ndarray, "samples n_states"], other: Float[np.ndarray, "_ n_states"]
+) -> Float[np.ndarray, " n_states"]:
+    """Wasserstein distance of each state's distribution to the data's, in standard deviations."""
+    levels = (np.arange(N_QUANTILES) + 0.5) / N_QUANTILES
+    apart = np.quantile(other, levels, axis=0) - np.quantile(data, levels, axis=0)
+    return np.abs(apart).mean(axis=0) / zero_to_one(data.std(axis=0))
+
+
+def spectrum_distance(
+    t: Float[np.ndarray, " samples"],
+    data: Float[np.ndarray, "samples n_states"],
+    other: Float[np.ndarray, "samples n_states"],
+) -> float:
+    """Share of the power that two records of the same times have in different bands, 0 to 1.
+
+    Bands are thirds of octaves; the mean over the states.
+    """
+    apart = []
+    for ours, theirs in zip(data.T, other.T, strict=True):
+        shares = [_power_by_band(t, column) for column in (ours, theirs)]
+        apart.append(0.5 * float(np.abs(shares[0] - shares[1]).sum()))
+    return float(np.mean(apart))
+
+
+def _power_by_band(t: np.ndarray, column: np.ndarray) -> np.ndarray:
+    frequency, power = power_spectrum(t, column)
+    band = np.floor(BANDS_PER_OCTAVE * np.log2(frequency[1:] / frequency[1])).astype(np.int64)
+    shares = np.bincount(band, weights=power[1:])
+    return shares / zero_to_one(np.array(shares.sum()))
