@@ -38,7 +38,7 @@ HEAVY = {
         "selection.free_run",
         "selection.systems",
         "studies.parametric",
-    ),  # fmt: skip
+    ),
     "hydra": ("app",),
     "omegaconf": ("app",),
     "matplotlib": ("figures", "report", "studies", "app"),

@@ -49,13 +49,11 @@ class Decision:
 
 
 @runtime_checkable
-class SystemSelection(Protocol):
+class SystemSelection(Selection, Protocol):
     """A rule that judges combinations of candidates, one per equation, and refines the winner.
 
     relations: between coefficients; they hold in every system that is judged.
     """
-
-    label: ClassVar[str]
 
     def decide(
         self, fronts: Sequence[ParetoFront], relations: Sequence[Relation] = ()

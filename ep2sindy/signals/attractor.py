@@ -164,24 +164,35 @@ def _series(
     return np.linalg.solve(triangle[kept, kept], known[kept]), left[order]
 
 
+def best_shift(data: Cycle, other: Cycle) -> float:
+    """Phase in rad to add to the other's, for its waveform to lie on the data's: all states."""
+    ours, theirs, order = _side_by_side(data, other)
+    overlap = ((np.conj(ours) * theirs) / np.square(zero_to_one(data.std))).sum(axis=1)
+    shifts = 2.0 * np.pi * np.arange(N_SHIFTS) / N_SHIFTS
+    best = float(shifts[np.argmax((np.exp(1j * np.outer(shifts, order)) @ overlap).real)])
+    for _ in range(3):  # Newton's method on the overlap, from within half a degree
+        turned = np.exp(1j * order * best) * overlap
+        curvature = float((order**2 @ turned).real)
+        best -= float((order @ turned).imag) / curvature if curvature > 0.0 else 0.0
+    return best
+
+
 def waveform_errors(data: Cycle, other: Cycle) -> Float[np.ndarray, " n_states"]:
     """RMS difference of two waveforms, in the data's standard deviations, at the best shift.
 
     One shift for all states: a lag between them counts.
     """
+    ours, theirs, order = _side_by_side(data, other)
+    turned = theirs * np.exp(1j * order * best_shift(data, other))[:, None]
+    off = np.square(np.abs(turned - ours)).sum(axis=0)
+    return np.sqrt(np.square(other.mean - data.mean) + 0.5 * off) / zero_to_one(data.std)
+
+
+def _side_by_side(data: Cycle, other: Cycle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Harmonics of both, as many, and their orders."""
     n = max(len(data.harmonics), len(other.harmonics))
     ours, theirs = (np.pad(c.harmonics, ((0, n - len(c.harmonics)), (0, 0))) for c in (data, other))
-    std = zero_to_one(data.std)
-    order = np.arange(1, n + 1)
-    overlap = ((np.conj(ours) * theirs) / np.square(std)).sum(axis=1)
-    shifts = 2.0 * np.pi * np.arange(N_SHIFTS) / N_SHIFTS
-    best = shifts[np.argmax((np.exp(1j * np.outer(shifts, order)) @ overlap).real)]
-    for _ in range(3):  # Newton's method on the overlap, from within half a degree
-        turned = np.exp(1j * order * best) * overlap
-        curvature = (order**2 @ turned).real
-        best -= (order @ turned).imag / curvature if curvature > 0.0 else 0.0
-    off = np.square(np.abs(theirs * np.exp(1j * order * best)[:, None] - ours)).sum(axis=0)
-    return np.sqrt(np.square(other.mean - data.mean) + 0.5 * off) / std
+    return ours, theirs, np.arange(1, n + 1)
 
 
 def distribution_distances(

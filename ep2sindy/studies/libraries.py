@@ -15,6 +15,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll
 from ep2sindy.studies.libraries_view import Outcome
 from ep2sindy.studies.library_result import result_of
+from ep2sindy.studies.living import LivingSearch
 from ep2sindy.studies.shown import Shown
 from ep2sindy.studies.source import Source
 
@@ -51,7 +52,8 @@ class Study:
 
     rollout_s: how far to integrate; None, or more than there is, means to the data's end.
     thesis: by library, published equations: state -> term -> SI coefficient; where the library
-    has the terms, and the data can tell them from others, they are fitted as well.
+    has the terms, and the data can tell them from others, they are fitted as well. living: how
+    libraries without inputs are searched for a model that lives; None leaves that out.
     """
 
     source: Source
@@ -60,6 +62,7 @@ class Study:
     rollout_s: PositiveOrAll
     figures: Shown
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
+    living: LivingSearch | None = None
 
     def compute(self, run: Run) -> Outcome:
         recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
@@ -70,7 +73,13 @@ class Study:
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         results = {
             name: result_of(
-                data, library, recipes[name], self.thesis.get(name, {}), self.rollout_s, rng=rng
+                data,
+                library,
+                recipes[name],
+                self.thesis.get(name, {}),
+                self.rollout_s,
+                self.living,
+                rng=rng,
             )
             for (name, library), rng in zip(libraries.items(), streams, strict=True)
         }

@@ -30,6 +30,14 @@ from ep2sindy.search.front import Candidate
 from ep2sindy.selection.rule import selected
 from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
 from ep2sindy.studies.library_result import LibraryResult
+from ep2sindy.studies.living import Living
+from ep2sindy.studies.living_view import (
+    living_figures,
+    living_models,
+    living_section,
+    living_summary,
+    living_tables,
+)
 from ep2sindy.studies.shown import INTEGRATED, Shown, rollout_tables, run_figures, trajectories
 from ep2sindy.studies.source import data_summary
 
@@ -58,8 +66,14 @@ class Outcome:
     def selected(self) -> dict[str, FreeRun]:
         return {name: result.selected for name, result in self.results.items()}
 
+    @property
+    def living(self) -> dict[str, Living]:
+        """Models that were searched for on their own cycle, by library."""
+        return {n: r.living for n, r in self.results.items() if r.living is not None}
+
     def models(self) -> dict[str, SparseModel]:
-        return {name: result.discovery.model for name, result in self.results.items()}
+        found = {name: result.discovery.model for name, result in self.results.items()}
+        return found | living_models(self.living)
 
     def tables(self) -> dict[str, pd.DataFrame]:
         found = {}
@@ -72,7 +86,7 @@ class Outcome:
             )
         published = {f"{name}_thesis_terms": each for name, each in self.published.items()}
         found |= rollout_tables(self.data, self.selected | published)
-        return found | {"comparison": self.comparison()}
+        return found | living_tables(self.living) | {"comparison": self.comparison()}
 
     def comparison(self) -> pd.DataFrame:
         """One row per model: frequencies in Hz, trajectory error, and a word on the trajectory."""
@@ -97,11 +111,18 @@ class Outcome:
             found, label = result.discovery, result.recipe.selection.label
             front = partial(front_figure, found.fronts, found.scores, label=label)
             drawn[f"front_{name}"] = Captioned(front, FRONT)
+        for name, living in self.living.items():
+            drawn |= living_figures(name, living)
         return drawn
 
     def sections(self) -> list[Section]:
         found = [_library_section(name, result) for name, result in self.results.items()]
-        return [*found, Section("Integrated", [self._comparison_table(), *pictures(FIGURES)])]
+        lives = [
+            living_section(name, living, living_figures(name, living))
+            for name, living in self.living.items()
+        ]
+        shown = Section("Integrated", [self._comparison_table(), *pictures(FIGURES)])
+        return [*found, *lives, shown]
 
     def _comparison_table(self) -> Table:
         rows = []
@@ -126,6 +147,7 @@ class Outcome:
                 "equations": {s: _equation_summary(result, s) for s in result.discovery.fronts},
                 "trajectory": _trajectory_summary(result.selected, first),
                 "thesis_terms": _published_summary(result, first),
+                "living": living_summary(result.living),
             }
             for name, result in self.results.items()
         }
@@ -142,6 +164,9 @@ class Outcome:
                 scalars[f"{name}/{state}/n_terms"] = float(chosen.n_terms)
                 score = float(result.discovery.scores[state].min())
                 scalars[f"{name}/{state}/{result.recipe.selection.label}"] = score
+        for name, living in self.living.items():
+            scalars[f"{name}/living/f_error"] = living.run.f_error
+            scalars[f"{name}/living/waveform_error"] = max(living.run.waveform_error.values())
         return scalars
 
 

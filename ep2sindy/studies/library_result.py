@@ -16,13 +16,15 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.studies.living import Living, LivingSearch, living_model
 
 
 @dataclass(frozen=True, eq=False)
 class LibraryResult:
     """One library's discovery and its selected model; the published terms, fitted to our data.
 
-    given: the published terms as printed, by state.
+    given: the published terms as printed, by state. living: a model that lives on its own; None
+    where it was not asked for, or the library has inputs.
     """
 
     recipe: Recipe
@@ -31,6 +33,7 @@ class LibraryResult:
     given: Mapping[str, Mapping[str, float]]
     refitted: Mapping[str, Candidate]
     published: FreeRun | None
+    living: Living | None = None
 
 
 def result_of(
@@ -39,6 +42,7 @@ def result_of(
     recipe: Recipe,
     published: Mapping[str, Mapping[str, float]],
     rollout_s: float | None,
+    living: LivingSearch | None = None,
     *,
     rng: np.random.Generator,
 ) -> LibraryResult:
@@ -46,6 +50,9 @@ def result_of(
     n_samples = data.n_samples if rollout_s is None else samples_in(data, rollout_s)
     found = discover(data, library, recipe, seed=rng)
     refitted = _refitted(found, published)
+    lives = None
+    if living is not None and not found.model.inputs:
+        lives = living_model(data, library, recipe, living, found.model, rng=rng)
     return LibraryResult(
         recipe=recipe,
         discovery=found,
@@ -53,6 +60,7 @@ def result_of(
         given=published,
         refitted=refitted,
         published=_run_refitted(found, refitted, data, n_samples),
+        living=lives,
     )
 
 

@@ -1,0 +1,127 @@
+"""Figures of a model that is run freely: over the data, on its cycle, and by phase."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.curves import time_unit
+from ep2sindy.figures.frames import framing
+from ep2sindy.figures.style import COLOURS, DATA, GREY, axis_label, legend_above, panel_grid
+from ep2sindy.model.rollout import Rollout
+from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
+
+PERIODS = 6.0  # shown at either end of a record
+
+PHASES = np.linspace(0.0, 2.0, 257)  # two periods, in periods
+
+
+def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Figure:
+    """A row per state: the first and the last periods of a record, the model over the data.
+
+    run: the record, whose first sample the model started from.
+    """
+    shown = min(PERIODS * period_s, 0.5 * float(run.t[-1] - run.t[0]))
+    factor, unit = time_unit(shown)
+    n = len(run.state_names)
+    figure = Figure(figsize=(9.0, 2.2 * n + 0.8), layout="constrained")
+    axes = figure.subplots(n, 2, squeeze=False, sharex="col", sharey="row")
+    since = run.t - run.t[0]
+    parts = (since <= shown, since >= since[-1] - shown)
+    for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
+        model = rollout.states[:, rollout.state_names.index(name)]
+        for ax, part in zip(row, parts, strict=True):
+            ax.plot(factor * since[part], run.states[part, k], color=GREY, lw=2.4, label="data")
+            reached = part[: len(model)]
+            ax.plot(
+                factor * since[: len(model)][reached], model[reached], color=COLOURS[0], lw=1.1,
+                label="model",
+            )  # fmt: skip
+        row[0].set_ylim(framing(run.states[:, k], model))
+        row[0].set_ylabel(axis_label(name, run.units[name]))
+    for ax, words in zip(axes[0], ("first periods", "last periods"), strict=True):
+        ax.set_title(words, fontsize=9)
+    for ax in axes[-1]:
+        ax.set_xlabel(f"time since the model's start ({unit})")
+    legend_above(figure, axes[0, 0].lines[:2])
+    return figure
+
+
+def cycle_figure(
+    run: Trajectory,
+    cycle: Float[np.ndarray, "samples n_states"],
+    paths: Sequence[Rollout],
+    *,
+    plane: Sequence[str],
+) -> Figure:
+    """The model's cycle in the plane of two states, over the data, and runs from other starts.
+
+    cycle: one period of the model, states in the order of the run's. Dots are the starts; a run
+    that leaves the panel does not come back to it.
+    """
+    pair = [run.state_names.index(name) for name in plane]
+    figure, (ax,) = panel_grid(1, width=4.4, height=3.8, extra=0.5)
+    ax.plot(*run.states[:, pair].T, color=GREY, lw=0.6)
+    for path in paths:
+        x, y = (path.states[:, path.state_names.index(name)] for name in plane)
+        ax.plot(x, y, color=COLOURS[5], lw=0.7)
+        ax.plot(x[0], y[0], "o", color=COLOURS[5], ms=4)
+    closed = np.concatenate([cycle, cycle[:1]])[:, pair]
+    ax.plot(*closed.T, color=COLOURS[1], lw=2.0)
+    for set_limits, k in ((ax.set_xlim, 0), (ax.set_ylim, 1)):
+        starts = np.array([path.states[0, path.state_names.index(plane[k])] for path in paths])
+        set_limits(framing(run.states[:, pair[k]], np.concatenate([closed[:, k], starts])))
+    ax.set_xlabel(axis_label(plane[0], run.units[plane[0]]))
+    ax.set_ylabel(axis_label(plane[1], run.units[plane[1]]))
+    handles = [
+        Line2D([], [], color=GREY, lw=2.0, label="data"),
+        Line2D([], [], color=COLOURS[1], lw=2.0, label="the model's cycle"),
+        Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label="from other starts"),
+    ]
+    legend_above(figure, handles, size=9.0)
+    return figure
+
+
+def has_waveform(run: Trajectory, rollout: Rollout) -> bool:
+    """Whether both the data and the second half of the model's run have a period."""
+    return _waveforms(run, rollout) is not None
+
+
+def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
+    """A panel per state: samples by phase, their waveform, and the model's over two periods."""
+    found = _waveforms(run, rollout)
+    assert found is not None
+    data, model = found
+    figure, axes = panel_grid(len(run.state_names), width=4.2, height=3.0, extra=0.5)
+    ours = data.waveform(2.0 * np.pi * PHASES)
+    theirs = model.waveform(2.0 * np.pi * PHASES + best_shift(data, model))
+    phase = np.mod(data.phase / (2.0 * np.pi), 1.0)
+    for k, (ax, name) in enumerate(zip(axes, run.state_names, strict=True)):
+        for shift in (0.0, 1.0):
+            ax.plot(phase + shift, run.states[:, k], ".", ms=1.0, color=GREY, rasterized=True)
+        ax.plot(PHASES, ours[:, k], color=DATA, lw=1.6)
+        ax.plot(PHASES, theirs[:, k], color=COLOURS[0], lw=1.4, ls="--")
+        ax.set(xlabel="phase (periods)", ylabel=axis_label(name, run.units[name]))
+        ax.set_xlim(0.0, 2.0)
+    handles = [
+        Line2D([], [], color=GREY, marker=".", ls="none", label="samples"),
+        Line2D([], [], color=DATA, lw=1.6, label="data"),
+        Line2D([], [], color=COLOURS[0], lw=1.4, ls="--", label="model"),
+    ]
+    legend_above(figure, handles, size=9.0)
+    return figure
+
+
+def _waveforms(run: Trajectory, rollout: Rollout) -> tuple[Cycle, Cycle] | None:
+    """Of the data, and of the second half of the model's run, where transients are over."""
+    data, half = find_cycle(run.t, run.states), len(rollout.t) // 2
+    if data is None:
+        return None
+    late = rollout.states[half:, [rollout.state_names.index(name) for name in run.state_names]]
+    model = find_cycle(rollout.t[half:], late, n_harmonics=len(data.harmonics))
+    return None if model is None else (data, model)
