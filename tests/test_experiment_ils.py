@@ -31,6 +31,7 @@ def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
         f"output={output}",
         "n_windows=8",
         "windows=[60]",
+        "n_draws=2",
         "weak.test_functions.n_windows=500",
         "weak.test_functions.n_points=50",
     ]
@@ -45,13 +46,14 @@ def toy_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def test_integral_least_squares_returns_predator_and_prey(toy_run: Path) -> None:
     summary = json.loads((toy_run / "summary.json").read_text())
     methods = summary["methods"]
-    assert list(methods) == ["base", "weak", "constrained", "ils", "ils_constrained"]
+    refinements = ("ils", "ils_constrained", "living")
+    assert list(methods) == ["base", "weak", "constrained", *refinements]
     for name, found in methods.items():
         assert set(found) >= JUDGED
         # Second-order differences at 1.5 us on a 14 kHz wave: (omega dt)^2 / 6 = 0.3 %, and the
         # smoothing window flattens peaks by about 1 %. A refinement has the error of one
         # Runge-Kutta step alone, (omega dt)^4 / 120 = 3e-6 for a sine, and the wave has harmonics.
-        refined = name.startswith("ils")
+        refined = name in refinements
         for state, terms in EXACT.items():
             rel = 1e-4 if refined else 0.02
             assert found["equations"][state] == pytest.approx(terms, rel=rel)
@@ -62,6 +64,11 @@ def test_integral_least_squares_returns_predator_and_prey(toy_run: Path) -> None
         assert found["f_error"] == pytest.approx(0.0, abs=0.02 if not refined else 1e-3)
         assert found["amplitude_ratio"] == pytest.approx(1.0, abs=0.1 if not refined else 1e-3)
         assert (toy_run / "models" / f"{name}.json").is_file()
+        if refined:
+            spread = found["spread"]
+            assert (spread["n_draws"], spread["n_living"]) == (2, 2)
+            assert spread["f_error"] == pytest.approx([0.0, 0.0], abs=1e-3)
+            assert spread["waveform"][0] <= spread["waveform"][1] < 1e-2
     for name in ("constrained", "ils_constrained"):
         equations = methods[name]["equations"]
         assert equations["n_i"]["n_i*n_n"] == -equations["n_n"]["n_i*n_n"]
@@ -81,7 +88,7 @@ def test_page_and_terminal_show_every_method_and_the_page_its_figures(toy_run: P
     for words in ("relation: n_i: n_i*n_n == -1 * n_n: n_i*n_n", "ILS, constrained", "converged"):
         assert words in page
         assert words in log
-    assert page.count("95 %: ") == 4  # of both refinements, for both states
+    assert page.count("95 %: ") == 6  # of both refinements, for both states
     assert "95 %: " not in log
 
 

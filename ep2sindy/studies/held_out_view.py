@@ -49,7 +49,7 @@ class Outcome:
     """Models by name, fitted to `train` and judged on `held`.
 
     labels: what a reader calls the models. relations: that the constrained ones obey. findings,
-    more_tables, more_figures: what the study itself adds.
+    more_tables, more_figures, more_sections: what the study itself adds.
     """
 
     train: Trajectory
@@ -61,6 +61,7 @@ class Outcome:
     findings: Mapping[str, Any]
     more_tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     more_figures: Mapping[str, Captioned] = field(default_factory=dict)
+    more_sections: Sequence[Section] = ()
 
     @property
     def f_data_Hz(self) -> float:
@@ -104,6 +105,7 @@ class Outcome:
             Section("Equations", [*relations, *intervals]),
             *equation_sections(models, page_only=True),
             Section("Held-out time", [self._table(), *shown]),
+            *self.more_sections,
         ]
 
     def _table(self) -> Table:
@@ -162,6 +164,7 @@ def _readable(label: str, judged: Judged) -> dict[str, Any]:
         "f": _or_verdict(sample, f"{frequency} ({100 * sample.f_error:+.1f} %)"),
         "nrmse": sample.nrmse,
         **{f"amplitude {state}": ratio for state, ratio in sample.amplitude_ratio.items()},
+        "verdict": str(sample.verdict),
         "start fitted": _or_verdict(fit, f"{100 * fit.f_error:+.1f} %, {fit.nrmse:.2f}"),
         "status": judged.status,
         "CPU s": judged.cpu_s,
@@ -193,5 +196,7 @@ def run_summary(run: FreeRun) -> dict[str, Any]:
         "f_error": run.f_error,
         "nrmse": run.nrmse,
         "amplitude_ratio": run.amplitude_ratio[first],
+        "waveform_error": run.waveform_error[first],
+        "periods": run.periods,
         "verdict": run.text,
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -14,22 +14,29 @@ import pandas as pd
 
 from ep2sindy.constraints.relations import Constraint, constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
+from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.held_out import Judged, first_and_last, fit_and_judge, judge
 from ep2sindy.studies.held_out_view import COMPARED, Outcome, judged_summary, run_summary
+from ep2sindy.studies.ils_draws import draws_table, spread_section, spread_summary
 from ep2sindy.studies.kinds import Count, Counts, Share
 from ep2sindy.studies.known_terms import Relations, Terms, terms_of
+from ep2sindy.studies.living import LivingSearch, two_periods
 from ep2sindy.studies.shown import Shown
 from ep2sindy.studies.source import Source
 
 if TYPE_CHECKING:
     from ep2sindy.refinement.problem import Iteration
+    from ep2sindy.refinement.refine import Refinement
 
 LABELS = {
     "base": "base",
@@ -37,6 +44,7 @@ LABELS = {
     "constrained": "constrained",
     "ils": "ILS",
     "ils_constrained": "ILS, constrained",
+    "living": "living",
 }
 CAPTION = (
     "Refinement with windows of several lengths: loss on the fitted part, where each window has a "
@@ -49,8 +57,10 @@ CAPTION = (
 class Study:
     """Base, weak and constrained least squares, and refinements of base and constrained.
 
-    model: the terms of every state. relations: of the constrained fits. window: samples in each;
-    None takes one and a half periods. windows: lengths for loss against window length.
+    Beside them the model that lives, from the library of degree 2, refined alike.
+    model: the terms of every state. relations: of the constrained fits. living: how the model
+    that lives is found. window: samples in each; None takes two periods. windows: lengths for loss
+    against window length. n_draws: of windows, for the spread of what refinements do.
     """
 
     source: Source
@@ -62,6 +72,8 @@ class Study:
     n_windows: Count
     window: Count | None
     windows: Counts
+    n_draws: Count
+    living: LivingSearch
     figures: Shown
 
     def compute(self, run: Run) -> Outcome:
@@ -70,8 +82,9 @@ class Study:
         data = self.source.sampled(self.source.field(), [library], run)
         train, held = first_and_last(data, self.held_out)
         self._check_windows(train)
-        rng, sweep_rng = np.random.default_rng(run.seed).spawn(2)
-        streams = iter(rng.spawn(5))
+        window = two_periods(train) if self.window is None else self.window
+        rng, sweep_rng, draws_rng = np.random.default_rng(run.seed).spawn(3)
+        streams = iter(rng.spawn(7))
         fits = (
             ("base", free, self.formulation),
             ("weak", free, self.weak),
@@ -81,16 +94,38 @@ class Study:
             name: fit_and_judge(train, held, library, each, form, rng=next(streams))
             for name, each, form in fits
         }
-        refined = {}
-        for name, start, each in (("ils", "base", free), ("ils_constrained", "constrained", tied)):
-            refined[name] = partial(self._refined, judged[start].model, each, train, held)
-            watch = watcher(run.board.scalars, name, each)
-            judged[name] = refined[name](self.window, rng=next(streams), watch=watch)
-        by_window = {
-            name: {window: again(window, rng=stream) for window in self.windows}
-            for (name, again), stream in zip(refined.items(), sweep_rng.spawn(2), strict=True)
+        lives = self._living(train, rng=next(streams))
+        own = constraint(lives.library, {state: list(lives.terms(state)) for state in lives.states})
+        starts = {
+            "ils": (judged["base"].model, free),
+            "ils_constrained": (judged["constrained"].model, tied),
+            "living": (lives, own),
         }
-        return self._outcome(train, held, judged, by_window)
+        again = {
+            name: partial(self._refined, model, each, train, held)
+            for name, (model, each) in starts.items()
+        }
+        for name, (_, each) in starts.items():
+            watch = watcher(run.board.scalars, name, each)
+            judged[name] = again[name](window, rng=next(streams), watch=watch)
+        by_window = {
+            name: {length: again[name](length, rng=stream) for length in self.windows}
+            for name, stream in zip(("ils", "ils_constrained"), sweep_rng.spawn(2), strict=True)
+        }
+        draws = {
+            name: [
+                free_run(self._refinement(*starts[name], train, window, rng=each).model, held)
+                for each in stream.spawn(self.n_draws)
+            ]
+            for name, stream in zip(starts, draws_rng.spawn(3), strict=True)
+        }
+        return self._outcome(train, held, judged, by_window, draws)
+
+    def _living(self, train: Trajectory, *, rng: np.random.Generator) -> SparseModel:
+        """The model that lives on its own, in the library of degree 2."""
+        recipe = Recipe(self.formulation, bootstraps=Bootstraps(n=0))
+        library = polynomial(train.state_names, degree=2)
+        return self.living.found(train, library, recipe, rng=rng).model
 
     def _check_windows(self, train: Trajectory) -> None:
         """Raise ValueError for windows that the fitted part of the data cannot hold."""
@@ -114,10 +149,24 @@ class Study:
         rng: np.random.Generator,
         watch: Callable[[Iteration], None] | None = None,
     ) -> Judged:
+        begun = process_time()
+        found = self._refinement(start, constraint, train, window, rng=rng, watch=watch)
+        cpu_s = process_time() - begun
+        return judge(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
+
+    def _refinement(
+        self,
+        start: SparseModel,
+        constraint: Constraint,
+        train: Trajectory,
+        window: int | None,
+        *,
+        rng: np.random.Generator,
+        watch: Callable[[Iteration], None] | None = None,
+    ) -> Refinement:
         from ep2sindy.refinement.refine import refine  # PyTorch takes seconds to load
 
-        begun = process_time()
-        found = refine(
+        return refine(
             start,
             [train],
             n_windows=self.n_windows,
@@ -126,8 +175,6 @@ class Study:
             rng=rng,
             callback=watch,
         )
-        cpu_s = process_time() - begun
-        return judge(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
 
     def _outcome(
         self,
@@ -135,6 +182,7 @@ class Study:
         held: Trajectory,
         judged: Mapping[str, Judged],
         by_window: Mapping[str, Mapping[int, Judged]],
+        draws: Mapping[str, Sequence[FreeRun]],
     ) -> Outcome:
         period_s = 1.0 / dominant_frequency(train.t, train.states[:, 0])
         windows = window_table(by_window, dt_s=train.dt_s, period_s=period_s)
@@ -148,10 +196,14 @@ class Study:
             self.relations,
             self.figures,
             findings={
-                "methods": {name: judged_summary(each) for name, each in judged.items()},
+                "methods": {
+                    name: judged_summary(each) | spread_summary(draws.get(name, ()))
+                    for name, each in judged.items()
+                },
                 "loss_against_window": windows.to_dict("records"),
             },
-            more_tables={"loss_against_window": windows},
+            more_tables={"loss_against_window": windows, "draws": draws_table(draws)},
+            more_sections=[spread_section({LABELS[name]: runs for name, runs in draws.items()})],
             more_figures={"loss_against_window": Captioned(draw, CAPTION)},
         )
 

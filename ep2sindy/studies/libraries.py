@@ -12,7 +12,7 @@ import xarray as xr
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Coefficients, PositiveOrAll
+from ep2sindy.studies.kinds import Coefficients, PositiveOrAll, Share
 from ep2sindy.studies.libraries_view import Outcome
 from ep2sindy.studies.library_result import result_of
 from ep2sindy.studies.living import LivingSearch
@@ -53,7 +53,8 @@ class Study:
     rollout_s: how far to integrate; None, or more than there is, means to the data's end.
     thesis: by library, published equations: state -> term -> SI coefficient; where the library
     has the terms, and the data can tell them from others, they are fitted as well. living: how
-    libraries without inputs are searched for a model that lives; None leaves that out.
+    libraries without inputs are searched for a model that lives; None leaves that out. held_out:
+    the last share of the record, which judges such a model.
     """
 
     source: Source
@@ -63,6 +64,7 @@ class Study:
     figures: Shown
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
+    held_out: Share = 0.25
 
     def compute(self, run: Run) -> Outcome:
         recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
@@ -79,6 +81,7 @@ class Study:
                 self.thesis.get(name, {}),
                 self.rollout_s,
                 self.living,
+                self.held_out,
                 rng=rng,
             )
             for (name, library), rng in zip(libraries.items(), streams, strict=True)

@@ -16,6 +16,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.studies.held_out import first_and_last
 from ep2sindy.studies.living import Living, LivingSearch, living_model
 
 
@@ -43,6 +44,7 @@ def result_of(
     published: Mapping[str, Mapping[str, float]],
     rollout_s: float | None,
     living: LivingSearch | None = None,
+    held_out: float = 0.25,
     *,
     rng: np.random.Generator,
 ) -> LibraryResult:
@@ -52,7 +54,8 @@ def result_of(
     refitted = _refitted(found, published)
     lives = None
     if living is not None and not found.model.inputs:
-        lives = living_model(data, library, recipe, living, found.model, rng=rng)
+        parts = first_and_last(data, held_out)
+        lives = living_model(*parts, library, recipe, living, found.model, rng=rng)
     return LibraryResult(
         recipe=recipe,
         discovery=found,

@@ -17,21 +17,31 @@ from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.kalman import KalmanSmoother
-from ep2sindy.studies.held_out import first_and_last
-from ep2sindy.studies.kinds import Count, Share
+from ep2sindy.studies.kinds import Count
 
 
 @dataclass(frozen=True)
 class LivingSearch:
     """How a library without inputs is searched for a model that lives.
 
-    depth: candidates per size and equation. held_out: the last share of the record, which judges.
+    depth: candidates per size and equation.
     """
 
     search: Search
     depth: Count
     selection: SystemSelection
-    held_out: Share
+
+    def found(
+        self, train: Trajectory, library: Library, recipe: Recipe, *, rng: np.random.Generator
+    ) -> Discovery:
+        """What it finds in a record, with the recipe's formulation and bootstraps."""
+        own = replace(recipe, search=self.search, depth=self.depth, selection=self.selection)
+        return discover(train, library, own, seed=rng)
+
+    @property
+    def bounds(self) -> Bounds:
+        """What its rule calls living."""
+        return getattr(self.selection, "bounds", Bounds())
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +74,8 @@ class Living:
 
 
 def living_model(
-    data: Trajectory,
+    train: Trajectory,
+    held: Trajectory,
     library: Library,
     recipe: Recipe,
     settings: LivingSearch,
@@ -72,17 +83,12 @@ def living_model(
     *,
     rng: np.random.Generator,
 ) -> Living:
-    """Find it in the first part of a record, and run it over the last.
+    """Find it in one part of a record, and run it over the other.
 
     selected: the model that was selected by derivatives, to be refined for comparison.
-    Raises ValueError for a record too short to be parted.
     """
-    train, held = first_and_last(data, settings.held_out)
-    own = replace(
-        recipe, search=settings.search, depth=settings.depth, selection=settings.selection
-    )
-    found = discover(train, library, own, seed=rng)
-    run = free_run(found.model, held, initial=start_of(held, found.model), bounds=_bounds(own))
+    found = settings.found(train, library, recipe, rng=rng)
+    run = free_run(found.model, held, initial=start_of(held, found.model), bounds=settings.bounds)
     cycle = cycle_of(run)
     share = None if cycle is None else share_reaching(found.model, cycle)
     return Living(found, held, run, cycle, share, _refined(selected, train, held))
@@ -105,15 +111,17 @@ def cycle_of(run: FreeRun) -> LimitCycle | None:
     return limit_cycle(run.model, run.rollout.states[-1], period_s=1.0 / frequency_Hz)
 
 
+def two_periods(run: Trajectory) -> int | None:
+    """Samples in two periods; None where there is no period, or not two windows of them."""
+    cycle = find_cycle(run.t, run.states)
+    if cycle is None or cycle.n_periods < 4.0:
+        return None
+    return round(2.0 / (cycle.frequency_Hz * run.dt_s)) + 1
+
+
 def _refined(model: SparseModel, train: Trajectory, held: Trajectory) -> Refined:
     """On windows of two periods, where there are periods."""
     from ep2sindy.refinement.refine import refine  # torch, for those alone who refine
 
-    cycle = find_cycle(train.t, train.columns(model.states))
-    window = None if cycle is None else round(2.0 / (cycle.frequency_Hz * train.dt_s)) + 1
-    found = refine(model, [train], window=window, rng=0)
+    found = refine(model, [train], window=two_periods(train), rng=0)
     return Refined(found.status, free_run(found.model, held, initial=start_of(held, model)))
-
-
-def _bounds(recipe: Recipe) -> Bounds:
-    return getattr(recipe.selection, "bounds", Bounds())
