@@ -46,18 +46,19 @@ class Discovery:
         notes = [f"note: {a.message}" for a in self.ambiguities][:MOST_NOTES]
         left = len(self.ambiguities) - len(notes)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
-        body = model_lines(self.model, n_lines=N_LINES - 1 - len(tail))
-        return one_screen([self._headline(), *body, *tail])
+        head = [self._headline(), *([self.note] if self.note else [])]
+        body = model_lines(self.model, n_lines=N_LINES - len(head) - len(tail))
+        return one_screen([*head, *body, *tail])
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<li>{html.escape(a.message)}</li>" for a in self.ambiguities)
-        head = f"<div>{html.escape(self._headline())}</div>"
+        lines = [self._headline(), *([self.note] if self.note else [])]
+        head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
         return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
 
     def _headline(self) -> str:
         rule = self.model.provenance.get("selection", "a rule unknown")
-        head = f"Discovery of {len(self.chosen)} equations, chosen by {rule}"
-        return f"{head}: {self.note}" if self.note else head
+        return f"Discovery of {len(self.chosen)} equations, chosen by {rule}"
 
 
 def discover(

@@ -198,7 +198,8 @@ class Record:
         by_state["distribution"] = distribution_distances(self.states[half:], late)
         by_state["amplitude_ratio"] = late.std(axis=0) / self.std
         spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
-        if (late.std(axis=0) < DEAD * self.std).all():
+        middle = len(states) // 2
+        if (states[middle:].std(axis=0) < DEAD * self.states[middle:].std(axis=0)).all():
             return Likeness(Verdict.DIES_OUT, np.nan, spectrum, by_state)
         if self.cycle is None:
             verdict = self._without_period(by_state["distribution"], spectrum, bounds)

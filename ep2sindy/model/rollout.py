@@ -151,7 +151,7 @@ def _integrated(
 ) -> Rollout:
     """From x0 over t, in units of `scale`, until a state exceeds `blow_up` of them."""
 
-    calls = 0
+    calls, given_up_s = 0, np.inf
     rhs = _scaled_rhs(model, drive, scale)
 
     def counted(t: float, y: np.ndarray) -> np.ndarray:
@@ -160,7 +160,11 @@ def _integrated(
         return rhs(t, y)
 
     def too_large(t: float, y: np.ndarray) -> float:
-        return -1.0 if calls > budget else blow_up - float(np.abs(y).max())
+        nonlocal given_up_s
+        if calls > budget:
+            given_up_s = min(given_up_s, t)
+            return given_up_s - t
+        return blow_up - float(np.abs(y).max())
 
     budget = CALLS + CALLS_PER_SAMPLE * len(t)
     too_large.terminal = True  # type: ignore[attr-defined]
@@ -180,7 +184,7 @@ def _integrated(
         t=solution.t,
         states=solution.y.T * scale,
         diverged=solution.status != 0,
-        message=_ending_text(solution, blow_up, bound, exhausted=calls > budget),
+        message=_ending_text(solution, blow_up, bound, exhausted=bool(np.isfinite(given_up_s))),
         state_names=tuple(model.states),
         inputs=samples[: len(solution.t)],
         input_names=tuple(model.inputs),

@@ -241,6 +241,8 @@ def _result(
             for each in (verdict.covariance, verdict.covariance_naive)
         )
         refined = replace(refined, covariance=robust)
+    with np.errstate(over="ignore"):  # of a fit that blew up
+        trajectories = fit.nodes[point] * batch.scale[: fit.nodes.shape[-1]]
     return Refinement(
         model=refined,
         covariance_naive=naive,
@@ -249,7 +251,7 @@ def _result(
         status=verdict.status,
         history=tuple(entry for entry in history if entry.point == point),
         batch=batch,
-        trajectories=fit.nodes[point] * batch.scale[: fit.nodes.shape[-1]],
+        trajectories=trajectories,
     )
 
 

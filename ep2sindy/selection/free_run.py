@@ -71,6 +71,7 @@ class FreeRunScore:
     margin: systems that deviate by no more than this share of the bounds come first, however
     small others are: what barely keeps within them here will not in another record.
     max_combinations: more are refused. n_confirmed: systems refined on all data, at most.
+    seed: of the windows that are drawn.
     """
 
     bounds: Bounds = field(default_factory=Bounds)
@@ -79,6 +80,7 @@ class FreeRunScore:
     window_periods: float = 2.0
     margin: float = 0.6
     n_confirmed: int = 8
+    seed: int = 0
     max_combinations: int = 4096
     label: ClassVar[str] = "free-run error"
 
@@ -150,7 +152,7 @@ class FreeRunScore:
             first.inputs,
             window=self._window(records, cycles),
             n_windows=self.n_windows,
-            rng=np.random.default_rng(0),  # the folds make the draws differ, not luck
+            rng=np.random.default_rng(self.seed),
         )
         method, together = budget(batch)
         refined = refine_together(
@@ -198,7 +200,9 @@ class FreeRunScore:
         window = self._window(records, cycles)
         resting = None
         for k in living[: self.n_confirmed]:
-            model = trials[k].system.refined_on_all(records.runs, window=window, n_reweights=0)
+            model = trials[k].system.refined_on_all(
+                records.runs, window=window, n_reweights=0, seed=self.seed
+            )
             run = self._confirmed(model, records)
             if run.verdict is Verdict.LIVES:
                 if _attracts(run, cycles):
@@ -207,7 +211,9 @@ class FreeRunScore:
         if resting is not None:
             return *resting, _note(trials, living, ", on a cycle that does not attract")
         best = min(range(len(trials)), key=lambda k: (trials[k].error, trials[k].system.n_terms))
-        model = trials[best].system.refined_on_all(records.runs, window=window, n_reweights=0)
+        model = trials[best].system.refined_on_all(
+            records.runs, window=window, n_reweights=0, seed=self.seed
+        )
         run = self._confirmed(model, records)
         return best, model, f"none of {len(trials)} systems lives; the best of them: {run.text}"
 

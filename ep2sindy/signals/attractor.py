@@ -14,6 +14,8 @@ from ep2sindy.signals.spectrum import dominant_frequency, is_uniform, power_spec
 
 LEAST_PERIODS = 3.0  # of a record that can be said to repeat
 
+LEAST_VISIBLE = 0.1  # of the variance of any state, noise included: noise alone has lines, too
+
 LEAST_SHARE = 0.5  # of the variance that the waveform must explain, for a record to have a period
 
 MOST_HARMONICS = 16
@@ -68,10 +70,10 @@ def find_cycle(
     """The period and waveform of a record; None where it has none.
 
     t: (samples,) in s. The period is that of the state whose spectrum has the sharpest line; its
-    phase is followed by demodulation, and the waveform is a Fourier series in it, fitted to all
-    samples: white noise averages out. n_harmonics: None takes as many as the samples bear (BIC).
-    None is returned for fewer than three periods, or where the waveform explains less than half
-    of the variance: chaos, noise, a transient.
+    phase is followed by demodulation, its slope sharpened until the waveform, a Fourier series in
+    it, fits all samples best: white noise averages out. n_harmonics: None takes as many as the
+    samples bear (BIC). None is returned for fewer than three periods, or where the waveform
+    explains less than half of the variance: chaos, noise, a transient.
     """
     spread = states.std(axis=0)
     # Rounding on a state that rests is no oscillation.
@@ -83,11 +85,22 @@ def find_cycle(
     rough_Hz = lines[leader][0]
     if not rough_Hz * (t[-1] - t[0]) >= LEAST_PERIODS:
         return None
-    phase = phase_along(t, scaled[:, leader], rough_Hz)
+    n_periods = rough_Hz * (t[-1] - t[0])
+    most = _most_harmonics(len(t), n_periods) if n_harmonics is None else n_harmonics
+    phase = 2.0 * np.pi * rough_Hz * (t - t[0])
+    for _ in range(3):
+        phase = _sharpened(t, phase, scaled, 1)
+    if n_periods >= 2.0 * PERIODS_TRACKED:
+        phase = phase + _drift(t, scaled[:, leader], phase)
+    for _ in range(2):
+        phase = _sharpened(t, phase, scaled, most)
     frequency_Hz = float(np.polynomial.Polynomial.fit(t, phase, 1).convert().coef[1]) / (2 * np.pi)
-    series, rest = _series(phase, scaled, n_harmonics, len(t) / (rough_Hz * (t[-1] - t[0])))
+    series, rest = _series(phase, scaled, most, chosen=n_harmonics is None)
+    whole = np.square(scaled).sum(axis=0)
+    if not (whole - rest >= LEAST_VISIBLE * whole).any():
+        return None
     noise = len(t) * np.array([white_variance(t, column) for column in scaled.T])
-    known = np.maximum(np.square(scaled).sum(axis=0) - noise, 1e-12)
+    known = np.maximum(whole - noise, 1e-12)
     share = 1.0 - float(np.maximum(rest - noise, 0.0).sum() / known.sum())
     if not (share >= LEAST_SHARE and frequency_Hz > 0.0):
         return None
@@ -126,38 +139,77 @@ def phase_along(
     """Phase in rad of the component of x near a frequency, at every sample, without jumps.
 
     x is demodulated, and averaged over eight periods, or half the record if that is less, under
-    a Hann window.
+    a Hann window; where the window reaches beyond an end, the phase goes on at the frequency.
     """
+    straight = 2.0 * np.pi * frequency_Hz * (t - t[0])
+    return straight + _drift(t, x, straight)
+
+
+def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
+    """Phase of x beyond a straight one, smooth over the periods that it is taken from."""
     from scipy.signal import fftconvolve  # half a second that a search does not need
 
-    even = t if is_uniform(t) else np.linspace(t[0], t[-1], len(t))
-    values = x if even is t else make_interp_spline(t, x, k=min(3, len(t) - 1))(even)
-    turning = np.exp(-2j * np.pi * frequency_Hz * (even - even[0]))
-    step_s = (even[-1] - even[0]) / (len(even) - 1)
-    n = round(min(PERIODS_TRACKED / (frequency_Hz * step_s), 0.5 * len(even)))
-    window = np.hanning(max(n, 3) + 2)[1:-1]
-    slow = fftconvolve((values - values.mean()) * turning, window, mode="same")
-    drift = np.unwrap(np.angle(slow))
-    phase = 2.0 * np.pi * frequency_Hz * (even - even[0]) + drift
-    return phase if even is t else np.interp(t, even, phase)
+    slow = (x - x.mean()) * np.exp(-1j * straight)
+    even = t
+    if not is_uniform(t):
+        even = np.linspace(t[0], t[-1], len(t))
+        slow = make_interp_spline(t, slow, k=1)(even)
+    per_period = len(t) * 2.0 * np.pi / (straight[-1] - straight[0])
+    n = max(3, round(min(PERIODS_TRACKED * per_period, 0.5 * len(t))))
+    drift = np.unwrap(np.angle(fftconvolve(slow, np.hanning(n + 2)[1:-1], mode="same")))
+    whole = slice(n // 2, len(t) - n // 2)
+    return np.interp(t, even[whole], drift[whole])
+
+
+def _sharpened(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
+    """A phase whose slope in time is changed so that the series of this order fits best.
+
+    One Gauss-Newton step: what the slope explains of what the series leaves.
+    """
+    basis, triangle = np.linalg.qr(_columns(phase, order))
+    known = basis.T @ scaled
+    series = np.linalg.solve(triangle, known)
+    orders = np.arange(1, order + 1)
+    slope = np.zeros_like(series)  # the derivative by the phase
+    slope[1::2] = orders[:, None] * series[2::2]
+    slope[2::2] = -orders[:, None] * series[1::2]
+    since = (t - t.mean()) / (t[-1] - t[0])
+    direction = (_columns(phase, order) @ slope) * since[:, None]
+    direction -= basis @ (basis.T @ direction)
+    size = float(np.square(direction).sum())
+    change = float((direction * (scaled - basis @ known)).sum()) / size if size > 0.0 else 0.0
+    # Half a period over the record: more is another line of the spectrum.
+    return phase + float(np.clip(change, -np.pi, np.pi)) * since
+
+
+def _columns(phase: np.ndarray, order: int) -> np.ndarray:
+    """A constant, then cosine and sine of every order: (samples, 1 + 2 order)."""
+    turns = np.exp(1j * np.outer(phase, np.arange(1, order + 1)))
+    columns = np.empty((len(phase), 1 + 2 * order))
+    columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real, turns.imag
+    return columns
+
+
+def _most_harmonics(n_samples: int, n_periods: float) -> int:
+    """As many as the samples of a period can tell apart, and their number determine."""
+    by_period = n_samples / n_periods / SAMPLES_PER_HARMONIC
+    return int(np.clip(min(by_period, (n_samples - 1) // 4), 1, MOST_HARMONICS))
 
 
 def _series(
-    phase: np.ndarray, scaled: np.ndarray, n_harmonics: int | None, samples_per_period: float
+    phase: np.ndarray, scaled: np.ndarray, most: int, *, chosen: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Constant, then cosine and sine of every order, (1 + 2 n, n_states); squares that are left."""
-    most = int(np.clip(samples_per_period / SAMPLES_PER_HARMONIC, 1, MOST_HARMONICS))
-    most = min(most, max(1, (len(phase) - 1) // 4)) if n_harmonics is None else n_harmonics
-    turns = np.exp(1j * np.outer(phase, np.arange(1, most + 1)))
-    columns = np.empty((len(phase), 1 + 2 * most))
-    columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real, turns.imag
+    """Constant, then cosine and sine of every order, (1 + 2 n, n_states); squares that are left.
+
+    chosen: whether BIC chooses how many of them, up to `most`.
+    """
     # The columns are ordered, so one factorisation holds the fits of every number of harmonics.
-    basis, triangle = np.linalg.qr(columns)
+    basis, triangle = np.linalg.qr(_columns(phase, most))
     known = basis.T @ scaled
     whole = np.square(scaled).sum(axis=0)
     left = np.maximum(whole - np.cumsum(np.square(known), axis=0)[::2], 1e-12 * whole)
     order = most
-    if n_harmonics is None:
+    if chosen:
         price = np.log(len(phase)) * (1 + 2 * np.arange(most + 1)) * scaled.shape[1]
         order = max(1, int(np.argmin(len(phase) * np.log(left).sum(axis=1) + price)))
     kept = slice(0, 1 + 2 * order)

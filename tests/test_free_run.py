@@ -1,0 +1,118 @@
+"""Free runs: what becomes of a model that starts from one sample."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.free_run import Bounds, Verdict, free_run, samples_in
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.synthetic.systems import lorenz
+
+LIBRARY = polynomial(["x", "y"], degree=3)
+
+
+def hopf(*, growth: float = 1.0, turn: float = 1.0, radius: float = 1.0) -> SparseModel:
+    """r' = growth r (1 - r^2/radius^2), angle' = turn."""
+    pull = growth / radius**2
+    terms = [
+        {"x": growth, "y": -turn, "x^3": -pull, "x*y^2": -pull},
+        {"x": turn, "y": growth, "x^2*y": -pull, "y^3": -pull},
+    ]
+    return SparseModel(LIBRARY, ["x", "y"], coef_matrix(LIBRARY, terms))
+
+
+def record(n_periods: float = 40.0) -> Trajectory:
+    t = np.linspace(0.0, 2.0 * np.pi * n_periods, round(50 * n_periods) + 1)
+    return Trajectory(t, np.column_stack([np.cos(t), np.sin(t)]), ("x", "y"))
+
+
+def test_the_truth_lives_and_every_figure_is_exact() -> None:
+    found = free_run(hopf(), record())
+    assert found.verdict is Verdict.LIVES
+    assert found.text == "lives"
+    assert found.f_error == pytest.approx(0.0, abs=1e-5)
+    assert dict(found.amplitude_ratio) == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-3)
+    assert max(found.waveform_error.values()) < 1e-3
+    assert found.periods == pytest.approx(40.0, rel=1e-3)
+    assert found.excursion == pytest.approx(np.sqrt(2.0), rel=1e-2)
+    assert found.nrmse < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("model", "verdict", "f_error", "amplitude"),
+    [
+        (hopf(turn=1.005), Verdict.LIVES, 0.005, 1.0),
+        (hopf(turn=1.03), Verdict.SLIPS, 0.03, 1.0),
+        (hopf(radius=1.05), Verdict.LIVES, 0.0, 1.05),
+        (hopf(radius=1.3), Verdict.WRONG_CYCLE, 0.0, 1.3),
+        (hopf(growth=-0.2, radius=1e9), Verdict.DIES_OUT, np.nan, 0.0),
+        (hopf(growth=0.3, radius=1e9), Verdict.DIVERGES, np.nan, np.nan),
+    ],
+)
+def test_verdicts(model, verdict, f_error, amplitude) -> None:
+    found = free_run(model, record())
+    assert found.verdict is verdict
+    assert found.f_error == pytest.approx(f_error, abs=1e-4, nan_ok=True)
+    assert found.amplitude_ratio["x"] == pytest.approx(amplitude, abs=2e-3, nan_ok=True)
+
+
+def test_the_phase_slips_by_a_quarter_when_it_should() -> None:
+    found = free_run(hopf(turn=1.01), record(60.0))  # a quarter after 25 periods
+    assert found.periods == pytest.approx(25.0, abs=1.0)
+
+
+def test_a_transient_does_not_count() -> None:
+    found = free_run(hopf(growth=0.3), record(), initial=np.array([0.2, 0.0]))
+    assert found.verdict is Verdict.LIVES
+    assert found.nrmse > 0.05
+
+
+def test_bounds_are_settings() -> None:
+    model = hopf(radius=1.05)
+    assert free_run(model, record(), bounds=Bounds(amplitude=0.03)).verdict is Verdict.WRONG_CYCLE
+    with pytest.raises(ValueError, match="the bound waveform must be positive: 0.0 came"):
+        Bounds(waveform=0.0)
+
+
+def test_units_change_nothing() -> None:
+    run, model = record(), hopf(turn=1.005)
+    plain = free_run(model, run)
+    scaled_run = Trajectory(1e-6 * run.t, 1e18 * run.states, run.state_names)
+    degrees = LIBRARY.degrees
+    scaled = replace(model, coef=model.coef * 1e6 * 1e18 / 1e18 ** degrees[:, None])
+    found = free_run(scaled, scaled_run)
+    assert found.f_error == pytest.approx(plain.f_error, abs=1e-6)
+    assert found.waveform_error["y"] == pytest.approx(plain.waveform_error["y"], abs=1e-5)
+
+
+def test_chaos_is_judged_by_its_distribution() -> None:
+    system = replace(lorenz(), duration_s=60.0)
+    run = system.trajectory()
+    truth = free_run(system.model, run)
+    assert truth.verdict is Verdict.LIVES
+    assert np.isnan(truth.f_error)
+    still = replace(system.model, coef=system.model.coef.copy())
+    coef = still.coef.copy()
+    coef[list(still.library.names).index("x"), 1] = 12.0  # rho = 12: two fixed points
+    assert free_run(replace(still, coef=coef), run).verdict is Verdict.DIES_OUT
+    wide = system.model.coef.copy()
+    wide[list(still.library.names).index("x"), 1] = 60.0
+    assert free_run(replace(still, coef=wide), run).verdict is Verdict.WRONG_CYCLE
+
+
+def test_a_run_that_needs_ever_smaller_steps_stops() -> None:
+    library = polynomial(["x"], degree=3)
+    model = SparseModel(library, ["x"], coef_matrix(library, [{"x": 1.0, "x^3": -1e14}]))
+    rollout = model.simulate(np.linspace(0.0, 1e4, 50), [1.0])
+    assert rollout.diverged
+    assert "its steps became too small for the samples" in rollout.message
+
+
+def test_samples_of_a_duration() -> None:
+    run = record()
+    assert samples_in(run, float(run.t[10])) == 11
+    with pytest.raises(ValueError, match="a window must hold two samples"):
+        samples_in(run, 1e-9)

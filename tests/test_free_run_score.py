@@ -1,0 +1,201 @@
+"""Selection by free run, relations in the search, and what a rule that refines hands on."""
+
+import re
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.constraints.relations import parse_relation
+from ep2sindy.constraints.support import binding, completed
+from ep2sindy.model.stability import limit_cycle
+from ep2sindy.selection.folds import folds_of
+
+THRUSTER = [
+    {"n_i": -3.92e5, "n_n": 4.83e3, "n_i*n_n": 4.57e-14},
+    {"1": -7.82e22, "n_i": -4.78e5, "n_n": 6.86e4},
+]
+LIBRARY = ep.polynomial(["n_i", "n_n"], degree=2)
+
+
+def model_of(terms, states=("n_i", "n_n"), library=LIBRARY):
+    return ep.SparseModel(library, list(states), ep.coef_matrix(library, terms))
+
+
+def record(n_periods=24.0, *, noise=0.0, seed=0):
+    """A cycle that attracts, as the breathing mode's: 54 samples in 71 us."""
+    t = 1.32e-6 * np.arange(round(54 * (n_periods + 10)))
+    states = model_of(THRUSTER).simulate(t, [1e18, 1e19]).states[540:]
+    rms = np.sqrt(np.square(states).mean(axis=0))
+    states = states + noise * rms * np.random.default_rng(seed).standard_normal(states.shape)
+    return ep.Trajectory(t[540:], states, ("n_i", "n_n"), units={"n_i": "m^-3", "n_n": "m^-3"})
+
+
+def recipe(*, max_terms=3, n_best=2, formulation=None, **settings):
+    return ep.Recipe(
+        formulation or ep.Differential(),
+        ep.BestSubset(max_terms=max_terms, n_best=n_best),
+        ep.Bootstraps(n=0),
+        ep.FreeRunScore(n_windows=8, **settings),
+        depth=n_best,
+    )
+
+
+@pytest.fixture(scope="module")
+def found():
+    return ep.discover(record(), LIBRARY, recipe())
+
+
+def test_the_truth_is_found_refined_and_handed_on(found):
+    for state, terms in zip(("n_i", "n_n"), THRUSTER, strict=True):
+        # One Runge-Kutta step per sample: (omega dt)^4 / 120 for a sine, and six harmonics.
+        assert found.model.terms(state) == pytest.approx(terms, rel=1e-3)
+        chosen = found.chosen[state]
+        assert chosen.coef_by_term == found.model.terms(state)
+        scores, front = found.scores[state], found.fronts[state]
+        assert front.candidates[int(np.argmin(scores))].terms == chosen.terms
+        low, high = found.model.intervals(state)[chosen.terms[0]]
+        assert low < chosen.coef[0] < high
+    assert found.note.startswith("lives; ")
+    assert found.note in repr(found)
+    assert ep.free_run(found.model, record()).verdict is ep.Verdict.LIVES
+
+
+def test_noise_is_no_obstacle():
+    run = record(noise=0.1)
+    noisy = ep.discover(run, LIBRARY, recipe(formulation=ep.WeightedWeak()))
+    assert ep.free_run(noisy.model, record()).verdict is ep.Verdict.LIVES
+    assert noisy.model.covariance is not None
+
+
+def test_a_cycle_that_attracts_comes_before_one_that_does_not(found):
+    cycle = limit_cycle(found.model, record().states[0], period_s=71.3e-6)
+    assert cycle.stability == "attracting"
+    prey = ep.lotka_volterra()
+    library = ep.polynomial(["x", "y"], degree=2)
+    neutral = ep.discover(prey.trajectory(), library, recipe(max_terms=2, n_best=1))
+    assert neutral.model.terms("x") == pytest.approx(prey.model.terms("x"), rel=1e-3)
+    assert "on a cycle that does not attract" in neutral.note
+
+
+def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
+    dead = ep.discover(record(), LIBRARY, recipe(max_terms=1, n_best=1))
+    assert dead.note.startswith("none of 4 systems lives; the best of them: ")
+    assert dead.scores["n_i"].min() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("run", "reason"),
+    [
+        (record(5.0), r"the record holds 5\.\d periods of 6: chosen by windows held out instead"),
+        (
+            ep.damped_oscillator().trajectory(),
+            "record 'damped oscillator' has no period: chosen by windows held out",
+        ),
+    ],
+)
+def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
+    library = ep.polynomial(run.state_names, degree=2)
+    other = ep.discover(run, library, recipe(max_terms=2, n_best=1))
+    assert re.match(reason, other.note)
+    assert other.model.covariance is not None  # refined, too
+
+
+def test_units_change_nothing(found):
+    run = record()
+    plain = ep.Trajectory(1e6 * run.t, run.states / [1e18, 1e19], run.state_names)
+    again = ep.discover(plain, LIBRARY, recipe())
+    for state in ("n_i", "n_n"):
+        assert list(again.model.terms(state)) == list(found.model.terms(state))
+        np.testing.assert_allclose(again.scores[state], found.scores[state], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"n_folds": 1}, "n_folds must be at least 2: 1 came"),
+        ({"window_periods": 0.0}, "window_periods must be positive: 0.0 came"),
+        ({"margin": 1.5}, "margin must lie between 0 and 1: 1.5 came"),
+    ],
+)
+def test_settings_are_checked(settings, message):
+    with pytest.raises(ValueError, match=message):
+        ep.FreeRunScore(**settings)
+
+
+def test_folds_share_no_sample_and_leave_none_out():
+    run = record(8.0)
+    for runs in ([run], [run] * 5):
+        seen = []
+        for fold in folds_of(runs, 3):
+            held = {(part.run, k) for part in fold.held for k in range(part.start, part.stop)}
+            kept = {(part.run, k) for part in fold.fitted for k in range(part.start, part.stop)}
+            assert not held & kept
+            assert len(held) + len(kept) == len(runs) * run.n_samples
+            seen += list(held)
+        assert sorted(seen) == [(j, k) for j in range(len(runs)) for k in range(run.n_samples)]
+    with pytest.raises(ValueError, match="runs must hold 30 samples to be parted in 3"):
+        folds_of([run.window(0, 20)], 3)
+
+
+SHARED = "x: x*y == -1 * y: x*y"
+
+
+@pytest.mark.parametrize("rule", [ep.EBIC(), ep.RefinedScore(), ep.FreeRunScore(n_windows=8)])
+def test_relations_hold_to_the_last_digit(rule):
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    how = ep.Recipe(
+        ep.WeightedWeak(), ep.BestSubset(max_terms=2), ep.Bootstraps(n=0), rule, depth=1
+    )
+    library = ep.polynomial(["x", "y"], degree=2)
+    tied = ep.discover(run, library, how, relations=[SHARED]).model
+    assert tied.terms("x")["x*y"] == -tied.terms("y")["x*y"]
+    assert tied.terms("x")["x*y"] == pytest.approx(-1.0, rel=0.05)
+
+
+def test_a_coefficient_keeps_the_value_it_is_given():
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    free, fixed = (ep.discover(run, relations=r).model for r in ((), ["x: x*y == -1.1"]))
+    assert fixed.terms("x")["x*y"] == -1.1
+    assert fixed.terms("x")["x"] > free.terms("x")["x"] * 1.01
+
+
+def test_a_known_equation_is_not_searched():
+    oscillator = ep.damped_oscillator(zeta=0.05)
+    run = oscillator.trajectory(noise=0.01, rng=0)
+    known = ep.discover(
+        run, ep.polynomial(["x", "v"], degree=2), terms={"x": ["v"]}, relations=["x: v == 1"]
+    )
+    assert known.model.terms("x") == {"v": 1.0}
+    assert [c.terms for c in known.fronts["x"].candidates][1:] == [("v",)]
+    assert known.model.terms("v") == pytest.approx({"x": -9.0, "v": -0.3}, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
+        ({"relations": ["x: w == 1"]}, "unknown variable 'w'"),
+        ({"terms": {"x": []}}, r"an equation whose terms are given must have some: \['x'\]"),
+        ({"terms": {"x": ["y"]}, "relations": ["x: x == 1"]}, "name terms that no combination of"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(asked, message):
+    with pytest.raises(ValueError, match=message):
+        ep.discover(ep.lotka_volterra().trajectory(), ep.polynomial(["x", "y"], degree=2), **asked)
+
+
+def test_supports_are_completed_by_what_relations_ask():
+    library = ep.polynomial(["x", "y"], degree=2)  # 1, x, y, x^2, x*y, y^2
+    masks = np.array([[0, 1, 0, 0, 0, 0], [0, 1, 0, 0, 1, 0]], dtype=bool)
+    shared = [parse_relation(SHARED)]
+    both = completed(masks, library, "x", shared)
+    assert both.tolist() == [[False, True, False, False, False, False],
+                             [False, True, False, False, True, False]]  # fmt: skip
+    valued = completed(masks, library, "x", [parse_relation("x: 1 == 2")])
+    assert valued[:, 0].all()
+    assert len(valued) == 2
+    assert binding(shared, {"x": ("x*y",), "y": ("y",)}) is None
+    assert binding(shared, {"x": ("x",), "y": ("y",)}) == ()
+    assert binding(shared, {"x": ("x*y",), "y": ("x*y",)}) == tuple(shared)
+    assert binding([parse_relation("x: 1 == 2")], {"x": ("x",)}) is None
