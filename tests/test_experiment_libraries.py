@@ -10,6 +10,7 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
+from ep2sindy.machine.files import write_json
 from ep2sindy.model.model import SparseModel
 from ep2sindy.studies.libraries import Study
 from tests.programs import EXPERIMENTS, ROOT, composed, computed
@@ -53,6 +54,38 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
         assert key in ions
 
 
+def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
+    found = summary_of(breathing_run)["models"]
+    living = found["simple"]["living"]
+    assert living["verdict"] == "lives"
+    assert living["n_terms"] == 4
+    assert living["f_error"] == pytest.approx(0.0, abs=1e-4)
+    assert living["waveform_error"] == pytest.approx({"n_i": 0.0, "n_n": 0.0}, abs=1e-2)
+    assert living["amplitude_ratio"] == pytest.approx({"n_i": 1.0, "n_n": 1.0}, abs=1e-2)
+    assert living["stability"] == "neutral"  # predator and prey
+    assert living["floquet"] == [[1.0, 0.0], pytest.approx([1.0, 0.0], abs=1e-3)]
+    ions = living["coefficients"]["n_i"]["n_i"]
+    assert ions["value"] == pytest.approx(-1.64e5, rel=1e-4)
+    assert ions["ci95"][0] < ions["value"] < ions["ci95"][1]
+    assert living["by_derivatives"]["verdict"] == "lives"  # the same terms here
+    assert found["velocity"]["living"] is None  # it has inputs
+    roles = {(r["state"], r["term"]): r for r in found["simple"]["roles"]["terms"]}
+    assert len(roles) == 4
+    assert roles["n_i", "n_i*n_n"]["balance"] == "mean R_ion"
+    assert roles["n_i", "n_i*n_n"]["balance_value"] == -roles["n_n", "n_i*n_n"]["balance_value"]
+    assert roles["n_n", "n_n"]["balance_value"] is None  # the file says nothing of neutrals' speed
+    assert all(role["without_verdict"] != "lives" for role in roles.values())
+    shared = found["simple"]["roles"]["shared_ionization"]
+    assert shared["verdict"] == "lives"
+    page = (breathing_run / "report.html").read_text()
+    for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
+        assert f"figures/{figure}.png" in page
+        assert (breathing_run / "figures" / f"{figure}.png").is_file()
+    names = {path.name for path in (breathing_run / "tables").iterdir()}
+    assert {"living.csv", "coefficients_living.csv", "roles_simple.csv"} <= names
+    assert "simple: a model that lives" in (breathing_run / "run.log").read_text()
+
+
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
     folder = breathing_run
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
@@ -81,8 +114,9 @@ def test_a_fixed_seed_gives_the_same_summary(
     breathing_run: Path, predator_prey: Path, tmp_path: Path
 ) -> None:
     again = computed(composed(*breathing(predator_prey, tmp_path))).summary
+    write_json(tmp_path / "again.json", again)
     first = summary_of(breathing_run)
-    assert json.loads(json.dumps(again)) == {k: first[k] for k in again}
+    assert json.loads((tmp_path / "again.json").read_text()) == {k: first[k] for k in again}
 
 
 def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:

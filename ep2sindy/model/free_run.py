@@ -91,9 +91,10 @@ class FreeRun:
 
     @property
     def text(self) -> str:
-        """The verdict, and when it diverged."""
-        when = f" at {self.rollout.t[-1]:.3g} s" if self.rollout.diverged else ""
-        return f"{self.verdict}{when}"
+        """The verdict, and how long after its start it diverged."""
+        if not (self.rollout.diverged and len(self.rollout.t)):
+            return str(self.verdict)
+        return f"{self.verdict} after {self.rollout.t[-1] - self.rollout.t[0]:.3g} s"
 
 
 def free_run(

@@ -150,33 +150,21 @@ def _integrated(
     rtol: float,
 ) -> Rollout:
     """From x0 over t, in units of `scale`, until a state exceeds `blow_up` of them."""
+    rhs = _Counted(_scaled_rhs(model, drive, scale), CALLS + CALLS_PER_SAMPLE * len(t))
 
-    calls, given_up_s = 0, np.inf
-    rhs = _scaled_rhs(model, drive, scale)
+    def ends(t: float, y: np.ndarray) -> float:
+        return min(blow_up - float(np.abs(y).max()), rhs.left_s(t))
 
-    def counted(t: float, y: np.ndarray) -> np.ndarray:
-        nonlocal calls
-        calls += 1
-        return rhs(t, y)
-
-    def too_large(t: float, y: np.ndarray) -> float:
-        nonlocal given_up_s
-        if calls > budget:
-            given_up_s = min(given_up_s, t)
-            return given_up_s - t
-        return blow_up - float(np.abs(y).max())
-
-    budget = CALLS + CALLS_PER_SAMPLE * len(t)
-    too_large.terminal = True  # type: ignore[attr-defined]
+    ends.terminal = True  # type: ignore[attr-defined]
     # An overflow on the way to a blow-up is caught by the event, or ends the solver.
     with np.errstate(over="ignore", invalid="ignore"):
         solution = solve_ivp(
-            counted,
+            rhs,
             (t[0], t[-1]),
             x0 / scale,
             method="DOP853",
             t_eval=t,
-            events=too_large,
+            events=ends,
             rtol=rtol,
             atol=rtol,
         )
@@ -184,12 +172,30 @@ def _integrated(
         t=solution.t,
         states=solution.y.T * scale,
         diverged=solution.status != 0,
-        message=_ending_text(solution, blow_up, bound, exhausted=bool(np.isfinite(given_up_s))),
+        message=_ending_text(solution, blow_up, bound, exhausted=rhs.given_up_s < np.inf),
         state_names=tuple(model.states),
         inputs=samples[: len(solution.t)],
         input_names=tuple(model.inputs),
         units=model.units,
     )
+
+
+class _Counted:
+    """A right-hand side that may be evaluated so many times."""
+
+    def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray], budget: int) -> None:
+        self.rhs, self.budget = rhs, budget
+        self.calls, self.given_up_s = 0, float("inf")
+
+    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        self.calls += 1
+        return self.rhs(t, y)
+
+    def left_s(self, t: float) -> float:
+        """Time until the run is given up, which is when it is first asked with nothing left."""
+        if self.calls > self.budget:
+            self.given_up_s = min(self.given_up_s, t)
+        return self.given_up_s - t
 
 
 def _scaled_rhs(

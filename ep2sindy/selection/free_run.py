@@ -197,25 +197,24 @@ class FreeRunScore:
             k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)
         ]
         living.sort(key=lambda k: self._rank(trials[k]))
+        by_error = sorted(range(len(trials)), key=lambda k: trials[k].error)
         window = self._window(records, cycles)
-        resting = None
-        for k in living[: self.n_confirmed]:
+        found = []
+        for place, k in enumerate((living or by_error)[: self.n_confirmed]):
             model = trials[k].system.refined_on_all(
                 records.runs, window=window, n_reweights=0, seed=self.seed
             )
             run = self._confirmed(model, records)
-            if run.verdict is Verdict.LIVES:
-                if _attracts(run, cycles):
-                    return k, model, _note(trials, living, "")
-                resting = resting or (k, model)
-        if resting is not None:
-            return *resting, _note(trials, living, ", on a cycle that does not attract")
-        best = min(range(len(trials)), key=lambda k: (trials[k].error, trials[k].system.n_terms))
-        model = trials[best].system.refined_on_all(
-            records.runs, window=window, n_reweights=0, seed=self.seed
-        )
-        run = self._confirmed(model, records)
-        return best, model, f"none of {len(trials)} systems lives; the best of them: {run.text}"
+            attracts = run.verdict is Verdict.LIVES and _attracts(run, cycles)
+            found.append((not attracts, list(Verdict).index(run.verdict), place, k, run))
+            if attracts:
+                break
+        rests, _, _, winner, run = min(found, key=lambda each: each[:3])
+        how = str(run.verdict)
+        if run.verdict is Verdict.LIVES and rests:
+            how = f"{how}, on a cycle that does not attract"
+        count = f"{len(living) or 'none'} of {len(trials)} systems live where not fitted"
+        return winner, run.model, f"{how}; {count}"
 
     def _rank(self, trial: Trial) -> tuple[bool, int, float]:
         return trial.error > self.margin, trial.system.n_terms, trial.waveform
@@ -276,7 +275,3 @@ def _attracts(run: FreeRun, cycles: Sequence[Cycle]) -> bool:
     period_s = 1.0 / cycles[0].frequency_Hz
     cycle = limit_cycle(run.model, run.rollout.states[-1], period_s=period_s)
     return cycle is not None and bool((np.abs(cycle.multipliers[1:]) <= PULL).all())
-
-
-def _note(trials: Sequence[Trial], living: Sequence[int], reservation: str) -> str:
-    return f"lives{reservation}; {len(living)} of {len(trials)} systems live where not fitted"

@@ -18,6 +18,7 @@ from ep2sindy.studies.library_result import result_of
 from ep2sindy.studies.living import LivingSearch
 from ep2sindy.studies.shown import Shown
 from ep2sindy.studies.source import Source
+from ep2sindy.studies.term_roles import Compared
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Study:
     thesis: by library, published equations: state -> term -> SI coefficient; where the library
     has the terms, and the data can tell them from others, they are fitted as well. living: how
     libraries without inputs are searched for a model that lives; None leaves that out. held_out:
-    the last share of the record, which judges such a model.
+    the last share of the record, which judges such a model. compared: what its terms are held
+    against.
     """
 
     source: Source
@@ -65,6 +67,7 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: Share = 0.25
+    compared: Compared | None = None
 
     def compute(self, run: Run) -> Outcome:
         recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
@@ -82,6 +85,7 @@ class Study:
                 self.rollout_s,
                 self.living,
                 self.held_out,
+                self.compared,
                 rng=rng,
             )
             for (name, library), rng in zip(libraries.items(), streams, strict=True)

@@ -40,6 +40,7 @@ from ep2sindy.studies.living_view import (
 )
 from ep2sindy.studies.shown import INTEGRATED, Shown, rollout_tables, run_figures, trajectories
 from ep2sindy.studies.source import data_summary
+from ep2sindy.studies.term_roles import roles_section, roles_summary, roles_table
 
 FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
 THESIS = "The same with the thesis's terms, fitted to these data."
@@ -86,6 +87,9 @@ class Outcome:
             )
         published = {f"{name}_thesis_terms": each for name, each in self.published.items()}
         found |= rollout_tables(self.data, self.selected | published)
+        for name, result in self.results.items():
+            if result.roles is not None:
+                found[f"roles_{name}"] = roles_table(result.roles)
         return found | living_tables(self.living) | {"comparison": self.comparison()}
 
     def comparison(self) -> pd.DataFrame:
@@ -117,10 +121,11 @@ class Outcome:
 
     def sections(self) -> list[Section]:
         found = [_library_section(name, result) for name, result in self.results.items()]
-        lives = [
-            living_section(name, living, living_figures(name, living))
-            for name, living in self.living.items()
-        ]
+        lives = []
+        for name, living in self.living.items():
+            lives.append(living_section(name, living, living_figures(name, living)))
+            if (roles := self.results[name].roles) is not None:
+                lives.append(roles_section(name, roles))
         shown = Section("Integrated", [self._comparison_table(), *pictures(FIGURES)])
         return [*found, *lives, shown]
 
@@ -148,6 +153,7 @@ class Outcome:
                 "trajectory": _trajectory_summary(result.selected, first),
                 "thesis_terms": _published_summary(result, first),
                 "living": living_summary(result.living),
+                "roles": roles_summary(result.roles),
             }
             for name, result in self.results.items()
         }

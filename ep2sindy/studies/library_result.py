@@ -18,6 +18,7 @@ from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.studies.held_out import first_and_last
 from ep2sindy.studies.living import Living, LivingSearch, living_model
+from ep2sindy.studies.term_roles import Compared, Roles, term_roles
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +26,7 @@ class LibraryResult:
     """One library's discovery and its selected model; the published terms, fitted to our data.
 
     given: the published terms as printed, by state. living: a model that lives on its own; None
-    where it was not asked for, or the library has inputs.
+    where it was not asked for, or the library has inputs. roles: of its terms.
     """
 
     recipe: Recipe
@@ -35,6 +36,7 @@ class LibraryResult:
     refitted: Mapping[str, Candidate]
     published: FreeRun | None
     living: Living | None = None
+    roles: Roles | None = None
 
 
 def result_of(
@@ -45,6 +47,7 @@ def result_of(
     rollout_s: float | None,
     living: LivingSearch | None = None,
     held_out: float = 0.25,
+    compared: Compared | None = None,
     *,
     rng: np.random.Generator,
 ) -> LibraryResult:
@@ -52,10 +55,12 @@ def result_of(
     n_samples = data.n_samples if rollout_s is None else samples_in(data, rollout_s)
     found = discover(data, library, recipe, seed=rng)
     refitted = _refitted(found, published)
-    lives = None
+    lives = roles = None
     if living is not None and not found.model.inputs:
         parts = first_and_last(data, held_out)
         lives = living_model(*parts, library, recipe, living, found.model, rng=rng)
+        if compared is not None:
+            roles = term_roles(lives.discovery, data, *parts, compared, living.bounds)
     return LibraryResult(
         recipe=recipe,
         discovery=found,
@@ -64,6 +69,7 @@ def result_of(
         refitted=refitted,
         published=_run_refitted(found, refitted, data, n_samples),
         living=lives,
+        roles=roles,
     )
 
 

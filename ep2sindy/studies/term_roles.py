@@ -1,0 +1,185 @@
+"""What the terms of a living model mean: beside the zone's means, left out, tied by ionization."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.constraints.fit import constrained_fit
+from ep2sindy.constraints.relations import Constraint, Relation, constraint, parse_relation
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import Discovery
+from ep2sindy.model.free_run import Bounds, FreeRun, free_run
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Section, Table, Text, places
+from ep2sindy.studies.living import start_of, two_periods
+
+if TYPE_CHECKING:
+    from ep2sindy.refinement.refine import Refinement
+
+LACKING = "the data have not the variables"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What the coefficients of ions and neutrals in a zone are held against.
+
+    ions, neutrals: the states. ion_velocity (m/s), ionization_rate (m^3/s): variables of the data;
+    neutral_speed in m/s, None where it is not known. length_m: of the zone.
+    """
+
+    ions: str
+    neutrals: str
+    ion_velocity: str
+    ionization_rate: str
+    neutral_speed: float | None
+    length_m: float
+
+    def expected(self, data: Trajectory) -> dict[tuple[str, str], tuple[str, float]]:
+        """(state, term) -> what a balance of the zone has there, in words and in SI.
+
+        d n/dt = -u n/L + inflow, and what ionization gives to ions it takes from neutrals.
+        Variables that the data lack are left out.
+        """
+        found: dict[tuple[str, str], tuple[str, float]] = {}
+        product = f"{self.ions}*{self.neutrals}"
+        if self.ion_velocity in data.names:
+            rate = float(data.columns([self.ion_velocity]).mean()) / self.length_m
+            found[self.ions, self.ions] = (f"-mean {self.ion_velocity}/L", -rate)
+        if self.neutral_speed is not None:
+            found[self.neutrals, self.neutrals] = ("-u_n/L", -self.neutral_speed / self.length_m)
+        if self.ionization_rate in data.names:
+            rate = float(data.columns([self.ionization_rate]).mean())
+            found[self.ions, product] = (f"mean {self.ionization_rate}", rate)
+            found[self.neutrals, product] = (f"-mean {self.ionization_rate}", -rate)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Role:
+    """A term of the model; without: how the model runs that lacks it, refined; None if it cannot.
+
+    expected: what a balance of the zone has in its place, in words and in SI; None for nothing.
+    """
+
+    state: str
+    term: str
+    coef: float
+    expected: tuple[str, float] | None
+    without: FreeRun | None
+
+
+@dataclass(frozen=True, eq=False)
+class Roles:
+    """The terms of a model. shared: the run of the model whose ionization is one coefficient, with
+    opposite signs; None where that cannot be refined."""
+
+    terms: Sequence[Role]
+    shared: FreeRun | None
+
+
+def term_roles(
+    found: Discovery,
+    data: Trajectory,
+    train: Trajectory,
+    held: Trajectory,
+    compared: Compared,
+    bounds: Bounds,
+) -> Roles:
+    """Each term left out in turn, and ionization shared, refined on `train` and run over `held`."""
+    model, expected = found.model, compared.expected(data)
+    support = {state: list(model.terms(state)) for state in model.states}
+    roles = []
+    for state in model.states:
+        for term, coef in model.terms(state).items():
+            less = support | {state: [name for name in support[state] if name != term]}
+            run = _run(found, less, (), train, held, bounds) if less[state] else None
+            roles.append(Role(state, term, coef, expected.get((state, term)), run))
+    product = f"{compared.ions}*{compared.neutrals}"
+    relation = parse_relation(f"{compared.ions}: {product} == -1 * {compared.neutrals}: {product}")
+    both = {state: list(dict.fromkeys([*terms, product])) for state, terms in support.items()}
+    return Roles(roles, _run(found, both, (relation,), train, held, bounds))
+
+
+def _run(
+    found: Discovery,
+    support: dict[str, list[str]],
+    relations: Sequence[Relation],
+    train: Trajectory,
+    held: Trajectory,
+    bounds: Bounds,
+) -> FreeRun | None:
+    """These terms fitted, refined on windows of two periods, and run; None if they cannot be."""
+    held_to = constraint(found.model.library, support, relations)
+    problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
+    start = constrained_fit(problems, held_to, units=train.units)
+    refined = _refined(start, held_to, train)
+    if refined.status == "non_finite":
+        return None
+    initial = start_of(held, refined.model)
+    return free_run(refined.model, held, initial=initial, bounds=bounds)
+
+
+def _refined(start: SparseModel, held_to: Constraint, train: Trajectory) -> Refinement:
+    from ep2sindy.refinement.refine import refine  # torch, for those alone who refine
+
+    return refine(
+        start, [train], window=two_periods(train), constraint=held_to, n_reweights=0, rng=0
+    )
+
+
+def roles_table(roles: Roles) -> pd.DataFrame:
+    rows = []
+    for role in roles.terms:
+        name, value = role.expected or ("", np.nan)
+        row = {"state": role.state, "term": role.term, "coefficient": role.coef}
+        row |= {"balance": name, "balance_value": value}
+        rows.append(row | {f"without_{key}": v for key, v in _figures(role.without).items()})
+    return pd.DataFrame(rows)
+
+
+def _figures(run: FreeRun | None) -> dict[str, Any]:
+    if run is None:
+        return {"verdict": "cannot be refined", "f_error": np.nan, "waveform_error": np.nan}
+    waveform = max(run.waveform_error.values())
+    return {"verdict": run.text, "f_error": run.f_error, "waveform_error": waveform}
+
+
+def roles_section(name: str, roles: Roles) -> Section:
+    """A row per term: what a balance of the zone expects there, and the model without it."""
+    rows = []
+    for row in roles_table(roles).to_dict("records"):
+        waveform = places(row["without_waveform_error"], 3)
+        rows.append(
+            {
+                "equation": f"{row['state']}'",
+                "term": row["term"],
+                "coefficient": row["coefficient"],
+                "in a balance": row["balance"],
+                "value": row["balance_value"],
+                "without it": row["without_verdict"],
+                "waveform": waveform,
+            }
+        )
+    shared = _figures(roles.shared)
+    text = f"Ionization as one coefficient of opposite signs: {shared['verdict']}"
+    if roles.shared is not None:
+        terms = "; ".join(roles.shared.model.text().splitlines())
+        text += f", waveform {places(shared['waveform_error'], 3)} ({terms})"
+    table = Table(pd.DataFrame(rows), title="each term beside a balance of the zone, and left out")
+    return Section(f"{name}: what the terms mean", [table, Text(f"{text}.")], level=3)
+
+
+def roles_summary(roles: Roles | None) -> dict[str, Any] | None:
+    if roles is None:
+        return None
+    shared = roles.shared
+    return {
+        "terms": roles_table(roles).to_dict("records"),
+        "shared_ionization": _figures(shared)
+        | {"text": None if shared is None else shared.model.text()},
+    }
