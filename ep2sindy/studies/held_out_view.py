@@ -110,7 +110,9 @@ class Outcome:
 
     def _table(self) -> Table:
         """A row per model: how it runs."""
-        rows = pd.DataFrame([_readable(name, each) for name, each in self.labelled.items()])
+        rows = pd.DataFrame(
+            [_readable(name, each, self.f_data_Hz) for name, each in self.labelled.items()]
+        )
         if rows["status"].isna().all():  # least squares has none
             del rows["status"]
         return Table(
@@ -156,9 +158,9 @@ def _rows(name: str, judged: Judged) -> list[dict[str, Any]]:
     return rows
 
 
-def _readable(label: str, judged: Judged) -> dict[str, Any]:
+def _readable(label: str, judged: Judged, f_data_Hz: float) -> dict[str, Any]:
     sample, fit = judged.from_sample, judged.from_fit
-    frequency = frequency_text(sample.frequency_Hz[judged.model.states[0]])
+    frequency = frequency_text(f_data_Hz * (1.0 + sample.f_error))
     return {
         "method": label,
         "f": _or_verdict(sample, f"{frequency} ({100 * sample.f_error:+.1f} %)"),
