@@ -1,14 +1,15 @@
-"""Selecting by trajectories: refined, as the regression left them, and by EBIC beside them.
+"""Selecting by trajectories: refined, free, as the regression left them, and by EBIC beside them.
 
-    python -m benchmarks.trajectory_scores --n 12
+    python -m benchmarks.trajectory_scores --n 12 [--systems lotka_volterra lorenz]
 
-Realizations of Lotka-Volterra and Lorenz as the synthetic benchmark draws them; weighted weak form,
+Realizations of four systems as the synthetic benchmark draws them; weighted weak form,
 the two best subsets of every size up to four terms, depth 2.
 """
 
 import argparse
 import time
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -19,15 +20,18 @@ from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.integral import IntegralScore
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import Selection, selected
 from ep2sindy.synthetic.draws import realization
 
-CASES = (("lotka_volterra", 0.05), ("lotka_volterra", 0.2), ("lorenz", 0.05), ("lorenz", 0.2))
+SYSTEMS = ("lotka_volterra", "van_der_pol", "damped_oscillator", "lorenz")
+NOISES = (0.0, 0.05, 0.2)
 RULES: dict[str, Selection] = {
     "RefinedScore": RefinedScore(),
     "IntegralScore": IntegralScore(),
+    "FreeRunScore": FreeRunScore(),
     "EBIC": EBIC(),
 }
 
@@ -64,8 +68,10 @@ def judged(number: int, *, name: str, noise: float) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="selection by trajectories")
     parser.add_argument("--n", type=int, default=12, help="realizations per system and noise")
-    n = parser.parse_args().n
-    for name, noise in CASES:
+    parser.add_argument("--systems", nargs="*", default=SYSTEMS, help="of these four")
+    given = parser.parse_args()
+    n = given.n
+    for name, noise in product(given.systems, NOISES):
         rows = dict(Loky().run(partial(judged, name=name, noise=noise), range(n))).values()
         table = pd.DataFrame(rows)
         counts = ", ".join(f"{key} {table[key].sum():.0f}" for key in ("on the front", *RULES))

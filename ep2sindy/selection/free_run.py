@@ -24,7 +24,8 @@ from ep2sindy.selection.rule import FLOOR, Decision
 from ep2sindy.selection.systems import System, budget, system_of
 from ep2sindy.signals.attractor import Cycle, find_cycle
 
-LEAST_PERIODS = 6.0  # of a record, so that its folds leave windows of two
+# Of a record, so that its folds leave windows of two: six, less what noise makes of them.
+LEAST_PERIODS = 5.5
 
 # Periods of a trial run: enough for a transient to die out. A model without inputs runs on where
 # a stretch ends before.
@@ -56,10 +57,10 @@ class FreeRunScore:
     """Judge systems of equations by running them freely: the smallest that lives wins.
 
     The records are parted in `n_folds`. Every combination of candidates, one per equation, is
-    refined on windows of `window_periods` in all folds but one, and run from the first sample of
-    what was held out (smoothed, for noise in it is not the model's), in turn for every fold. It
-    lives if frequency, amplitudes and waveform keep within `bounds` of the data's cycle each time.
-    Of those that live with room to spare the smallest, by waveform among equals, is refined on
+    refined on windows of `window_periods` in all folds but one, and run from where the data's
+    cycle is when what was held out begins (noise in a sample is not the model's), in turn for
+    every fold. It lives if frequency, amplitudes and waveform keep within `bounds` of the data's
+    cycle each time. Of those that live with room to spare the smallest, by waveform among equals, is refined on
     windows of all data and run over the longest record; it wins if it lives there too, on a cycle
     that attracts. Where none attracts, one on a neutral cycle may win; where none lives, the one
     that deviates least does; the note says so. Neither R2 nor the loss of the windows decides:
@@ -197,14 +198,14 @@ class FreeRunScore:
             k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)
         ]
         living.sort(key=lambda k: self._rank(trials[k]))
-        by_error = sorted(range(len(trials)), key=lambda k: trials[k].error)
+        by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
         found = []
         for place, k in enumerate((living or by_error)[: self.n_confirmed]):
             model = trials[k].system.refined_on_all(
                 records.runs, window=window, n_reweights=0, seed=self.seed
             )
-            run = self._confirmed(model, records)
+            run = self._confirmed(model, records, cycles)
             attracts = run.verdict is Verdict.LIVES and _attracts(run, cycles)
             found.append((not attracts, list(Verdict).index(run.verdict), place, k, run))
             if attracts:
@@ -219,23 +220,25 @@ class FreeRunScore:
     def _rank(self, trial: Trial) -> tuple[bool, int, float]:
         return trial.error > self.margin, trial.system.n_terms, trial.waveform
 
-    def _confirmed(self, model: SparseModel, records: Records) -> FreeRun:
-        """Over the longest record, from its first sample, smoothed."""
-        pairs = zip(records.runs, records.smoothed, strict=True)
-        run, x = max(pairs, key=lambda pair: np.ptp(pair[0].t))
-        return free_run(model, run, initial=x[0], bounds=self.bounds)
+    def _confirmed(self, model: SparseModel, records: Records, cycles: Sequence[Cycle]) -> FreeRun:
+        """Over the longest record, from where its cycle begins."""
+        pairs = zip(records.runs, cycles, strict=True)
+        run, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
+        start = cycle.waveform(cycle.phase[:1])[0]
+        return free_run(model, run, initial=start, bounds=self.bounds)
 
 
 def _cycles(records: Records) -> list[Cycle] | str:
     """The cycle of every record, or what stands against there being one."""
     found = []
-    for run, x in zip(records.runs, records.smoothed, strict=True):
-        cycle = find_cycle(run.t, run.columns(run.state_names)) and find_cycle(run.t, x)
+    for run in records.runs:
+        # Samples as they are: a waveform of all periods averages noise, smoothing clips peaks.
+        cycle = find_cycle(run.t, run.columns(run.state_names))
         name = f"record {run.label!r}" if run.label else "the record"
         if cycle is None:
             return f"{name} has no period"
         if cycle.n_periods < LEAST_PERIODS:
-            return f"{name} holds {cycle.n_periods:.1f} periods of {LEAST_PERIODS:g}"
+            return f"{name} holds {cycle.n_periods:.1f} periods, not six"
         found.append(cycle)
     return found
 
@@ -255,7 +258,7 @@ def _paths(
         first, n_samples = part.start, part.stop - part.start
         if not ensemble.inputs:
             n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))
-            start = x[first][:, None]
+            start = cycle.waveform(cycle.phase[first : first + 1]).T
             windows = DrivenWindows.free(start, step_s=run.dt_s, n_samples=n_samples)
             t = run.dt_s * np.arange(n_samples)
         else:
