@@ -78,6 +78,27 @@ def test_a_cycle_that_attracts_comes_before_one_that_does_not(found):
     assert "on a cycle that does not attract" in neutral.note
 
 
+def test_a_state_that_was_not_measured_need_not_keep_its_waveform(found):
+    run = record()
+    # What the model cannot follow, in the second state alone: ten times faster.
+    wiggle = 0.4 * run.states[:, 1].std() * np.sin(10 * 2 * np.pi * run.t / 71.3e-6)
+    spoilt = ep.Trajectory(run.t, run.states + np.outer(wiggle, [0, 1]), run.state_names)
+    assert ep.free_run(found.model, spoilt).verdict is ep.Verdict.WRONG_CYCLE
+    judged = ep.free_run(found.model, spoilt, judged=["n_i"])
+    assert judged.verdict is ep.Verdict.LIVES
+    assert judged.waveform_error["n_n"] > 0.2
+    with pytest.raises(ValueError, match=r"judged must name some of the states .*: \['T'\] came"):
+        ep.free_run(found.model, run, judged=["T"])
+
+
+def test_starts_at_other_phases_refuse_what_lives_from_one(found):
+    several = ep.discover(record(), LIBRARY, recipe(n_starts=4))
+    assert several.note.startswith("lives; ")
+    for state in ("n_i", "n_n"):
+        assert list(several.model.terms(state)) == list(found.model.terms(state))
+        assert (several.scores[state] >= found.scores[state] - 1e-9).all()
+
+
 def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
     dead = ep.discover(record(), LIBRARY, recipe(max_terms=1, n_best=1))
     assert dead.note.endswith("; none of 4 systems live where not fitted")
@@ -120,6 +141,7 @@ def test_units_change_nothing(found):
         ({"n_folds": 1}, "n_folds must be at least 2: 1 came"),
         ({"window_periods": 0.0}, "window_periods must be positive: 0.0 came"),
         ({"margin": 1.5}, "margin must lie between 0 and 1: 1.5 came"),
+        ({"n_starts": 0}, "n_starts must be at least 1: 0 came"),
     ],
 )
 def test_settings_are_checked(settings, message):

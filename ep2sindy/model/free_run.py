@@ -104,15 +104,23 @@ def free_run(
     n_samples: int | None = None,
     initial: Float[np.ndarray, " n_states"] | None = None,
     bounds: Bounds | None = None,
+    judged: Sequence[str] | None = None,
 ) -> FreeRun:
     """Run a model over a record, or its first samples, and compare the attractors.
 
-    initial: the state to start from, in SI; None takes the data's.
+    initial: the state to start from, in SI; None takes the data's. judged: states that the verdict
+    and f_error are by, such as the one that was measured; None takes all.
+    Raises ValueError for a judged state that the model does not have.
     """
     n_samples = run.n_samples if n_samples is None else min(n_samples, run.n_samples)
     rollout = model.rollout(run, n_samples=n_samples, initial=initial)
     record = record_of(run.window(0, n_samples), model.states)
-    likeness = record.likeness(rollout.states, bounds or Bounds())
+    bounds = bounds or Bounds()
+    likeness = ours = record.likeness(rollout.states, bounds)
+    if judged is not None:
+        columns = columns_of(model.states, judged)
+        some = record_of(run.window(0, n_samples), judged)
+        ours = some.likeness(rollout.states[:, columns], bounds)
     by_state = {
         name: MappingProxyType(dict(zip(model.states, values.tolist(), strict=True)))
         for name, values in likeness.by_state.items()
@@ -120,8 +128,8 @@ def free_run(
     return FreeRun(
         model=model,
         rollout=rollout,
-        verdict=likeness.verdict,
-        f_error=likeness.f_error,
+        verdict=ours.verdict,
+        f_error=ours.f_error,
         spectrum=likeness.spectrum,
         periods=_periods_kept(record, rollout.states),
         excursion=record.excursion(rollout.states),
@@ -233,6 +241,14 @@ def record_of(run: Trajectory, states: Sequence[str]) -> Record:
     """A trajectory as what runs are compared to."""
     values = run.columns(states)
     return Record(run.t, values, find_cycle(run.t, values))
+
+
+def columns_of(states: Sequence[str], judged: Sequence[str] | None) -> list[int]:
+    """Places of the states that are judged, None meaning all; ValueError for one not there."""
+    names = list(states if judged is None else judged)
+    if not names or not set(names) <= set(states):
+        raise ValueError(f"judged must name some of the states {list(states)}: {names} came")
+    return [list(states).index(name) for name in names]
 
 
 def samples_in(run: Trajectory, duration_s: float) -> int:

@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
-from ep2sindy.model.free_run import Bounds, FreeRun, Verdict, against_cycle, deviation, free_run
+from ep2sindy.model.free_run import (
+    Bounds,
+    FreeRun,
+    Verdict,
+    against_cycle,
+    columns_of,
+    deviation,
+    free_run,
+)
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
@@ -23,6 +31,12 @@ from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import FLOOR, Decision
 from ep2sindy.selection.systems import System, budget, system_of
 from ep2sindy.signals.attractor import Cycle, find_cycle
+
+LEAST_WINDOWS = 30  # that the winner is refined on
+
+# Share of the window loss of a smaller system on a neutral cycle that one on a cycle that attracts
+# must come below: where noise is all that is left, more terms pull by chance.
+GAIN = 0.95
 
 # Of a record, so that its folds leave windows of two: six, less what noise makes of them.
 LEAST_PERIODS = 5.5
@@ -71,8 +85,10 @@ class FreeRunScore:
     decides. score = the largest deviation from the cycle, in units of its bound; at most 10.
     margin: systems that deviate by no more than this share of the bounds come first, however
     small others are: what barely keeps within them here will not in another record.
-    max_combinations: more are refused. n_confirmed: systems refined on all data, at most.
-    seed: of the windows that are drawn.
+    judged: states whose cycle counts, such as one that was measured where others are made of it;
+    None takes all. n_starts: of models without inputs in every stretch that was held out, at
+    phases spread over the period; all must end on the cycle.
+    max_combinations: more are refused. n_confirmed: refined on all data, at most. seed: of windows.
     """
 
     bounds: Bounds = field(default_factory=Bounds)
@@ -83,11 +99,13 @@ class FreeRunScore:
     n_confirmed: int = 8
     seed: int = 0
     max_combinations: int = 4096
+    judged: Sequence[str] | None = None
+    n_starts: int = 1
     label: ClassVar[str] = "free-run error"
 
     def __post_init__(self) -> None:
-        least = {"n_folds": 2, "n_windows": 1, "n_confirmed": 1, "max_combinations": 1}
-        for name, fewest in least.items():
+        least = dict.fromkeys(("n_windows", "n_confirmed", "max_combinations", "n_starts"), 1)
+        for name, fewest in ({"n_folds": 2} | least).items():
             if getattr(self, name) < fewest:
                 raise ValueError(f"{name} must be at least {fewest}: {getattr(self, name)} came")
         if not self.window_periods > 0.0:
@@ -104,7 +122,7 @@ class FreeRunScore:
         max_combinations, or relations that no combination has the terms for.
         """
         records = records_of(fronts)
-        cycles = _cycles(records)
+        cycles = _cycles(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
             found = RefinedScore(max_combinations=self.max_combinations).decide(fronts, relations)
             return replace(found, note=f"{cycles}: chosen by windows held out instead")
@@ -167,8 +185,8 @@ class FreeRunScore:
         coef = np.stack([model.coef for model in refined.models], axis=2)
         ensemble = Ensemble(first.library, first.states, coef)
         judged = [
-            self._judged(t, paths, cycle)
-            for t, paths, cycle in _paths(ensemble, fold.held, records, cycles)
+            self._judged(t, paths, cycle, first.states)
+            for t, paths, cycle in _paths(ensemble, fold.held, records, cycles, self.n_starts)
         ]
         return np.column_stack([np.max(judged, axis=0), refined.loss])
 
@@ -177,13 +195,15 @@ class FreeRunScore:
         t: Float[np.ndarray, " samples"],
         paths: Float[np.ndarray, "systems samples n_states"],
         cycle: Cycle,
+        states: Sequence[str],
     ) -> Float[np.ndarray, "systems 2"]:
         """Error and waveform of every system over one stretch, transients left out."""
-        half = len(t) // 2
+        half, columns = len(t) // 2, columns_of(states, self.judged)
+        ours = replace(cycle, mean=cycle.mean[columns], harmonics=cycle.harmonics[:, columns])
         found = np.full((len(paths), 2), [MAX_ERROR, np.inf])
         for row, path in zip(found, paths, strict=True):
             if np.isfinite(path).all():
-                likeness = against_cycle(cycle, t[half:], path[half:])
+                likeness = against_cycle(ours, t[half:], path[half:, columns])
                 error = deviation(*likeness, self.bounds)
                 if not np.isnan(error):
                     row[:] = min(error, MAX_ERROR), likeness[2].max()
@@ -200,15 +220,23 @@ class FreeRunScore:
         living.sort(key=lambda k: self._rank(trials[k]))
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
-        found = []
+        found, resting = [], None
         for place, k in enumerate((living or by_error)[: self.n_confirmed]):
             model = trials[k].system.refined_on_all(
-                records.runs, window=window, n_reweights=0, seed=self.seed
+                records.runs,
+                window=window,
+                n_windows=max(LEAST_WINDOWS, self.n_windows),
+                n_reweights=0,
+                seed=self.seed,
             )
             run = self._confirmed(model, records, cycles)
-            attracts = run.verdict is Verdict.LIVES and _attracts(run, cycles)
-            found.append((not attracts, list(Verdict).index(run.verdict), place, k, run))
-            if attracts:
+            lives = run.verdict is Verdict.LIVES
+            attracts = lives and _attracts(run, cycles)
+            pulls = attracts and (resting is None or trials[k].loss < GAIN * resting)
+            if lives and not attracts and resting is None:
+                resting = trials[k].loss
+            found.append((not pulls, list(Verdict).index(run.verdict), place, k, run))
+            if pulls:
                 break
         rests, _, _, winner, run = min(found, key=lambda each: each[:3])
         how = str(run.verdict)
@@ -225,15 +253,15 @@ class FreeRunScore:
         pairs = zip(records.runs, cycles, strict=True)
         run, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
-        return free_run(model, run, initial=start, bounds=self.bounds)
+        return free_run(model, run, initial=start, bounds=self.bounds, judged=self.judged)
 
 
-def _cycles(records: Records) -> list[Cycle] | str:
+def _cycles(records: Records, states: Sequence[str]) -> list[Cycle] | str:
     """The cycle of every record, or what stands against there being one."""
     found = []
     for run in records.runs:
         # Samples as they are: a waveform of all periods averages noise, smoothing clips peaks.
-        cycle = find_cycle(run.t, run.columns(run.state_names))
+        cycle = find_cycle(run.t, run.columns(states))
         name = f"record {run.label!r}" if run.label else "the record"
         if cycle is None:
             return f"{name} has no period"
@@ -248,8 +276,9 @@ def _paths(
     held: Sequence[Stretch],
     records: Records,
     cycles: Sequence[Cycle],
+    n_starts: int,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, Cycle]]:
-    """Times and paths of every system over every stretch that was held out."""
+    """Times and paths of every system over every stretch that was held out, start by start."""
     joined = np.concatenate(records.smoothed)
     centre, spread = joined.mean(axis=0), joined.std(axis=0)
     for part in held:
@@ -258,8 +287,11 @@ def _paths(
         first, n_samples = part.start, part.stop - part.start
         if not ensemble.inputs:
             n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))
-            start = cycle.waveform(cycle.phase[first : first + 1]).T
-            windows = DrivenWindows.free(start, step_s=run.dt_s, n_samples=n_samples)
+            # Over as many periods, no two at one phase.
+            later = np.arange(n_starts) * (1.0 + 1.0 / n_starts) * per_period
+            starts = np.minimum(first + later.round().astype(np.int64), part.stop - 1)
+            begin = cycle.waveform(cycle.phase[starts]).T
+            windows = DrivenWindows.free(begin, step_s=run.dt_s, n_samples=n_samples)
             t = run.dt_s * np.arange(n_samples)
         else:
             if n_samples < LEAST_RUN * per_period:  # inputs end with the record
@@ -268,7 +300,9 @@ def _paths(
                 run, x, ensemble.states, ensemble.inputs, np.array([first]), n_samples - 1
             )
             t = run.t[first : first + n_samples]
-        yield t, ensemble.paths(windows, centre=centre, spread=spread)[:, 0], cycle
+        paths = ensemble.paths(windows, centre=centre, spread=spread)
+        for k in range(paths.shape[1]):
+            yield t, paths[:, k], cycle
 
 
 def _attracts(run: FreeRun, cycles: Sequence[Cycle]) -> bool:

@@ -38,20 +38,22 @@ class System:
         runs: Sequence[Trajectory],
         *,
         window: int | None = None,
+        n_windows: int = 30,
         n_reweights: int = 1,
         seed: int = 0,
     ) -> SparseModel:
         """Refined on windows spread over all the data, with the covariance of its coefficients.
 
-        window: None takes one and a half periods. n_reweights, and seed for its rng, as for
-        `refine`. A system without terms, or one whose refinement does not stay finite, comes back
-        as it is, without covariance.
+        window: None takes one and a half periods. n_windows, n_reweights, and seed for its rng,
+        as for `refine`. A system without terms, or one whose refinement does not stay finite,
+        comes back as it is, without covariance.
         """
         if not len(self.constraint.free):
             return self.model
         found = refine(
             self.model,
             runs,
+            n_windows=n_windows,
             window=window,
             constraint=self.constraint,
             n_reweights=n_reweights,
