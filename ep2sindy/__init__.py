@@ -110,11 +110,19 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.selection.rule import selected as selected
     from ep2sindy.signals.attractor import Cycle as Cycle
     from ep2sindy.signals.attractor import find_cycle as find_cycle
+    from ep2sindy.signals.embedding import Delays as Delays
+    from ep2sindy.signals.embedding import Embedded as Embedded
+    from ep2sindy.signals.embedding import LogRate as LogRate
+    from ep2sindy.signals.embedding import Rate as Rate
+    from ep2sindy.signals.embedding import embed as embed
     from ep2sindy.signals.kalman import KalmanSmoother as KalmanSmoother
+    from ep2sindy.signals.log_smoother import LogSmoother as LogSmoother
     from ep2sindy.signals.smoothers import NoSmoothing as NoSmoothing
     from ep2sindy.signals.smoothers import SavitzkyGolay as SavitzkyGolay
     from ep2sindy.signals.spectrum import dominant_frequency as dominant_frequency
     from ep2sindy.signals.spectrum import power_spectrum as power_spectrum
+    from ep2sindy.signals.trace import Trace as Trace
+    from ep2sindy.signals.trace import trace as trace
     from ep2sindy.studies.parametric.points import Refining as Refining
     from ep2sindy.studies.parametric.quantities import Quantity as Quantity
     from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap as TimeBootstrap
@@ -223,9 +231,12 @@ _FACE = {
     "selection.resampled": "Stability CrossValidation",
     "selection.rule": "selected",
     "signals.attractor": "Cycle find_cycle",
+    "signals.embedding": "LogRate Rate Delays Embedded embed",
     "signals.kalman": "KalmanSmoother",
+    "signals.log_smoother": "LogSmoother",
     "signals.smoothers": "SavitzkyGolay NoSmoothing",
     "signals.spectrum": "power_spectrum dominant_frequency",
+    "signals.trace": "Trace trace",
     "studies.parametric.points": "Refining",
     "studies.parametric.quantities": "Quantity",
     "studies.parametric.time_bootstrap": "TimeBootstrap",

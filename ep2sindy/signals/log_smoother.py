@@ -1,0 +1,208 @@
+"""Smooth a positive signal in its logarithm: noise is additive, growth rates are what is smooth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
+from scipy.linalg import cholesky_banded, solveh_banded
+from scipy.optimize import minimize_scalar
+
+from ep2sindy.data.trajectory import check_time, read_only
+
+# Of process to measurement noise, with the mean step as the unit of time and the signal's mean as
+# that of the signal: from a memory of some 30 samples to interpolation.
+LOG10_RATIO_MIN, LOG10_RATIO_MAX = -9.0, 8.0
+
+LOG10_RATIO_TOLERANCE = 0.05  # below what data can tell
+
+MIN_SAMPLES = 8
+
+MAX_ITER, TOLERANCE = 50, 1e-9
+
+ROUNDING = 1e-24  # of samples of order one, squared: less noise cannot be told apart
+
+FLOOR = 1e-3  # of the signal's mean: where the logarithm of a sample begins at least
+
+
+@dataclass(frozen=True, eq=False)
+class LogEstimate:
+    """What is left of a positive signal without its noise.
+
+    log: natural logarithm of the smoothed signal, its unit left out; rate: derivative of that, in
+    1/s. noise_std: of the white noise in the samples, in their unit. log10_ratio: of process to
+    measurement noise.
+    """
+
+    log: Float[np.ndarray, " samples"]
+    rate: Float[np.ndarray, " samples"]
+    noise_std: float
+    log10_ratio: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "log", read_only(self.log))
+        object.__setattr__(self, "rate", read_only(self.rate))
+
+    @property
+    def smoothed(self) -> Float[np.ndarray, " samples"]:
+        return np.exp(self.log)
+
+
+@dataclass(frozen=True)
+class LogSmoother:
+    """A positive signal seen through additive white noise, its logarithm a smooth process.
+
+    The logarithm is a twice integrated Wiener process, as in `KalmanSmoother`, and the samples are
+    its exponential plus noise of one standard deviation. A sample at a trough that is no higher
+    than the noise says little of the logarithm there, and counts as little; it may be zero or
+    negative. The mode of the posterior is found by Gauss and Newton's method; the ratio of process
+    to measurement noise is the most likely one (Laplace's approximation).
+    finest_s: memory of the process, at least, where the signal is at its mean: what is faster
+    counts as noise. None leaves it to the data.
+    Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 3.4.
+    """
+
+    finest_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.finest_s is not None and not self.finest_s > 0.0:
+            raise ValueError(f"finest_s must be a positive time in s: {self.finest_s} came")
+
+    def estimate(
+        self, t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
+    ) -> LogEstimate:
+        """Smooth samples of a signal that is positive but for noise; steps may be unequal.
+
+        Raises ValueError for fewer than eight samples, or a mean that is not positive.
+        """
+        _check(t, x)
+        step_s = (t[-1] - t[0]) / (len(t) - 1)
+        mean = float(x.mean())
+        y, penalty = x / mean, _roughness(t / step_s)
+        ratio, found = _most_likely(y, penalty, ratio_bound(self.finest_s, step_s))
+        log = found.log + np.log(mean)
+        return LogEstimate(
+            log=log,
+            rate=make_interp_spline(t, log, k=5).derivative()(t),
+            noise_std=mean * float(np.sqrt(found.squares / (len(y) - 3))),
+            log10_ratio=ratio,
+        )
+
+
+def ratio_bound(finest_s: float | None, step_s: float) -> float:
+    """The largest log10_ratio under which a process remembers a time or more."""
+    if finest_s is None:
+        return LOG10_RATIO_MAX
+    bound = 6.0 * np.log10(step_s / finest_s)
+    return float(np.clip(bound, LOG10_RATIO_MIN, LOG10_RATIO_MAX))
+
+
+@dataclass(frozen=True, eq=False)
+class _Mode:
+    """log: (samples,); squares: of what is left and of the roughness; misfit: -2 log likelihood."""
+
+    log: np.ndarray
+    squares: float
+    misfit: float
+
+
+def _most_likely(y: np.ndarray, penalty: np.ndarray, highest: float) -> tuple[float, _Mode]:
+    """A grid of decades down from the highest ratio, then a bounded search around the best.
+
+    y: in units of its mean. Each mode is sought from where the last was found.
+    """
+    decades = np.arange(highest, LOG10_RATIO_MIN - 1.0, -1.0)
+    modes, log = [], np.log(np.maximum(y, FLOOR))
+    for decade in decades:
+        modes.append(_mode(y, penalty, decade, log))
+        log = modes[-1].log
+    best = int(np.argmin([mode.misfit for mode in modes]))
+    search = minimize_scalar(
+        lambda ratio: _mode(y, penalty, ratio, modes[best].log).misfit,
+        bounds=(decades[min(best + 1, len(decades) - 1)], decades[max(best - 1, 0)]),
+        method="bounded",
+        options={"xatol": LOG10_RATIO_TOLERANCE},
+    )
+    if search.fun < modes[best].misfit:
+        return float(search.x), _mode(y, penalty, search.x, modes[best].log)
+    return float(decades[best]), modes[best]
+
+
+def _mode(y: np.ndarray, penalty: np.ndarray, log10_ratio: float, log: np.ndarray) -> _Mode:
+    """The most likely logarithm under one ratio, by damped Gauss-Newton steps."""
+    prior = penalty * 10.0**-log10_ratio
+    squares = _squares(y, prior, log)
+    for _ in range(MAX_ITER):
+        value = np.exp(log)
+        curvature = _with_weights(prior, np.square(value))
+        step = solveh_banded(curvature, value * (y - value) - _times(prior, log), lower=True)
+        share = min(1.0, 2.0 / max(np.abs(step).max(), 1e-300))
+        while (tried := _squares(y, prior, log + share * step)) > squares and share > 1e-6:
+            share *= 0.5
+        if tried > squares:
+            break
+        log, gained, squares = log + share * step, squares - tried, tried
+        if gained <= TOLERANCE * squares:
+            break
+    factor = cholesky_banded(_with_weights(prior, np.exp(2.0 * log)), lower=True)
+    n = len(y) - 3
+    squares = max(squares, n * ROUNDING)
+    misfit = n * np.log(squares) + 2.0 * np.log(factor[0]).sum() + n * np.log(10.0) * log10_ratio
+    return _Mode(log, squares, float(misfit))
+
+
+def _squares(y: np.ndarray, prior: np.ndarray, log: np.ndarray) -> float:
+    with np.errstate(over="ignore"):  # a step too far: it is halved
+        return float(np.square(y - np.exp(log)).sum() + log @ _times(prior, log))
+
+
+def _roughness(t: np.ndarray) -> np.ndarray:
+    """Integral of the squared third derivative as a matrix of the samples: its lower diagonals.
+
+    t: (samples,) in mean steps. From divided differences, each over a third of its four samples'
+    span. Returns (4, samples).
+    """
+    n = len(t)
+    four = np.stack([t[k : n - 3 + k] for k in range(4)])
+    weights = np.empty((4, n - 3))
+    for k in range(4):
+        others = np.delete(four, k, axis=0)
+        weights[k] = 6.0 / np.prod(four[k] - others, axis=0)
+    weights *= np.sqrt((four[3] - four[0]) / 3.0)
+    diagonals = np.zeros((4, n))
+    for lower in range(4):
+        for k in range(4 - lower):
+            diagonals[lower, k : n - 3 + k] += weights[k] * weights[k + lower]
+    return diagonals
+
+
+def _with_weights(diagonals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The matrix with weights added to its diagonal."""
+    found = diagonals.copy()
+    found[0] += weights
+    return found
+
+
+def _times(diagonals: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A symmetric banded matrix times a vector."""
+    product = diagonals[0] * x
+    for k in range(1, len(diagonals)):
+        product[k:] += diagonals[k, :-k] * x[:-k]
+        product[:-k] += diagonals[k, :-k] * x[k:]
+    return product
+
+
+def _check(t: np.ndarray, x: np.ndarray) -> None:
+    if len(t) < MIN_SAMPLES or len(x) != len(t):
+        raise ValueError(
+            f"smoothing needs {MIN_SAMPLES} samples or more, one per time: {len(x)} came with "
+            f"{len(t)} times; join more data"
+        )
+    check_time(t)
+    if not x.mean() > 0.0:
+        raise ValueError(
+            f"a signal must be positive for its logarithm to be taken: its mean is {x.mean():.3g}; "
+            "take its derivative instead (ep.Rate)"
+        )

@@ -1,0 +1,165 @@
+"""One measured signal, checked and made ready: does it oscillate, and how finely is it sampled?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
+from ep2sindy.signals.spectrum import dominant_frequency
+
+LEAST_PERIODS = 6.0  # of a record: what a free run is judged on
+
+# Samples to a period that say all of a breathing mode; more cost time, and follow the noise.
+ENOUGH_SAMPLES = 100
+
+DRIFT = 1.0  # of a standard deviation over the record: more is said
+
+# Of the signal's standard deviation: what the waveform's must be. In white noise, too, a line can
+# be followed that has some.
+LEAST_VISIBLE = 0.5
+
+# A sample may lie below zero by so many standard deviations of the noise, and so many samples may,
+# where the signal is positive but for noise.
+NOISE_BELOW, SHARE_BELOW = 6.0, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """A signal that oscillates, at six periods or more.
+
+    x: (samples,) in `unit`. done: what was done to the samples, in words; advice: what might be.
+    """
+
+    t: Float[np.ndarray, " samples"]
+    x: Float[np.ndarray, " samples"]
+    name: str
+    unit: str
+    cycle: Cycle
+    done: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "t", read_only(self.t))
+        object.__setattr__(self, "x", read_only(self.x))
+
+    @property
+    def period_s(self) -> float:
+        return 1.0 / self.cycle.frequency_Hz
+
+    @property
+    def is_positive(self) -> bool:
+        return is_positive(self.t, self.x)
+
+
+def trace(
+    run: Trajectory,
+    signal: str | None = None,
+    *,
+    decimate: int | str | None = None,
+    detrend: bool = False,
+) -> Trace:
+    """One variable of a run as a trace.
+
+    signal: None takes the only state. decimate: means over so many samples take their place;
+    "auto" leaves a hundred to a period. detrend: a straight line is taken out: a positive signal
+    is divided by it, another less it, and the mean stays.
+    Raises ValueError for a signal that does not oscillate, under six periods, or a wrong setting.
+    """
+    name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal
+    if name is None:
+        raise ValueError(f"one signal must be named: this run has {list(run.names)}")
+    if not (decimate is None or decimate == "auto" or (type(decimate) is int and decimate >= 1)):
+        raise ValueError(
+            f"decimate must be auto, null or a whole number, one or more: {decimate!r} came"
+        )
+    t, x, done = run.t, run.columns([name])[:, 0], []
+    if detrend:
+        x = _without_line(t, x, name)
+        done.append("a straight line taken out")
+    cycle = _cycle(t, x, name)
+    per_period = len(t) / cycle.n_periods
+    spare = max(1, int(per_period // ENOUGH_SAMPLES))
+    factor = spare if decimate == "auto" else int(decimate or 1)
+    if factor > 1:
+        t, x = _means(t, factor), _means(x, factor)
+        cycle = _cycle(t, x, name)
+        done.append(
+            f"means over {factor} samples: {len(t)} are left, {per_period / factor:.0f} to a period"
+        )
+    advice = [] if factor > 1 or spare < 2 else [
+        f"{per_period:.0f} samples to a period are more than the dynamics need: decimate={spare}, "
+        "or decimate=auto, takes means over them, and costs less"
+    ]  # fmt: skip
+    drift = _drift(t, x)
+    if abs(drift) > DRIFT and not detrend:
+        advice.append(
+            f"{name} drifts by {drift:.1f} standard deviations over the record: detrend=true takes "
+            "a straight line out"
+        )
+    return Trace(t, x, name, run.units[name], cycle, tuple(done), tuple(advice))
+
+
+def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> bool:
+    """Whether a signal is above zero at all times, but for white noise in its samples."""
+    lowest = float(x.min())
+    if lowest > 0.0:
+        return True
+    noise = float(np.sqrt(white_variance(t, x)))
+    explained = noise > 1e-3 * x.std() and lowest > -NOISE_BELOW * noise
+    return bool(explained and x.mean() > 0.0 and (x <= 0.0).mean() <= SHARE_BELOW)
+
+
+def _cycle(t: np.ndarray, x: np.ndarray, name: str) -> Cycle:
+    """The cycle of a signal that has one, over six periods or more."""
+    cycle = find_cycle(t, x[:, None])
+    if cycle is not None and cycle.std[0] < LEAST_VISIBLE * x.std():
+        cycle = None
+    duration_s = float(t[-1] - t[0])
+    rough = dominant_frequency(t, x) * duration_s if np.ptp(x) > 0.0 else 0.0
+    n_periods = rough if cycle is None else cycle.n_periods
+    remedy = "; or take out its drift (detrend=true)" if abs(_drift(t, x)) > DRIFT else ""
+    if 0.5 < n_periods < LEAST_PERIODS:
+        doubt = " if it oscillates at all" if cycle is None else ""
+        raise ValueError(
+            f"a trace must hold {LEAST_PERIODS:g} periods or more: {name} holds about "
+            f"{n_periods:.1f} in {duration_s:.4g} s{doubt}; record longer, or crop less{remedy}"
+        )
+    if cycle is None:
+        raise ValueError(
+            f"a trace must oscillate: no period explains a quarter of the variance of {name} over "
+            f"its {duration_s:.4g} s (strongest line: {rough / duration_s:.4g} Hz); crop "
+            f"transients, prepare it with ep2sindy.low_pass, or take another signal{remedy}"
+        )
+    return cycle
+
+
+def _means(values: np.ndarray, factor: int) -> np.ndarray:
+    """Over `factor` samples each; what is left over at the end is dropped."""
+    n = len(values) // factor
+    return values[: n * factor].reshape(n, factor).mean(axis=1)
+
+
+def _line(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return np.polynomial.Polynomial.fit(t, x, 1)(t)
+
+
+def _drift(t: np.ndarray, x: np.ndarray) -> float:
+    """Rise of the straight line over the record, in standard deviations."""
+    line = _line(t, x)
+    return float((line[-1] - line[0]) / x.std())
+
+
+def _without_line(t: np.ndarray, x: np.ndarray, name: str) -> np.ndarray:
+    line = _line(t, x)
+    if not is_positive(t, x):
+        return x - line + x.mean()
+    if not line.min() > 0.0:
+        raise ValueError(
+            f"a positive signal is divided by the line through it, which must be positive: that of "
+            f"{name} falls to {line.min():.4g}; crop the record, or leave detrend out"
+        )
+    return x * x.mean() / line
