@@ -45,7 +45,8 @@ def front_figure(
         score = f"{_score_label(label)} = {scores[state][index]:.4g}"
         ax.set_title(f"${latex_derivative(state)}$: {_terms(chosen)}\n{score}", fontsize=9)
     entries = {line.get_label(): line for ax in axes for line in ax.lines if _labelled(line)}
-    legend_above(figure, [entries[name] for name in _LAYERS if name in entries], size=9.0)
+    shown = [entries[name] for name in _LAYERS if name in entries]
+    legend_above(figure, shown, n_columns=2 if len(axes) == 1 else None, size=9.0)
     return figure
 
 
