@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.report.run import Run
+from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll, Share
 from ep2sindy.studies.libraries_view import Outcome
 from ep2sindy.studies.library_result import result_of
@@ -74,6 +76,8 @@ class Study:
         opened = self.source.field()
         libraries = {name: case.library(opened) for name, case in self.libraries.items()}
         data = self.source.sampled(opened, libraries.values(), run)
+        if hint := alone(data):
+            run.warn(hint)
         # Each case draws from its own stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         results = {
@@ -91,3 +95,14 @@ class Study:
             for (name, library), rng in zip(libraries.items(), streams, strict=True)
         }
         return Outcome(data, results, self.figures)
+
+
+def alone(data: Trajectory) -> str | None:
+    """What to say where one state without inputs is asked to oscillate; else None."""
+    if len(data.names) > 1 or find_cycle(data.t, data.states) is None:
+        return None
+    (name,) = data.names
+    return (
+        f"{name} oscillates, and one first-order equation cannot: where it rises it never falls "
+        f"again. Name a second state, or let +exp=trace signal={name} make one of the signal"
+    )
