@@ -178,6 +178,7 @@ class Configured:
             if OmegaConf.select(node, place, default=missing) is missing:
                 raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
             OmegaConf.update(node, place, value)
+        OmegaConf.set_struct(node, False)  # a key that it does not take is refused when it is built
         merged: Any = OmegaConf.merge(node, dict(more or {}))
         return Configured(merged, self.place)
 
