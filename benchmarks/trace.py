@@ -1,0 +1,111 @@
+"""Living models from the discharge current alone: clean, and as a scope has it.
+
+    python -m benchmarks.trace
+    python -m benchmarks.trace --seeds 1 --points 300/5
+
+The simulator's current at four operating points, the recipe of +exp=trace; three quarters are
+fitted, the rest is run freely from one sample and compared with the current itself, without noise.
+Noise: white, 2 % of the mean current, then 8 bits over the range. A row per point, record and
+seed, of the noise and of the windows that are drawn: frequency error, amplitude and waveform of
+the current, terms of the searched equation (the known one has one more), Floquet multiplier, share
+of starts that reach the cycle, and of the record's samples as starts.
+"""
+
+import argparse
+import time
+
+import numpy as np
+import pandas as pd
+
+import ep2sindy as ep
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.free_run import Verdict, free_run
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.selection.free_run import FreeRunScore
+from ep2sindy.signals.embedding import embed
+from ep2sindy.signals.trace import trace
+from ep2sindy.studies.living import cycle_of
+
+POINTS = ("300/4", "300/5", "300/6", "400/5")
+NAME, NOISE, BITS = "I_d", 0.02, 8
+N_STARTS, STRIDE = 20, 11  # of the held-out samples, at most phases
+
+
+def current(point: str) -> Trajectory:
+    """The simulator's, as +exp=trace takes it."""
+    voltage, mass_flow = map(float, point.split("/"))
+    field = ep.simulate_cached(
+        ep.Thruster(), ep.OperatingPoint(voltage, mass_flow), cache=".cache/simulations"
+    )
+    return Trajectory(field["time"].values, field[NAME].values[:, None], (NAME,), units={NAME: "A"})
+
+
+def as_measured(run: Trajectory, seed: int) -> Trajectory:
+    """White noise of 2 % of the mean, then steps of an 8-bit scope over the range and a tenth."""
+    x = run.states[:, 0]
+    noisy = x + NOISE * x.mean() * np.random.default_rng(seed).standard_normal(len(x))
+    step = 1.1 * (noisy.max() - min(noisy.min(), 0.0)) / 2**BITS
+    return Trajectory(run.t, (step * np.round(noisy / step))[:, None], (NAME,), units=run.units)
+
+
+def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]:
+    begin = time.process_time()
+    chosen = embed(trace(measured))
+    states = chosen.embedded.run
+    n = round(0.75 * states.n_samples)
+    bounds = ep.Bounds(frequency=0.005, amplitude=0.05)
+    rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
+    recipe = Recipe(
+        search=BestSubset(max_terms=5, n_best=8), bootstraps=Bootstraps(n=0), selection=rule,
+        depth=8,
+    )  # fmt: skip
+    library = polynomial(states.state_names, degree=3)
+    known = {"relations": chosen.embedded.relations, "terms": chosen.embedded.terms}
+    model = discover(states.window(0, n), library, recipe, **known).model
+    seconds = time.process_time() - begin
+    record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
+    held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)
+
+    def run_from(k: int) -> ep.FreeRun:
+        part = held.window(k, held.n_samples)
+        return free_run(model, part, initial=states.states[n + k], judged=(NAME,))
+
+    run = run_from(0)
+    lives = [run_from(STRIDE * k).verdict is Verdict.LIVES for k in range(N_STARTS)]
+    cycle = cycle_of(run)
+    return {
+        "verdict": run.text,
+        "f error, %": 100.0 * run.f_error,
+        "amplitude": run.amplitude_ratio[NAME],
+        "waveform": run.waveform_error[NAME],
+        "terms": len(model.terms("g")),
+        "multiplier": np.nan if cycle is None else abs(cycle.multipliers[1]),
+        "reaching": np.nan if cycle is None else ep.share_reaching(model, cycle),
+        "samples": f"{sum(lives)}/{N_STARTS}",
+        "CPU s": seconds,
+        "g'": ", ".join(model.terms("g")),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="living models from one signal")
+    parser.add_argument("--points", nargs="+", default=POINTS, help="V/mg/s, such as 300/5")
+    parser.add_argument("--seeds", type=int, default=3, help="draws of noise and of windows")
+    arguments = parser.parse_args()
+    rows = []
+    for point in arguments.points:
+        clean = current(point)
+        for seed in range(arguments.seeds):
+            for record, run in {"clean": clean, "scope": as_measured(clean, seed)}.items():
+                found = {"point": point, "record": record, "seed": seed} | row(clean, run, seed)
+                rows.append(found)
+                print(found, flush=True)
+    print(pd.DataFrame(rows).to_string(index=False, float_format=lambda x: f"{x:.3g}"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""A living model from one measured signal: `+exp=trace`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.stability import share_reaching
+from ep2sindy.report.run import Run
+from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
+from ep2sindy.signals.trace import Trace, trace
+from ep2sindy.studies.kinds import Count, Deferred, Positive, Share
+from ep2sindy.studies.living import cycle_of
+from ep2sindy.studies.source import Source
+from ep2sindy.studies.trace_judged import as_measured, fitted_samples
+from ep2sindy.studies.trace_view import Outcome
+
+# Of each equation where none is known, so that their combinations stay few.
+DEPTH_OF_BOTH = 2
+
+
+@dataclass(frozen=True)
+class Study:
+    """Make states of one signal, search the equation that is not known, judge it by free run.
+
+    signal: the variable. unit: of one that the data group does not describe, or instead of what it
+    says; None: as it says, else none. embedding: auto, log_rate, rate or delays; harmonics: of the
+    period that the smoother follows. decimate, detrend: see `trace`. degree: of the library.
+    held_out: the end of the record that the model never sees, and is judged on.
+    """
+
+    source: Source
+    recipe: Recipe
+    signal: str
+    embedding: str
+    harmonics: Positive
+    decimate: int | str | None
+    detrend: bool
+    degree: Count
+    held_out: Share
+    unit: str | None = None
+
+    def __post_init__(self) -> None:
+        embeddings(self.harmonics)
+        if self.embedding not in ("auto", *embeddings(self.harmonics)):
+            raise ValueError(
+                f"embedding must be auto, {' or '.join(embeddings(self.harmonics))}: "
+                f"{self.embedding!r} came"
+            )
+
+    def compute(self, run: Run) -> Outcome:
+        data = self._sampled(run)
+        signal = trace(data, decimate=self.decimate, detrend=self.detrend)
+        for text in signal.done:
+            run.say(f"{signal.name}: {text}")
+        for text in signal.advice:
+            run.warn(text)
+        chosen = self._embedded(signal)
+        states = chosen.embedded.run
+        n_fitted = fitted_samples(signal, states, self.held_out)
+        found = self._found(chosen, states.window(0, n_fitted), run)
+        held = states if n_fitted == states.n_samples else states.window(n_fitted, states.n_samples)
+        return living(signal, chosen, found, states, held, label=self.recipe.selection.label)
+
+    def _sampled(self, run: Run) -> Trajectory:
+        zone = getattr(self.source.trajectory, "zone", None)
+        space = [axis for axis in ("z", "r") if getattr(zone, axis, None) is None]
+        data = only(self.source.data, self.signal, self.unit, without=space)
+        source = replace(self.source, data=data)
+        return source.sampled(source.field(), [], run)
+
+    def _embedded(self, signal: Trace) -> Chosen:
+        known = embeddings(self.harmonics)
+        if self.embedding != "auto":
+            return embed(signal, known[self.embedding])
+        chosen = embed(signal)
+        (fitting,) = (e for e in known.values() if type(e) is type(chosen.embedding))
+        return chosen if fitting == chosen.embedding else replace(
+            embed(signal, fitting), reason=chosen.reason
+        )  # fmt: skip
+
+    def _found(self, chosen: Chosen, states: Trajectory, run: Run) -> Discovery:
+        recipe, rule = self.recipe, self.recipe.selection
+        if hasattr(rule, "judged"):  # what was measured counts, not what is made of it
+            changed: Any = rule
+            recipe = replace(recipe, selection=replace(changed, judged=(self.signal,)))
+        if not chosen.embedded.terms:
+            recipe = replace(recipe, depth=min(recipe.depth, DEPTH_OF_BOTH))
+        return discover(
+            states,
+            polynomial(states.state_names, degree=self.degree),
+            recipe,
+            relations=chosen.embedded.relations,
+            terms=chosen.embedded.terms,
+            seed=run.seed,
+        )
+
+
+def embeddings(harmonics: float) -> dict[str, Embedding]:
+    return {
+        "log_rate": LogRate(harmonics),
+        "rate": Rate(harmonics),
+        "delays": Delays(harmonics=harmonics),
+    }
+
+
+def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str] = ()) -> Deferred:
+    """Data read from a file with this variable alone, whatever else a config expects there.
+
+    without: axes that are not asked for. Data that are not read from a file stay as they are.
+    """
+    variables: Mapping[str, Any] | None = data.settings.get("variables")
+    if variables is None:
+        return data
+    places: dict[str, Any] = {
+        f"variables.{name}.name": None for name in variables if name != signal
+    }
+    places |= {f"{axis}.name": None for axis in without if data.settings.get(axis)}
+    if signal not in variables:
+        new = {"name": signal, "unit": unit or "1", "dims": None}
+        return data.changed(places, {"variables": {signal: new}})
+    if unit is not None:
+        places[f"variables.{signal}.unit"] = unit
+    return data.changed(places)
+
+
+def living(
+    signal: Trace,
+    chosen: Chosen,
+    found: Discovery,
+    states: Trajectory,
+    held: Trajectory,
+    *,
+    label: str,
+) -> Outcome:
+    """The model run freely over the held-out part, against the signal as it was measured."""
+    measured = as_measured(signal, held)
+    run: FreeRun = free_run(found.model, measured, initial=held.states[0], judged=(signal.name,))
+    cycle = cycle_of(run)
+    share = float("nan") if cycle is None else share_reaching(found.model, cycle)
+    return Outcome(signal, chosen, found, states, measured, run, cycle, share, label)

@@ -1,0 +1,128 @@
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.app.runner import run_config
+from tests.programs import composed, computed
+
+# A growth rate that damps towards a cycle, as those found in the discharge current do.
+CYCLE = {"1": 7.93e9, "I": -2.44e9, "I*g": 1.07e4, "g^3": -1.47e-6}
+
+
+def signal(n_periods: float = 40.0) -> tuple[np.ndarray, np.ndarray]:
+    library = ep.polynomial(["I", "g"], degree=3)
+    coef = ep.coef_matrix(library, [{"I*g": 1.0}, CYCLE])
+    model = ep.SparseModel(library, ["I", "g"], coef)
+    t = 1.5e-6 * np.arange(round(54 * (n_periods + 10)))
+    return t[:-540], model.simulate(t, [2.0, 1e5]).states[540:, 0]
+
+
+def scope(path: Path, t: np.ndarray, x: np.ndarray) -> Path:
+    np.savetxt(path, np.column_stack([t, x]), delimiter=",", header="time,I", comments="")
+    return path
+
+
+def toy(path: Path, output: Path, *more: str) -> list[str]:
+    return [
+        "+exp=trace", "data=file", f"data.path={path}", "signal=I", "unit=A", f"output={output}",
+        "search.n_best=2", "search.max_terms=4", "depth=2", "selection.n_starts=2",
+        "selection.n_windows=6", *more,
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal())
+
+
+def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
+    folder = run_config(composed(*toy(record, tmp_path))).folder
+    summary = json.loads((folder / "summary.json").read_text())
+    living = summary["living"]
+    assert living["verdict"] == "lives"
+    assert living["held_out"] is True
+    assert abs(living["f_error"]) < 0.005
+    assert living["amplitude_ratio"] == pytest.approx(1.0, abs=0.03)
+    assert living["waveform_error"] < 0.1
+    assert living["multiplier"] < 0.5
+    assert living["n_terms_known"] == 1
+    assert summary["model"]["equations"]["I"] == {"I*g": 1.0}
+    assert summary["signal"]["embedding"] == "LogRate"
+    assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
+    log = (folder / "run.log").read_text()
+    for words in ("(I is positive)", "known: I' = 1 I g", "attracting", "1 known", "95 %"):
+        assert words in log
+    page = (folder / "report.html").read_text()
+    for name in ("free_run", "plane", "waveform", "front"):
+        assert (folder / "figures" / f"{name}.png").exists()
+        assert f"figures/{name}.png" in page
+
+
+@pytest.mark.parametrize("embedding", ["rate", "delays"])
+def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) -> None:
+    t = 0.12 * np.arange(1500)  # 28 periods
+    run = ep.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
+    path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
+    more = ("search.max_terms=3", "degree=3" if embedding == "rate" else "degree=1")
+    config = composed(*toy(path, tmp_path, f"embedding={embedding}", *more))
+    found = computed(config)
+    assert found.summary["signal"]["reason"] == "set"
+    if embedding == "rate":
+        assert found.summary["model"]["equations"]["I"] == {"v": 1.0}
+        assert set(found.summary["model"]["equations"]["v"]) == {"I", "v", "I^2*v"}
+        assert found.summary["living"]["verdict"] == "lives"
+    else:
+        assert found.summary["living"]["n_terms_known"] == 0
+        assert "I_before" in found.log
+
+
+def test_advice_is_given_and_taken(tmp_path: Path) -> None:
+    t, x = signal(12.0)
+    fine = np.linspace(t[0], t[-1], 4 * len(t))
+    path = scope(tmp_path / "scope.csv", fine, np.interp(fine, t, x))
+    few = ("search.n_best=1", "depth=1", "search.max_terms=1", "selection.n_windows=2")
+    offered = computed(composed(*toy(path, tmp_path, *few, "decimate=null")))
+    assert re.search(r"21\d samples to a period are more .* decimate=2", offered.log)
+    taken = computed(composed(*toy(path, tmp_path, *few, "decimate=auto")))
+    assert "means over 2 samples" in taken.log
+    assert taken.summary["data"]["n_samples"] == len(fine) // 2
+
+
+def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
+    path = scope(tmp_path / "scope.csv", *signal(8.0))
+    found = computed(composed(*toy(path, tmp_path)))
+    assert found.summary["living"]["held_out"] is False
+    assert "too short to hold out" in " ".join(found.log.split())
+
+
+@pytest.mark.parametrize(
+    ("change", "more", "message"),
+    [
+        (lambda t, x: (t[:200], x[:200]), [], "must hold 6 periods or more"),
+        (lambda t, x: (t, np.random.default_rng(0).random(len(t))), [], "must oscillate"),
+        (lambda t, x: (t, x - 1.0), ["embedding=log_rate"], "needs a positive signal: I falls"),
+        (lambda t, x: (t, x), ["embedding=log"], "embedding must be auto, log_rate or rate or"),
+        (lambda t, x: (t, x), ["decimate=0"], "decimate must be auto, null or a whole number"),
+        (lambda t, x: (t, x), ["signal=V"], "has no variable 'V'"),
+    ],
+)
+def test_what_cannot_be_taken_is_refused(change, more, message, tmp_path: Path) -> None:
+    path = scope(tmp_path / "scope.csv", *change(*signal(10.0)))
+    with pytest.raises(ValueError, match=message):
+        computed(composed(*toy(path, tmp_path, *more)))
+
+
+def test_discover_says_that_one_state_cannot_oscillate(record: Path, tmp_path: Path) -> None:
+    config = composed(
+        "+exp=discover", "data=file", f"data.path={record}", "data.z.name=null",
+        "data.variables.n_i.name=null", "data.variables.n_n.name=null",
+        "+data.variables.I.name=I", "+data.variables.I.unit=A", "trajectory.states=[I]",
+        "search=best_subset", f"output={tmp_path}", "bootstraps.n=4",
+    )  # fmt: skip
+    log = computed(config).log.replace("\n", " ")
+    assert "one first-order equation cannot" in log
+    assert "+exp=trace signal=I" in log
