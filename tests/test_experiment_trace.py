@@ -116,6 +116,18 @@ def test_what_cannot_be_taken_is_refused(change, more, message, tmp_path: Path) 
         computed(composed(*toy(path, tmp_path, *more)))
 
 
+def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> None:
+    t, x = signal(12.0)
+    path = scope(tmp_path / "scope.csv", t, x - x.mean())
+    few = ("search.n_best=1", "depth=1", "search.max_terms=1", "selection.n_windows=2")
+    lost = computed(composed(*toy(path, tmp_path, *few)))
+    assert lost.summary["signal"]["embedding"] == "Rate"
+    assert "offset=MEAN gives it back" in " ".join(lost.log.split())
+    given = computed(composed(*toy(path, tmp_path, *few, f"offset={x.mean()}")))
+    assert given.summary["signal"]["embedding"] == "LogRate"
+    assert "offset=MEAN" not in given.log
+
+
 def test_discover_says_that_one_state_cannot_oscillate(record: Path, tmp_path: Path) -> None:
     config = composed(
         "+exp=discover", "data=file", f"data.path={record}", "data.z.name=null",

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.recipe import Recipe
@@ -21,6 +23,8 @@ from ep2sindy.studies.source import Source
 from ep2sindy.studies.trace_judged import as_measured, fitted_samples
 from ep2sindy.studies.trace_view import Outcome
 
+PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
+
 # Of each equation where none is known, so that their combinations stay few.
 DEPTH_OF_BOTH = 2
 
@@ -30,14 +34,16 @@ class Study:
     """Make states of one signal, search the equation that is not known, judge it by free run.
 
     signal: the variable. unit: of one that the data group does not describe, or instead of what it
-    says; None: as it says, else none. embedding: auto, log_rate, rate or delays; harmonics: of the
-    period that the smoother follows. decimate, detrend: see `trace`. degree: of the library.
-    held_out: the end of the record that the model never sees, and is judged on.
+    says; None: as it says, else none. offset: added to the samples, in SI. embedding: auto,
+    log_rate, rate or delays; harmonics: of the period that the smoother follows. decimate,
+    detrend: see `trace`. degree: of the library. held_out: the end of the record that the model
+    never sees, and is judged on.
     """
 
     source: Source
     recipe: Recipe
     signal: str
+    offset: float
     embedding: str
     harmonics: Positive
     decimate: int | str | None
@@ -62,6 +68,8 @@ class Study:
         for text in signal.advice:
             run.warn(text)
         chosen = self._embedded(signal)
+        if type(chosen.embedding) is not LogRate and (hint := lost_mean(signal)):
+            run.warn(hint)
         states = chosen.embedded.run
         n_fitted = fitted_samples(signal, states, self.held_out)
         found = self._found(chosen, states.window(0, n_fitted), run)
@@ -73,7 +81,8 @@ class Study:
         space = [axis for axis in ("z", "r") if getattr(zone, axis, None) is None]
         data = only(self.source.data, self.signal, self.unit, without=space)
         source = replace(self.source, data=data)
-        return source.sampled(source.field(), [], run)
+        sampled = source.sampled(source.field(), [], run)
+        return replace(sampled, states=sampled.states + self.offset)
 
     def _embedded(self, signal: Trace) -> Chosen:
         known = embeddings(self.harmonics)
@@ -108,6 +117,19 @@ def embeddings(harmonics: float) -> dict[str, Embedding]:
         "rate": Rate(harmonics),
         "delays": Delays(harmonics=harmonics),
     }
+
+
+def lost_mean(signal: Trace) -> str | None:
+    """What to say of pulses of one sign about a mean of zero; None of other signals."""
+    away = signal.x - np.median(signal.x)
+    one_way = float(np.mean(away**3) / np.mean(away**2) ** 1.5)
+    if not one_way > PULSES:
+        return None
+    return (
+        f"{signal.name} is pulses that take either sign, as a positive signal does that lost its "
+        f"mean in a capacitor: offset=MEAN gives it back (over {-signal.x.min():.3g}), and the "
+        "growth rate with it, which is simpler"
+    )
 
 
 def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str] = ()) -> Deferred:

@@ -200,8 +200,8 @@ class Outcome:
             "verdict": run.text,
             "frequency of the data": frequency_text(measured.frequency_Hz) if measured else "-",
             "frequency error": _percent(run.f_error),
-            f"amplitude of {name}": f"{_percent(run.amplitude_ratio[name] - 1.0)} off",
-            f"waveform of {name}": f"{places(run.waveform_error[name], 3)} standard deviations off",
+            f"amplitude error of {name}": _percent(run.amplitude_ratio[name] - 1.0),
+            f"waveform error of {name}": f"{places(run.waveform_error[name], 3)} std",
             "terms": f"{self._n_terms(known=False)} searched, {self._n_terms(known=True)} known",
         }
         return pd.DataFrame({"": list(rows), "model": list(rows.values())})
