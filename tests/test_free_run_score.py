@@ -99,6 +99,16 @@ def test_starts_at_other_phases_refuse_what_lives_from_one(found):
         assert (several.scores[state] >= found.scores[state] - 1e-9).all()
 
 
+def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
+    prey = ep.lotka_volterra()
+    how = recipe(max_terms=3, n_best=1, formulation=ep.WeightedWeak())
+    found = ep.discover(
+        prey.trajectory(noise=0.05, rng=3), ep.polynomial(["x", "y"], degree=2), how
+    )
+    for state in ("x", "y"):
+        assert list(found.model.terms(state)) == list(prey.model.terms(state))
+
+
 def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
     dead = ep.discover(record(), LIBRARY, recipe(max_terms=1, n_best=1))
     assert dead.note.endswith("; none of 4 systems live where not fitted")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -19,31 +19,25 @@ from ep2sindy.model.free_run import (
     deviation,
     free_run,
 )
-from ep2sindy.model.many import DrivenWindows, Ensemble
+from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.refinement.many import refine_together
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, joint_scores
-from ep2sindy.selection.folds import Fold, Stretch, folds_of
+from ep2sindy.selection.folds import Fold, folds_of
 from ep2sindy.selection.integral import Records, records_of
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import FLOOR, Decision
 from ep2sindy.selection.systems import System, budget, system_of
-from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.selection.trial_runs import cycles_of, paths_over
+from ep2sindy.signals.attractor import Cycle
 
 LEAST_WINDOWS = 30  # that the winner is refined on
 
 # Share of the window loss of a smaller system on a neutral cycle that one on a cycle that attracts
 # must come below: where noise is all that is left, more terms pull by chance.
 GAIN = 0.95
-
-# Of a record, so that its folds leave windows of two: six, less what noise makes of them.
-LEAST_PERIODS = 5.5
-
-# Periods of a trial run: enough for a transient to die out. A model without inputs runs on where
-# a stretch ends before.
-LEAST_RUN, MOST_RUN = 16.0, 30.0
 
 MAX_ERROR = 10.0  # of a system that dies, diverges or cannot be refined
 
@@ -74,12 +68,13 @@ class FreeRunScore:
     refined on windows of `window_periods` in all folds but one, and run from where the data's
     cycle is when what was held out begins (noise in a sample is not the model's), in turn for
     every fold. It lives if frequency, amplitudes and waveform keep within `bounds` of the data's
-    cycle each time. Of those that live with room to spare the smallest, by waveform among equals, is refined on
-    windows of all data and run over the longest record; it wins if it lives there too, on a cycle
-    that attracts. Where none attracts, one on a neutral cycle may win; where none lives, the one
-    that deviates least does; the note says so. Neither R2 nor the loss of the windows decides:
-    they are blind to where a trajectory ends. Only where the samples are followed to rounding,
-    the truth being in the library, the systems that do so compete alone.
+    cycle each time. Of those that live with room to spare the smallest, by waveform among equals,
+    is refined on windows of all data and run over the longest record; it wins if it lives there
+    too, on a cycle that attracts. One on a neutral cycle wins where no larger one attracts that
+    follows its windows better; where none lives, the one that deviates least does; the note says
+    so. Neither R2 nor the loss of the windows decides what lives: they are blind to where a
+    trajectory ends. Only where the samples are followed to rounding, the truth being in the
+    library, the systems that do so compete alone.
 
     Where a record has no period, or fewer than six, there is no cycle to keep to: RefinedScore
     decides. score = the largest deviation from the cycle, in units of its bound; at most 10.
@@ -122,7 +117,7 @@ class FreeRunScore:
         max_combinations, or relations that no combination has the terms for.
         """
         records = records_of(fronts)
-        cycles = _cycles(records, [front.equation for front in fronts])
+        cycles = cycles_of(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
             found = RefinedScore(max_combinations=self.max_combinations).decide(fronts, relations)
             return replace(found, note=f"{cycles}: chosen by windows held out instead")
@@ -186,7 +181,7 @@ class FreeRunScore:
         ensemble = Ensemble(first.library, first.states, coef)
         judged = [
             self._judged(t, paths, cycle, first.states)
-            for t, paths, cycle in _paths(ensemble, fold.held, records, cycles, self.n_starts)
+            for t, paths, cycle in paths_over(ensemble, fold.held, records, cycles, self.n_starts)
         ]
         return np.column_stack([np.max(judged, axis=0), refined.loss])
 
@@ -254,55 +249,6 @@ class FreeRunScore:
         run, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
         return free_run(model, run, initial=start, bounds=self.bounds, judged=self.judged)
-
-
-def _cycles(records: Records, states: Sequence[str]) -> list[Cycle] | str:
-    """The cycle of every record, or what stands against there being one."""
-    found = []
-    for run in records.runs:
-        # Samples as they are: a waveform of all periods averages noise, smoothing clips peaks.
-        cycle = find_cycle(run.t, run.columns(states))
-        name = f"record {run.label!r}" if run.label else "the record"
-        if cycle is None:
-            return f"{name} has no period"
-        if cycle.n_periods < LEAST_PERIODS:
-            return f"{name} holds {cycle.n_periods:.1f} periods, not six"
-        found.append(cycle)
-    return found
-
-
-def _paths(
-    ensemble: Ensemble,
-    held: Sequence[Stretch],
-    records: Records,
-    cycles: Sequence[Cycle],
-    n_starts: int,
-) -> Iterator[tuple[np.ndarray, np.ndarray, Cycle]]:
-    """Times and paths of every system over every stretch that was held out, start by start."""
-    joined = np.concatenate(records.smoothed)
-    centre, spread = joined.mean(axis=0), joined.std(axis=0)
-    for part in held:
-        run, x, cycle = records.runs[part.run], records.smoothed[part.run], cycles[part.run]
-        per_period = 1.0 / (cycle.frequency_Hz * run.dt_s)
-        first, n_samples = part.start, part.stop - part.start
-        if not ensemble.inputs:
-            n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))
-            # Over as many periods, no two at one phase.
-            later = np.arange(n_starts) * (1.0 + 1.0 / n_starts) * per_period
-            starts = np.minimum(first + later.round().astype(np.int64), part.stop - 1)
-            begin = cycle.waveform(cycle.phase[starts]).T
-            windows = DrivenWindows.free(begin, step_s=run.dt_s, n_samples=n_samples)
-            t = run.dt_s * np.arange(n_samples)
-        else:
-            if n_samples < LEAST_RUN * per_period:  # inputs end with the record
-                first, n_samples = 0, run.n_samples
-            windows = DrivenWindows.of(
-                run, x, ensemble.states, ensemble.inputs, np.array([first]), n_samples - 1
-            )
-            t = run.t[first : first + n_samples]
-        paths = ensemble.paths(windows, centre=centre, spread=spread)
-        for k in range(paths.shape[1]):
-            yield t, paths[:, k], cycle
 
 
 def _attracts(run: FreeRun, cycles: Sequence[Cycle]) -> bool:
