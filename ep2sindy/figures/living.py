@@ -13,6 +13,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.curves import time_unit
 from ep2sindy.figures.frames import framing
 from ep2sindy.figures.style import COLOURS, DATA, GREY, axis_label, legend_above, panel_grid
+from ep2sindy.model.free_run import LONG
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
 
@@ -88,7 +89,7 @@ def cycle_figure(
 
 
 def has_waveform(run: Trajectory, rollout: Rollout) -> bool:
-    """Whether both the data and the second half of the model's run have a period."""
+    """Whether both the data and the model's run have a period."""
     return _waveforms(run, rollout) is not None
 
 
@@ -118,10 +119,11 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
 
 
 def _waveforms(run: Trajectory, rollout: Rollout) -> tuple[Cycle, Cycle] | None:
-    """Of the data, and of the second half of the model's run, where transients are over."""
-    data, half = find_cycle(run.t, run.states), len(rollout.t) // 2
+    """Of the data, and of the model's run where transients are over, if it is long."""
+    data = find_cycle(run.t, run.states)
     if data is None:
         return None
+    half = len(rollout.t) // 2 if data.n_periods >= LONG else 0
     late = rollout.states[half:, [rollout.state_names.index(name) for name in run.state_names]]
     model = find_cycle(rollout.t[half:], late, n_harmonics=len(data.harmonics))
     return None if model is None else (data, model)
