@@ -76,6 +76,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.refinement.refine import refine_many as refine_many
     from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson
     from ep2sindy.refinement.steps import RungeKutta as RungeKutta
+    from ep2sindy.refinement.tied import TiedRefinement as TiedRefinement
+    from ep2sindy.refinement.tied import refine_tied as refine_tied
     from ep2sindy.refinement.windows import WindowBatch as WindowBatch
     from ep2sindy.refinement.windows import cut_windows as cut_windows
     from ep2sindy.regression.differential import Differential as Differential
@@ -212,6 +214,7 @@ _FACE = {
     "refinement.ode": "ODE",
     "refinement.refine": "Refinement refine refine_many loss_against_window",
     "refinement.steps": "RungeKutta HermiteSimpson",
+    "refinement.tied": "TiedRefinement refine_tied",
     "refinement.windows": "WindowBatch cut_windows",
     "regression.differential": "Differential",
     "regression.rows": "Regression",

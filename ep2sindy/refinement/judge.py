@@ -118,10 +118,10 @@ def rollout(problem: Problem, fit: Fit, *, n_substeps: int = 4) -> np.ndarray:
     return path.permute(1, 3, 0, 2).cpu().numpy()
 
 
-def step_bias(problem: Problem, fit: Fit, maps: np.ndarray) -> np.ndarray:
-    """Change of the scalings, (points, free), that the error of the time step causes.
+def step_triangles(problem: Problem, fit: Fit, maps: np.ndarray) -> np.ndarray:
+    """Condensed residuals by scaling, with the error of the time step in the defects' place.
 
-    The error of each step, against two steps of half its length, takes the place of the defects.
+    That is the error of each step against two steps of half its length.
     """
     error = fit.step.finer(problem.system, problem.one_step, fit.scaling, fit.nodes) - maps[:, :, 0]
     shifted = maps.copy()
@@ -129,7 +129,12 @@ def step_bias(problem: Problem, fit: Fit, maps: np.ndarray) -> np.ndarray:
     n_start = fit.nodes.shape[-1] if problem.free_start else 0
     window = fit.nodes.shape[2]
     condensed = condense(shifted, fit.nodes, fit.nodes, fit.weights, window, n_start)
-    return least_change(condensed[..., n_start:, n_start:])
+    return condensed[..., n_start:, n_start:]
+
+
+def step_bias(problem: Problem, fit: Fit, maps: np.ndarray) -> np.ndarray:
+    """Change of the scalings, (points, free), that the error of the time step causes."""
+    return least_change(step_triangles(problem, fit, maps))
 
 
 def is_coarse(bias: np.ndarray, covariance: np.ndarray, scaling: np.ndarray) -> bool:

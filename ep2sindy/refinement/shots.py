@@ -52,8 +52,15 @@ def newton_step(
 
 def least_change(triangles: np.ndarray) -> np.ndarray:
     """Scalings that minimise the condensed residuals of all blocks, (points, free), or NaN."""
-    n_points, size = len(triangles), triangles.shape[-1]
-    rows = triangles[..., :-1, :].reshape(n_points, -1, size)
+    return least_squares(triangles[..., :-1, :].reshape(len(triangles), -1, triangles.shape[-1]))
+
+
+def least_squares(rows: np.ndarray) -> np.ndarray:
+    """The minimisers of |A x + b|, (problems, unknowns), of rows [A | b], or NaN.
+
+    Of least norm, where rows leave a direction free.
+    """
+    size = rows.shape[-1]
     joined: np.ndarray = np.linalg.qr(rows, mode="r")  # type: ignore[assignment]
     lost = ~np.isfinite(joined).all(axis=(1, 2))
     joined = np.where(lost[:, None, None], 0.0, joined)
@@ -69,3 +76,22 @@ def largest_defect(maps: np.ndarray, nodes: np.ndarray, block: int) -> np.ndarra
     gaps = np.abs(maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2))
     inside = np.arange(1, nodes.shape[2]) % block != 0
     return gaps[..., inside].max(axis=(1, 2, 3))
+
+
+def step_share(
+    change: np.ndarray,
+    moved: np.ndarray,
+    scaling: np.ndarray,
+    data: np.ndarray,
+    *,
+    limit: float,
+) -> np.ndarray:
+    """Share of a step, (points,), that moves no scaling by more than `limit` of it or of one.
+
+    Nor a node by more than a range of the data.
+    """
+    by_scaling = np.abs(change) / (limit * np.maximum(np.abs(scaling), 1.0))
+    reach = np.ptp(data, axis=(1, 2))
+    by_node = np.abs(moved).max(axis=(1, 2)) / reach
+    largest = np.maximum(by_scaling.max(axis=1, initial=0.0), by_node.max(axis=1))
+    return 1.0 / np.maximum(1.0, largest)

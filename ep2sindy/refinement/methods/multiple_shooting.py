@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ep2sindy.refinement.problem import Fit, Iteration, Problem, residual_weights
-from ep2sindy.refinement.shots import largest_defect, newton_step, step_maps
+from ep2sindy.refinement.shots import largest_defect, newton_step, step_maps, step_share
 from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
 
 
@@ -42,7 +42,7 @@ class MultipleShooting:
             step=self.step,
         )
         window = problem.data.shape[2]
-        for block in self._blocks(window):
+        for block in self.blocks(window):
             tried = self._stage(problem, state, block, tolerance=0.3, max_iter=10)
             state = _kept(state, tried, problem.data)
         for _ in range(problem.n_reweights):
@@ -67,7 +67,8 @@ class MultipleShooting:
             max_iter=self.max_iter,
         )
 
-    def _blocks(self, window: int) -> list[int]:
+    def blocks(self, window: int) -> list[int]:
+        """Of the stages before the whole window, in samples."""
         blocks, size = [], float(self.first_block)
         while size < window:
             blocks.append(round(size))
@@ -101,7 +102,9 @@ class MultipleShooting:
                 if not active.size:
                     break
             defect = largest_defect(maps, nodes[active], block)
-            share = self._share(change, moved, scaling[active], problem.data[active])
+            share = step_share(
+                change, moved, scaling[active], problem.data[active], limit=self.limit
+            )
             scaling[active] += share[:, None] * change
             nodes[active] += share[:, None, None, None] * moved
             size = np.maximum(np.abs(scaling[active]), 1e-3)
@@ -119,16 +122,6 @@ class MultipleShooting:
                     )
                 )
         return replace(state, scaling=scaling, nodes=nodes, finished=finished, finite=finite)
-
-    def _share(
-        self, change: np.ndarray, moved: np.ndarray, scaling: np.ndarray, data: np.ndarray
-    ) -> np.ndarray:
-        """Share of the step that keeps scalings and nodes within their limits, (points,)."""
-        by_scaling = np.abs(change) / (self.limit * np.maximum(np.abs(scaling), 1.0))
-        reach = np.ptp(data, axis=(1, 2))
-        by_node = np.abs(moved).max(axis=(1, 2)) / reach
-        largest = np.maximum(by_scaling.max(axis=1, initial=0.0), by_node.max(axis=1))
-        return 1.0 / np.maximum(1.0, largest)
 
 
 def _kept(before: Fit, after: Fit, data: np.ndarray) -> Fit:
