@@ -38,6 +38,14 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.control_law import control_law as control_law
     from ep2sindy.discovery.discover import Discovery as Discovery
     from ep2sindy.discovery.discover import discover as discover
+    from ep2sindy.discovery.operating_fit import LeftOut as LeftOut
+    from ep2sindy.discovery.operating_fit import OperatingFit as OperatingFit
+    from ep2sindy.discovery.operating_fit import Windows as Windows
+    from ep2sindy.discovery.operating_fit import left_out as left_out
+    from ep2sindy.discovery.operating_fit import operating_fit as operating_fit
+    from ep2sindy.discovery.operating_law import OperatingLaw as OperatingLaw
+    from ep2sindy.discovery.operating_points import OperatingRecord as OperatingRecord
+    from ep2sindy.discovery.operating_points import branches_of as branches_of
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
     from ep2sindy.discovery.pointwise import pointwise as pointwise
     from ep2sindy.discovery.recipe import Recipe as Recipe
@@ -194,6 +202,9 @@ _FACE = {
     "discovery.coefficient_law": "TiedFit tied_fit",
     "discovery.control_law": "ControlLaw control_law",
     "discovery.discover": "Discovery discover",
+    "discovery.operating_fit": "LeftOut OperatingFit Windows left_out operating_fit",
+    "discovery.operating_law": "OperatingLaw",
+    "discovery.operating_points": "OperatingRecord branches_of",
     "discovery.pointwise": "PointSearch pointwise",
     "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",

@@ -37,6 +37,7 @@ HEAVY = {
         "selection.refined",
         "selection.free_run",
         "selection.systems",
+        "discovery.operating_fit",
         "studies.parametric",
     ),
     "hydra": ("app",),
