@@ -19,7 +19,7 @@ from ep2sindy.studies.libraries_view import Outcome
 from ep2sindy.studies.library_result import result_of
 from ep2sindy.studies.living import LivingSearch
 from ep2sindy.studies.shown import Shown
-from ep2sindy.studies.source import Source
+from ep2sindy.studies.source import Source, zone_length_m
 from ep2sindy.studies.term_roles import Compared
 
 
@@ -90,6 +90,7 @@ class Study:
                 self.living,
                 self.held_out,
                 self.compared,
+                zone_length_m(self.source),
                 rng=rng,
             )
             for (name, library), rng in zip(libraries.items(), streams, strict=True)

@@ -48,6 +48,7 @@ def result_of(
     living: LivingSearch | None = None,
     held_out: float = 0.25,
     compared: Compared | None = None,
+    length_m: float | None = None,
     *,
     rng: np.random.Generator,
 ) -> LibraryResult:
@@ -60,7 +61,9 @@ def result_of(
         parts = first_and_last(data, held_out)
         lives = living_model(*parts, library, recipe, living, found.model, rng=rng)
         if compared is not None:
-            roles = term_roles(lives.discovery, data, *parts, compared, living.bounds)
+            roles = term_roles(
+                lives.discovery, data, *parts, compared, living.bounds, length_m=length_m
+            )
     return LibraryResult(
         recipe=recipe,
         discovery=found,

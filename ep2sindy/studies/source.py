@@ -74,6 +74,12 @@ class Source:
         return data
 
 
+def zone_length_m(source: Source) -> float | None:
+    """Of the zone that the trajectory is averaged over, along z; None for the whole axis."""
+    z = getattr(getattr(source.trajectory, "zone", None), "z", None)
+    return None if z is None else float(z[1] - z[0])
+
+
 def say_data(run: Run, data: Trajectory) -> None:
     frequencies = ", ".join(
         f"{name} {frequency_text(dominant_frequency(data.t, column))}"

@@ -21,15 +21,13 @@ from ep2sindy.studies.living import start_of, two_periods
 if TYPE_CHECKING:
     from ep2sindy.refinement.refine import Refinement
 
-LACKING = "the data have not the variables"
-
 
 @dataclass(frozen=True)
 class Compared:
     """What the coefficients of ions and neutrals in a zone are held against.
 
     ions, neutrals: the states. ion_velocity (m/s), ionization_rate (m^3/s): variables of the data;
-    neutral_speed in m/s, None where it is not known. length_m: of the zone.
+    neutral_speed in m/s, None where it is not known.
     """
 
     ions: str
@@ -37,21 +35,22 @@ class Compared:
     ion_velocity: str
     ionization_rate: str
     neutral_speed: float | None
-    length_m: float
 
-    def expected(self, data: Trajectory) -> dict[tuple[str, str], tuple[str, float]]:
+    def expected(
+        self, data: Trajectory, length_m: float | None
+    ) -> dict[tuple[str, str], tuple[str, float]]:
         """(state, term) -> what a balance of the zone has there, in words and in SI.
 
         d n/dt = -u n/L + inflow, and what ionization gives to ions it takes from neutrals.
-        Variables that the data lack are left out.
+        length_m: of the zone, None where it has none. What the data lack is left out.
         """
         found: dict[tuple[str, str], tuple[str, float]] = {}
         product = f"{self.ions}*{self.neutrals}"
-        if self.ion_velocity in data.names:
-            rate = float(data.columns([self.ion_velocity]).mean()) / self.length_m
+        if self.ion_velocity in data.names and length_m is not None:
+            rate = float(data.columns([self.ion_velocity]).mean()) / length_m
             found[self.ions, self.ions] = (f"-mean {self.ion_velocity}/L", -rate)
-        if self.neutral_speed is not None:
-            found[self.neutrals, self.neutrals] = ("-u_n/L", -self.neutral_speed / self.length_m)
+        if self.neutral_speed is not None and length_m is not None:
+            found[self.neutrals, self.neutrals] = ("-u_n/L", -self.neutral_speed / length_m)
         if self.ionization_rate in data.names:
             rate = float(data.columns([self.ionization_rate]).mean())
             found[self.ions, product] = (f"mean {self.ionization_rate}", rate)
@@ -89,9 +88,14 @@ def term_roles(
     held: Trajectory,
     compared: Compared,
     bounds: Bounds,
+    *,
+    length_m: float | None,
 ) -> Roles:
-    """Each term left out in turn, and ionization shared, refined on `train` and run over `held`."""
-    model, expected = found.model, compared.expected(data)
+    """Each term left out in turn, and ionization shared, refined on `train` and run over `held`.
+
+    length_m: of the zone.
+    """
+    model, expected = found.model, compared.expected(data, length_m)
     support = {state: list(model.terms(state)) for state in model.states}
     roles = []
     for state in model.states:
