@@ -4,18 +4,21 @@
 
 The package's own discharge at 250 to 400 V and 4 to 6 mg/s, five by five, 6 ms each after 2 ms of
 warm-up; densities in the downstream zone; six coefficients of the structure below. First how
-smooth the measured frequencies and amplitudes are: interpolated by as many functions themselves.
+smooth the measured frequencies and amplitudes are: interpolated by as many functions themselves. Then a map that reaches to where nothing oscillates,
+and the strong one of two cycles.
 """
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 import ep2sindy as ep
 from ep2sindy.discovery.operating_fit import LeftOut, OperatingFit, left_out, operating_fit
+from ep2sindy.discovery.operating_map import Fate, law_map
 from ep2sindy.discovery.operating_points import (
     OperatingRecord,
     branches_of,
@@ -29,16 +32,38 @@ ZONE = ep.Zone(z=(0.015, 0.025))
 VOLTAGES, FLOWS = (250.0, 287.5, 325.0, 362.5, 400.0), (4.0, 4.5, 5.0, 5.5, 6.0)
 
 
-def recorded(voltage: float, flow: float) -> OperatingRecord:
+LOW, LEAN = (150.0, 175.0, 200.0, 225.0), (2.0, 3.0, 4.0, 5.0)  # at the edge of the quiet
+HIGH = (300.0, 400.0)
+TWO_CYCLES = ep.Thruster(  # conf/thruster/two_cycles.yaml
+    transport=ep.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3)
+)
+
+
+def recorded(
+    voltage: float, flow: float, thruster: ep.Thruster | None = None
+) -> OperatingRecord | None:
+    """None where the simulation does not breathe."""
     field = ep.simulate_cached(
-        ep.Thruster(),
-        ep.OperatingPoint(voltage, flow),
+        thruster or ep.Thruster(),
+        ep.OperatingPoint(float(voltage), float(flow)),
         cache=".cache/simulations",
         duration_s=6e-3,
         progress=False,
     )
+    if field.attrs["status"] != "oscillating":
+        return None
     run = ep.zone_average(field, ZONE, states=["n_i", "n_n"])
     return OperatingRecord.of({"V_D_V": voltage, "mdot_mg_s": flow}, run)
+
+
+def one_branch(records: Sequence[OperatingRecord | None]) -> list[OperatingRecord]:
+    """The stronger cycle; prints what is on the other."""
+    known = [record for record in records if record is not None]
+    branch = branches_of(known)
+    for record, number in zip(known, branch, strict=True):
+        if number:
+            print(f"on another cycle: {point_text(record.parameters)}")
+    return [record for record, number in zip(known, branch, strict=True) if not number]
 
 
 def line(name: str, found: Sequence[LeftOut]) -> str:
@@ -73,21 +98,39 @@ def judged(fit: OperatingFit, degree: int) -> None:
         print(f"  {point_text(each.record.parameters)}: {r.verdict}, f {r.f_error:+.2%}")
 
 
+def mapped(strong: Sequence[OperatingRecord], quiet: Sequence[Mapping[str, float]]) -> None:
+    """Whether a law of all that oscillates says where nothing does."""
+    fit = operating_fit(strong, LIBRARY, STRUCTURE)
+    law, found = fit.tied(fit.functions(2))
+    points = [*quiet, *(record.parameters for record in strong)]
+    right = 0
+    for k, point in enumerate(law_map(law, strong, points)):
+        right += (agrees := (point.fate is Fate.OSCILLATES) == (k >= len(quiet)))
+        if k < len(quiet) or not agrees:
+            state = "quiet" if k < len(quiet) else "oscillates"
+            print(f"  {point_text(point.parameters)}: {state}; the model {point.fate}")
+    print(f"map, {len(strong)} points fitted ({found.status}): right at {right} of {len(points)}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="laws of the operating point, left out in turn")
     parser.add_argument("--degree", type=int, default=2)
     degree = parser.parse_args().degree
-    records = [recorded(*point) for point in product(VOLTAGES, FLOWS)]
-    branch = branches_of(records)
-    for record, number in zip(records, branch, strict=True):
-        if number:
-            print(f"on another cycle: {point_text(record.parameters)}")
-    strong = [record for record, number in zip(records, branch, strict=True) if not number]
     start = time.perf_counter()
-    fit = operating_fit(strong, LIBRARY, STRUCTURE)
-    print(f"{len(strong)} points refined in {time.perf_counter() - start:.0f} s")
-    judged(fit, degree)
+    strong = one_branch([recorded(*point) for point in product(VOLTAGES, FLOWS)])
+    judged(operating_fit(strong, LIBRARY, STRUCTURE), degree)
+    print(f"{time.perf_counter() - start:.0f} s", flush=True)
+    edge = {point: recorded(*point) for point in (*product(LOW, LEAN), *product(HIGH, LEAN[:2]))}
+    breathing = [record for record in edge.values() if record is not None]
+    quiet = [{"V_D_V": v, "mdot_mg_s": m} for (v, m), record in edge.items() if record is None]
+    mapped(one_branch([*strong, *breathing]), quiet)
     print(f"{time.perf_counter() - start:.0f} s in all")
+    print("two cycles, 300 V:")
+    both = [
+        recorded(300.0, flow, TWO_CYCLES) for flow in (4, 4.25, 4.5, 4.75, 5, 5.25, 5.5, 5.75, 6)
+    ]
+    along = [replace(r, parameters={"mdot_mg_s": r.parameters["mdot_mg_s"]}) for r in both if r]
+    judged(operating_fit(one_branch(along), LIBRARY, STRUCTURE), degree)
 
 
 if __name__ == "__main__":

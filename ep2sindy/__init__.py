@@ -44,6 +44,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.operating_fit import left_out as left_out
     from ep2sindy.discovery.operating_fit import operating_fit as operating_fit
     from ep2sindy.discovery.operating_law import OperatingLaw as OperatingLaw
+    from ep2sindy.discovery.operating_map import MapPoint as MapPoint
+    from ep2sindy.discovery.operating_map import law_map as law_map
     from ep2sindy.discovery.operating_points import OperatingRecord as OperatingRecord
     from ep2sindy.discovery.operating_points import branches_of as branches_of
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
@@ -204,6 +206,7 @@ _FACE = {
     "discovery.discover": "Discovery discover",
     "discovery.operating_fit": "LeftOut OperatingFit Windows left_out operating_fit",
     "discovery.operating_law": "OperatingLaw",
+    "discovery.operating_map": "MapPoint law_map",
     "discovery.operating_points": "OperatingRecord branches_of",
     "discovery.pointwise": "PointSearch pointwise",
     "discovery.recipe": "Recipe",

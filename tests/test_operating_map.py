@@ -1,0 +1,117 @@
+"""Where laws say that a cycle begins, and which structure they are told to have."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ep2sindy.discovery.operating_choice import Tried, candidate_structures, chosen, tried
+from ep2sindy.discovery.operating_fit import Windows
+from ep2sindy.discovery.operating_law import OperatingLaw
+from ep2sindy.discovery.operating_map import Fate, eigenvalues, fixed_point, law_map
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
+from tests.test_operating_law import LIBRARY, STATES, STRUCTURE, recorded, records
+
+# Radius r' = r (a - r^2), phase' = 1: a cycle of radius sqrt(a) and period 2 pi where a > 0.
+HOPF = {
+    "x": {"x": 1.0, "y": -1.0, "x^3": -1.0, "x*y^2": -1.0},
+    "y": {"x": 1.0, "y": 1.0, "x^2*y": -1.0, "y^3": -1.0},
+}
+
+
+ONES = np.ones(2)
+
+
+def hopf() -> OperatingLaw:
+    names = list(dict.fromkeys(name for terms in HOPF.values() for name in terms))
+    pairs = tuple((state, term) for state, terms in HOPF.items() for term in terms)
+    coef = np.array([[c, 0.0] for terms in HOPF.values() for c in terms.values()])
+    for k, pair in enumerate(pairs):
+        if pair in (("x", "x"), ("y", "y")):
+            coef[k] = [0.0, 1.0]
+    return OperatingLaw(
+        functions=polynomial(["a"], degree=1),
+        library=named_terms(("x", "y"), names),
+        states=("x", "y"),
+        coefficients=pairs,
+        coef=coef,
+        points=np.array([[0.5], [1.5]]),
+    )
+
+
+def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
+    near = replace(recorded(1.0, 0.0), parameters={"a": 1.0})
+    found = law_map(hopf(), [near], [{"a": a} for a in (-0.5, -0.1, 0.1, 1.0)])
+    assert [p.fate for p in found] == [Fate.RESTS, Fate.RESTS, Fate.OSCILLATES, Fate.OSCILLATES]
+    np.testing.assert_allclose([p.growth_per_s for p in found], [-0.5, -0.1, 0.1, 1.0], atol=1e-6)
+    assert [p.inside for p in found] == [False, False, False, True]
+    for point in found[2:]:
+        assert point.frequency_Hz == pytest.approx(0.5 / np.pi, rel=1e-6)
+        # A departure along the radius decays by exp(-2 a t).
+        expected = np.exp(-4.0 * np.pi * point.parameters["a"])
+        assert point.second == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    assert np.isnan(found[0].frequency_Hz)
+
+
+def test_a_model_that_runs_away_has_no_cycle() -> None:
+    law = hopf()
+    wild = OperatingLaw(
+        functions=law.functions,
+        library=law.library,
+        states=law.states,
+        coefficients=law.coefficients,
+        coef=np.abs(law.coef),
+        points=law.points,
+    )
+    near = replace(recorded(1.0, 0.0), parameters={"a": 1.0})
+    (found,) = law_map(wild, [near], [{"a": 1.0}])
+    assert found.fate is Fate.DIVERGES
+    assert np.isnan(found.relative_amplitude)
+
+
+def test_fixed_points_and_their_eigenvalues_are_exact() -> None:
+    library = polynomial(["x", "y"], degree=2)
+    terms = [{"x": 2.0, "x*y": -1.0}, {"x*y": 1.0, "y": -3.0}]
+    model = SparseModel(library, ("x", "y"), coef_matrix(library, terms))
+    state = fixed_point(model, np.array([2.5, 2.5]), scale=ONES, positive=ONES > 0.0)
+    assert state is not None
+    np.testing.assert_allclose(state, [3.0, 2.0], rtol=1e-8)
+    np.testing.assert_allclose(
+        np.sort_complex(eigenvalues(model, state, scale=ONES)),
+        [-1j * 6**0.5, 1j * 6**0.5],
+        atol=1e-8,
+    )
+    drift = SparseModel(library, ("x", "y"), coef_matrix(library, [{"1": 1.0}, {"1": 1.0}]))
+    assert fixed_point(drift, ONES, scale=ONES, positive=ONES > 0.0) is None
+
+
+def test_the_structure_and_degree_of_a_known_family_are_chosen() -> None:
+    windows = Windows(n_windows=3, periods=1.0)
+    structures = [STRUCTURE, {**STRUCTURE, "y": ["x", "y"]}, {**STRUCTURE, "x": ["x", "y"]}]
+    found = tried(records(), LIBRARY, structures, [1, 2], windows=windows)
+    # Nine points bear six functions; every structure has both degrees.
+    assert [each.degree for each in found] == [1, 2] * 3
+    best = chosen(found)
+    assert best.fit.structure == STRUCTURE
+    assert (best.degree, best.n_numbers) == (1, 12)
+    assert best.errors.max() < 1.0
+
+
+def test_candidates_are_the_best_supports_of_every_size() -> None:
+    found = candidate_structures(records(), polynomial(STATES, degree=3), max_terms=3)
+    assert len(found) == 4
+    assert {len(each["x"]) for each in found} == {2, 3}
+    assert any(set(each["x"]) == {"x", "y", "x^3"} for each in found)
+
+
+def test_too_few_points_for_every_degree_are_refused() -> None:
+    few = [records()[k] for k in (0, 1, 4)]
+    with pytest.raises(ValueError, match="3 operating points suffice for no law of degree 1"):
+        tried(few, LIBRARY, [STRUCTURE], [1, 2], windows=Windows(3, 1.0))
+
+
+def test_of_equals_the_one_of_fewest_numbers_is_chosen() -> None:
+    found = tried(records(), LIBRARY, [STRUCTURE], [1, 2], windows=Windows(3, 1.0))
+    first, second = found
+    assert chosen([Tried(second.fit, 2, first.found), first]).degree == 1
