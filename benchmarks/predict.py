@@ -4,8 +4,8 @@
 
 The package's own discharge at 250 to 400 V and 4 to 6 mg/s, five by five, 6 ms each after 2 ms of
 warm-up; densities in the downstream zone; six coefficients of the structure below. First how
-smooth the measured frequencies and amplitudes are: interpolated by as many functions themselves. Then a map that reaches to where nothing oscillates,
-and the strong one of two cycles.
+smooth the measured frequencies and amplitudes are: interpolated by as many functions themselves.
+Then a map that reaches to where nothing oscillates, and the strong one of two cycles.
 """
 
 import argparse

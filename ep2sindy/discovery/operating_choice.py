@@ -25,12 +25,15 @@ from ep2sindy.machine.parallel import Serial, Workers
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.searches import BestSubset
 
+CLOSE = 0.05  # of its bound: a deviation that is no reason for another term
+
 
 @dataclass(frozen=True, eq=False)
 class Tried:
     """A structure with laws of one degree, weighted by information, at points left out.
 
-    error: by record, the largest deviation from its cycle in units of its bound, ten at most.
+    errors: by record, the largest deviation from its cycle in units of its bound, ten at most, and
+    no less than a twentieth: what is closer buys no term.
     """
 
     fit: OperatingFit
@@ -43,7 +46,7 @@ class Tried:
 
     @property
     def errors(self) -> np.ndarray:
-        return np.array([each.error for each in self.found])
+        return np.maximum([each.error for each in self.found], CLOSE)
 
 
 def candidate_structures(
