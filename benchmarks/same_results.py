@@ -57,6 +57,12 @@ TOYS: dict[str, list[str]] = {
         "points=[{{V_D_V: 200.0, mdot_mg_s: 5.0}},{{V_D_V: 300.0, mdot_mg_s: 5.0}},"
         "{{V_D_V: 300.0, mdot_mg_s: 2.0, data: {{operating_point: {{neutral_speed: 190.0}}}}}}]",
     ],
+    "predict": [
+        "+exp=predict", "data.cache={cache}", "data.duration_s=2.0e-3", "data.warm_up_s=1.0e-3",
+        "data.n_cells=30", "parallel=serial", "degrees=[1]", "windows.n_windows=4",
+        "windows.periods=1.0", "map_points=3",
+        "points=[{{V_D_V: [280.0, 300.0, 320.0], mdot_mg_s: [5.0, 5.5]}}]",
+    ],
     "pointwise": [
         "+exp=pointwise", *ON_FILE, GRID, "data.r.name=r", "data.variables.u_ir.name=u_ir",
         "keep={cache}/kept", "parallel=serial", "bootstraps.n=6", "block_points=5", "max_regimes=3",

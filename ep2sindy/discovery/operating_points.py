@@ -91,6 +91,10 @@ def check_records(records: Sequence[OperatingRecord]) -> None:
             raise ValueError(
                 f"every operating point must have {names}: {dict(record.parameters)} came"
             )
+    if len(records) == 1:
+        raise ValueError(
+            f"one operating point, {point_text(records[0].parameters)}, has no law: add points"
+        )
     values = values_of(records)
     for name, column in zip(names, values.T, strict=True):
         if np.ptp(column) == 0.0:

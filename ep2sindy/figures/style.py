@@ -58,6 +58,12 @@ def axis_label(name: str, unit: str) -> str:
     return f"${latex_name(name)}$ ({unit_text(unit)})"
 
 
+def equals_label(label: str, value: float) -> str:
+    """`$V_D$ (V)` at 300 -> `$V_D$ = 300 V`."""
+    symbol, _, unit = label.removesuffix(")").rpartition(" (")
+    return f"{symbol} = {value:g} {unit}" if symbol else f"{label} = {value:g}"
+
+
 def slope_label(name: str, unit: str) -> str:
     """Of the derivative in time; unit: of the variable."""
     return f"${latex_derivative(name)}$ ({unit_text(unit_product([(unit, 1), ('s', -1)]))})"

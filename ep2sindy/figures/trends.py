@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ep2sindy.discovery.control_law import ControlLaw
-from ep2sindy.figures.style import COLOURS, legend_above
+from ep2sindy.figures.style import COLOURS, equals_label, legend_above
 from ep2sindy.library.equations import latex_name
 
 Style = str | tuple[int, tuple[int, ...]]
@@ -78,7 +78,7 @@ def trends_figure(
         row[0].set_ylabel(", ".join(_label(name, labels) for name in panel))
     for column, (along, at) in zip(axes.T, trends, strict=True):
         column[-1].set_xlabel(_label(along, labels))
-        held = ", ".join(_equals(_label(name, labels), value) for name, value in at.items())
+        held = ", ".join(equals_label(_label(name, labels), value) for name, value in at.items())
         column[0].set_title(held, fontsize=10)
     entries = _legend(signs, labels, published=len(published) > 0)
     legend_above(figure, entries, n_columns=5, size=9.0)
@@ -174,12 +174,6 @@ def _ticks(ax: Axes, tables: Sequence[pd.DataFrame], along: str) -> None:
     ax.set_xticks(values, [f"{value:g}" for value in values])
     ax.margins(x=0.08)
     ax.grid(alpha=0.3)
-
-
-def _equals(label: str, value: float) -> str:
-    """`$V_D$ (V)` at 300 -> `$V_D$ = 300 V`."""
-    symbol, _, unit = label.removesuffix(")").rpartition(" (")
-    return f"{symbol} = {value:g} {unit}" if symbol else f"{label} = {value:g}"
 
 
 def _label(name: str, labels: Mapping[str, str]) -> str:

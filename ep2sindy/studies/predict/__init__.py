@@ -1,0 +1,1 @@
+"""Laws of the operating point and what they predict."""

@@ -1,0 +1,121 @@
+import json
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from omegaconf import DictConfig
+
+from ep2sindy.app.runner import run_config
+from ep2sindy.app.schema import study_of
+from ep2sindy.discovery.operating_law import OperatingLaw
+from ep2sindy.studies.predict.branch import map_points
+from ep2sindy.studies.predict.study import Study, expanded
+from tests import programs
+
+POINTS = (
+    "points=[{V_D_V: [280.0, 300.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"
+)
+
+
+def composed(*overrides: str) -> DictConfig:
+    return programs.composed("+exp=predict", *overrides)
+
+
+def toy(output: Path) -> list[str]:
+    """Short, coarse simulations, few windows and a small map."""
+    return [
+        f"output={output}", f"data.cache={output / 'cache'}", "data.duration_s=2.0e-3",
+        "data.warm_up_s=1.0e-3", "data.n_cells=30", "parallel=serial", "degrees=[1]",
+        "windows.n_windows=4", "windows.periods=1.0", "map_points=3",
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs")), POINTS)).folder
+
+
+def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
+    summary = json.loads((folder / "summary.json").read_text())
+    (name,) = summary["branches"]
+    branch = summary["branches"][name]
+    assert branch["structure"] == {"n_i": ["n_i", "n_n", "n_i*n_n"], "n_n": ["1", "n_i", "n_n"]}
+    assert branch["degree"] == 1
+    assert branch["left_out"]["n"] == 6
+    quiet = [p for p in summary["points"] if p["status"] != "oscillating"]
+    assert [(p["V_D_V"], p["mdot_mg_s"]) for p in quiet] == [(150.0, 2.0)]
+    assert summary["oscillating_or_not"]["points"] == 7
+    tables = {path.stem: pd.read_csv(path) for path in (folder / "tables").glob("*.csv")}
+    assert len(tables["laws"]) == 18
+    assert len(tables["left_out"]) == 6
+    assert len(tables["map"]) == 9
+    assert len(tables["coefficients"]) == 36
+    assert {p.stem for p in (folder / "figures").glob("*.png")} == {
+        "left_out", f"laws_{name}", f"map_{name}",
+    }  # fmt: skip
+    page = (folder / "report.html").read_text()
+    assert "Points left out" in page
+    assert "6 coefficients of 3 functions each, 18 numbers, from 6 records" in page
+
+
+def test_the_law_of_a_run_gives_models_in_python(folder: Path) -> None:
+    (path,) = folder.glob("law_*.json")
+    law = OperatingLaw.load(path)
+    assert law.parameters == ("V_D_V", "mdot_mg_s")
+    model = law.model_at({"V_D_V": 310.0, "mdot_mg_s": 5.2})
+    assert set(model.terms("n_i")) == {"n_i", "n_n", "n_i*n_n"}
+    with pytest.raises(ValueError, match="outside the points"):
+        law.model_at({"V_D_V": 150.0, "mdot_mg_s": 2.0})
+
+
+def test_ranges_of_points_are_every_combination_once() -> None:
+    blocks = [{"a": [1.0, 2.0], "b": [3.0, 4.0]}, {"a": 2.0, "b": [4.0, 5.0]}]
+    found = expanded(blocks, ["a", "b"])
+    assert [(p["a"], p["b"]) for p in found] == [(1, 3), (1, 4), (2, 3), (2, 4), (2, 5)]
+    (own,) = expanded([{"a": 1.0, "data": {"path": "a.nc"}}], ["a"])
+    assert own == {"a": 1.0, "data": {"path": "a.nc"}}
+
+
+def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
+    corners = [{"a": 0.0, "b": 2.0}, {"a": 1.0, "b": 4.0}]
+    grid = map_points(corners, 3)
+    assert grid[0] == corners[0]
+    assert grid[-1] == corners[1]
+    assert len(grid) == 9
+    assert map_points([{"a": 0.0, "b": 1.0, "c": 2.0}], 3) == []
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["model.n_i=[n_i,u_iz]"], "a law's model runs freely, on its states ['n_i', 'n_n'] alone"),
+        (["model.n_n=[]"], "model must list the terms of every state"),
+        (["points=[{V_D_V: [250, 300]}]"], "a point must have ['V_D_V', 'mdot_mg_s']"),
+        (["points=[]"], "points must be a list like [{V_D_V: [250,300]"),
+        (["parameters.V_D_V=operating_point.volts"], "parameters must name numbers of the data"),
+        (["degrees=[]"], "degrees must be a list such as [a,b]"),
+        (["windows.n_windows=0"], "windows.n_windows must be a whole number, one or more"),
+        (["map_points=0"], "map_points must be a whole number, one or more"),
+    ],
+)
+def test_settings_that_cannot_work_cost_no_simulation(overrides: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        study_of(Study, composed(*overrides))
+
+
+def test_points_that_are_quiet_have_no_law(tmp_path: Path) -> None:
+    quiet = "points=[{V_D_V: 150.0, mdot_mg_s: [2.0, 3.0]}]"
+    with pytest.raises(ValueError, match="operating points that oscillate: none of these does"):
+        programs.computed(composed(*toy(tmp_path), quiet))
+
+
+def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(tmp_path: Path) -> None:
+    settings = ["model=null", "structures.max_terms=3", "map_points=1"]
+    found = programs.computed(composed(*toy(tmp_path), POINTS, *settings))
+    (branch,) = found.outcome.branches.values()
+    assert len(branch.trials) == 4
+    assert {each.fit.n_coefs for each in branch.trials} == {4, 5, 6}
+    table = found.outcome.tables()["structures"]
+    assert table["chosen"].sum() == 1
+    assert "Structure and order" in found.log
