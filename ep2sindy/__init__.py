@@ -55,6 +55,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.regimes import regimes as regimes
     from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
     from ep2sindy.discovery.shared_support import discover_jointly as discover_jointly
+    from ep2sindy.estimation.estimate import Estimate as Estimate
+    from ep2sindy.estimation.estimate import estimate as estimate
+    from ep2sindy.estimation.joint import Joint as Joint
     from ep2sindy.library.equations import equation_text as equation_text
     from ep2sindy.library.library import Library as Library
     from ep2sindy.library.library import named_terms as named_terms
@@ -112,6 +115,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.selection.criteria import BIC as BIC
     from ep2sindy.selection.criteria import EBIC as EBIC
     from ep2sindy.selection.criteria import AICc as AICc
+    from ep2sindy.selection.evidence import Evidence as Evidence
     from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore
     from ep2sindy.selection.integral import IntegralScore as IntegralScore
     from ep2sindy.selection.knees import Knee as Knee
@@ -212,6 +216,8 @@ _FACE = {
     "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",
     "discovery.shared_support": "JointDiscovery discover_jointly",
+    "estimation.estimate": "Estimate estimate",
+    "estimation.joint": "Joint",
     "library.equations": "equation_text",
     "library.library": "Library polynomial named_terms",
     "machine.parallel": "Serial Loky Dask",
@@ -241,6 +247,7 @@ _FACE = {
     "search.front": "Candidate ParetoFront fit_support pareto_front",
     "search.searches": "AdaptiveLasso STLSQ BestSubset",
     "selection.criteria": "AICc BIC EBIC",
+    "selection.evidence": "Evidence",
     "selection.free_run": "FreeRunScore",
     "selection.integral": "IntegralScore",
     "selection.knees": "Knee LogKnee",

@@ -20,6 +20,7 @@ ROOMS = [
     "regression",
     "constraints",
     "search",
+    "estimation",
     "synthetic",
     "refinement",
     "selection",

@@ -12,6 +12,7 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Relation, constraint
 from ep2sindy.constraints.support import binding
 from ep2sindy.discovery.last_fit import assemble_model, last_fit
+from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.model.model import SparseModel
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, support_of
@@ -41,11 +42,13 @@ def choose(
     *,
     units: Mapping[str, str],
     provenance: Mapping[str, str],
+    estimate: Estimate | None = None,
 ) -> Choice:
     """Score the candidates, select, and fit: refined, constrained, weighted or as they are.
 
     A rule that judges whole systems refines the winner. Under relations the combination of least
-    summed score wins that has the terms, and all equations are fitted at once.
+    summed score wins that has the terms, and all equations are fitted at once. estimate: of whose
+    candidates the fronts are; where its own evidence selects, its model stands as it is.
     Raises ValueError for relations that no combination has the terms for.
     """
     library = fronts[0].problem.library
@@ -56,6 +59,10 @@ def choose(
         chosen = [_as_in(model, candidate) for candidate in best]
         return Choice(decision.scores, chosen, model, decision.note)
     scores = rule.scores(fronts)
+    if estimate is not None:
+        best = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
+        chosen = [_as_in(estimate.model, candidate) for candidate in best]
+        return Choice(scores, chosen, estimate.model, estimate.note)
     if relations:
         place = _least_sum(fronts, scores, relations)
         support = support_of(fronts, place)

@@ -12,8 +12,12 @@ from jaxtyping import Float
 from ep2sindy.constraints.relations import Relation
 from ep2sindy.constraints.support import relations_of
 from ep2sindy.data.given import Runs, trajectories_of
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import choose
+from ep2sindy.discovery.estimated import estimated
 from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
+from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.screen import N_LINES, one_screen
 from ep2sindy.model.display import model_html, model_lines
@@ -32,7 +36,8 @@ class Discovery:
     chosen: by state, the selected candidate as it stands in the model: where the noise of the
     samples is followed into the rows, fitted again with weights, with its covariance.
     ambiguities: terms that these data cannot tell apart. note: how a rule that judges whole
-    systems of equations came to its model; empty for the others.
+    systems of equations came to its model, or how sure a joint search is; empty for the others.
+    estimate: of states and coefficients together, where the search was joint.
     """
 
     fronts: Mapping[str, ParetoFront] = field(repr=False)
@@ -41,6 +46,7 @@ class Discovery:
     model: SparseModel = field(repr=False)
     ambiguities: Sequence[Ambiguity]
     note: str = ""
+    estimate: Estimate | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         notes = [f"note: {a.message}" for a in self.ambiguities][:MOST_NOTES]
@@ -74,8 +80,8 @@ def discover(
 
     The recipe's formulation assembles rows; its search proposes supports in every bootstrap; each
     support is fitted to all training rows, and the best of every size make the front; its rule
-    selects one per equation. Where the formulation follows the noise of the samples into the
-    rows, the selected terms are fitted again with weights, and their covariance is known.
+    selects one per equation. Where the noise of the samples is followed into the rows, selected
+    terms are fitted again with weights. A `Joint` search does without rows.
     runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`.
     library: None means every product of the variables of the first run up to degree 2.
     recipe: None means Recipe(), the route for noisy data that we know to be best.
@@ -91,8 +97,7 @@ def discover(
     check_kind("recipe", recipe, Recipe, "ep.Recipe(selection=ep.EBIC())")
     asked = Asked(relations_of(relations), terms or {})
     check_asked(asked, library, trajectories[0].state_names)
-    equations = recipe.searched(trajectories, library, asked, rng=np.random.default_rng(seed))
-    fronts = {equation.front.equation: equation.front for equation in equations}
+    estimate, fronts = _searched(trajectories, library, recipe, asked, seed)
     labels = ", ".join(run.label for run in trajectories)
     choice = choose(
         list(fronts.values()),
@@ -100,6 +105,7 @@ def discover(
         asked.relations,
         units=trajectories[0].units,
         provenance=recipe.provenance | {"trajectories": labels},
+        estimate=estimate,
     )
     problems = dict.fromkeys(front.problem for front in fronts.values())
     return Discovery(
@@ -109,4 +115,20 @@ def discover(
         model=choice.model,
         ambiguities=tuple(dict.fromkeys(a for problem in problems for a in ambiguities(problem))),
         note=choice.note,
+        estimate=estimate,
     )
+
+
+def _searched(
+    runs: Sequence[Trajectory],
+    library: Library,
+    recipe: Recipe,
+    asked: Asked,
+    seed: int | np.random.Generator,
+) -> tuple[Estimate | None, dict[str, ParetoFront]]:
+    """Fronts by state, and the estimate that they come from, if any."""
+    rng = np.random.default_rng(seed)
+    if isinstance(recipe.search, Joint):
+        return estimated(runs, library, recipe, asked, rng=rng)
+    equations = recipe.searched(runs, library, asked, rng=rng)
+    return None, {equation.front.equation: equation.front for equation in equations}

@@ -11,6 +11,8 @@ from jaxtyping import Bool
 from ep2sindy.constraints.relations import Relation
 from ep2sindy.constraints.support import completed
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.estimate import Estimate, estimate
+from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.weighted_weak import WeightedWeak
@@ -18,7 +20,8 @@ from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, 
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset, Search
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.selection.evidence import Evidence
+from ep2sindy.selection.rule import Selection, SystemSelection, selected
 
 
 @dataclass(frozen=True)
@@ -99,20 +102,32 @@ class Recipe:
 
     The defaults are the route that finds known systems most often in noise (docs/benchmark.md);
     the thesis's is Recipe(Differential(), AdaptiveLasso(), Bootstraps(), Knee()).
+    search: a `Joint` one fits whole trajectories; the formulation's rows then serve tables alone.
+    selection: None means EBIC(), or Evidence() after a joint search.
     depth: candidates kept per size: 3 lets a true support win that noise has put second or third.
     """
 
     formulation: Formulation = field(default_factory=WeightedWeak)
-    search: Search = field(default_factory=BestSubset)
+    search: Joint | Search = field(default_factory=BestSubset)
     bootstraps: Bootstraps = field(default_factory=lambda: Bootstraps(n=0))
-    selection: Selection = field(default_factory=EBIC)
+    selection: Selection = None  # type: ignore[assignment]  # __post_init__ sets it
     depth: int = 1
 
     def __post_init__(self) -> None:
         check_kind("formulation", self.formulation, Formulation, "ep.WeightedWeak()")
-        check_kind("search", self.search, Search, "ep.BestSubset()")
+        joint = isinstance(self.search, Joint)
+        if self.selection is None:
+            object.__setattr__(self, "selection", Evidence() if joint else EBIC())
+        if not joint:
+            check_kind("search", self.search, Search, "ep.BestSubset()")
         check_kind("bootstraps", self.bootstraps, Bootstraps, "ep.Bootstraps(n=0)")
         check_kind("selection", self.selection, Selection, "ep.EBIC()")
+        if joint and not isinstance(self.selection, Evidence | SystemSelection):
+            raise ValueError(
+                "a joint search weighs models by the likelihood of trajectories: selection must "
+                "be Evidence() (selection=evidence), or a rule that runs models, such as "
+                f"FreeRunScore(): {self.selection!r} came"
+            )
         if type(self.depth) is not int or self.depth < 1:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")
 
@@ -124,7 +139,15 @@ class Recipe:
         *,
         rng: np.random.Generator | int,
     ) -> list[SearchedEquation]:
-        """Assemble the rows, search every bootstrap of them, and fit what is found."""
+        """Assemble the rows, search every bootstrap of them, and fit what is found.
+
+        Raises ValueError for a joint search: it has no rows.
+        """
+        if isinstance(self.search, Joint):
+            raise ValueError(
+                "a joint search fits whole trajectories, and serves discover() and the experiments "
+                f"discover, breathing and benchmark: {self.search!r} came; use BestSubset here"
+            )
         rng, asked = np.random.default_rng(rng), asked or Asked()
         equations = []
         for problem in self.formulation.assemble(runs, library, rng=rng):
@@ -140,6 +163,8 @@ class Recipe:
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
         """The supports alone: what a benchmark counts."""
+        if isinstance(self.search, Joint):
+            return _finding(estimate(runs, library, self.search))
         rng = np.random.default_rng(rng)
         fronts = [equation.front for equation in self.searched(runs, library, rng=rng)]
         scores = self.selection.scores(fronts)
@@ -154,3 +179,11 @@ class Recipe:
         """What a model remembers of how it was found."""
         names = ("formulation", "search", "bootstraps", "selection")
         return {name: repr(getattr(self, name)) for name in names}
+
+
+def _finding(found: Estimate) -> Finding:
+    states = found.model.states
+    return Finding(
+        kept={s: [frozenset(w.coef) for w in found.weighed[s]] for s in states},
+        selected={s: frozenset(found.model.terms(s)) for s in states},
+    )

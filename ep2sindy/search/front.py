@@ -25,6 +25,8 @@ class Candidate:
     truth. share: share of bootstraps that found this support. inclusion: for each of its
     terms, the share of bootstraps in which the term stood in a support of this size.
     covariance: (support, support) of coef, in SI, where noise has been followed to it.
+    deviance: -2 log likelihood of whole trajectories plus the price of the terms, beside the best
+    system's; None where rows alone were fitted.
     """
 
     equation: str
@@ -35,6 +37,7 @@ class Candidate:
     share: float
     inclusion: Float[np.ndarray, " support"]
     covariance: Float[np.ndarray, "support support"] | None = None
+    deviance: float | None = None
 
     @property
     def n_terms(self) -> int:

@@ -1,0 +1,1 @@
+"""States and coefficients together: sparse equations by the likelihood of whole trajectories."""

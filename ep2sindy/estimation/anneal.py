@@ -1,0 +1,69 @@
+"""From free states to exact trajectories: supports chosen at every level on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.estimation.likelihood import Fit, Level, enough_substeps, fitted, gram, squares
+from ep2sindy.estimation.problem import Problem
+from ep2sindy.estimation.supports import best_support
+
+# rho, and the share of a term's price that is asked there: free states hide part of what a term
+# explains, and what is dropped too early would have to be found again.
+COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
+COLD = ((0.03, 1.0), (0.001, 1.0), (0.0001, 1.0))
+MOST_EXCHANGES = 3  # of supports at one level
+
+
+@dataclass(frozen=True, eq=False)
+class Annealed:
+    """A fit, the level that it ended at, and its squares plus the prices of its terms."""
+
+    fit: Fit
+    level: Level
+    score: float
+
+
+def annealed(
+    problem: Problem,
+    fit: Fit,
+    noise: Float[np.ndarray, " d"],
+    prices: Float[np.ndarray, " free"],
+    schedule: Sequence[tuple[float, float]],
+    *,
+    max_terms: int,
+) -> Annealed:
+    """Fit level by level; at each, exchange terms as long as squares plus prices fall."""
+    n_substeps, score = 1, np.inf
+    for rho, share in schedule:
+        level = Level(noise, rho, n_substeps)
+        n_substeps = enough_substeps(problem, fit, level)
+        level = replace(level, n_substeps=n_substeps)
+        if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():
+            fit = replace(fit, free=np.zeros_like(fit.free))  # a flow that stands still is finite
+        fit = fitted(problem, fit, level)
+        fit, score = _exchanged(problem, fit, level, share * prices, max_terms)
+    return Annealed(fit, level, score)
+
+
+def _exchanged(
+    problem: Problem, fit: Fit, level: Level, prices: Float[np.ndarray, " free"], max_terms: int
+) -> tuple[Fit, float]:
+    """Exchange terms by the Gram pair, fit again, and accept what lowers squares plus prices."""
+    score = fit.total + prices[fit.support].sum()
+    for _ in range(MOST_EXCHANGES):
+        found = best_support(
+            problem, gram(problem, fit, level), prices, fit.support, max_terms=max_terms
+        )
+        if np.array_equal(found.support, fit.support):
+            break
+        tried = fitted(problem, replace(fit, support=found.support, free=found.free), level)
+        tried_score = tried.total + prices[found.support].sum()
+        if not tried_score < score:
+            break
+        fit, score = tried, tried_score
+    return fit, float(score)

@@ -1,0 +1,210 @@
+"""What an estimate of states and coefficients together returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.constraints.relations import Relation
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.joint import Joint, Solution, solve
+from ep2sindy.estimation.likelihood import Gram, covariance, gram
+from ep2sindy.estimation.problem import Problem, scaled_problem
+from ep2sindy.estimation.supports import priced, supports_by_size
+from ep2sindy.library.library import Library
+from ep2sindy.model.model import SparseModel
+
+MOST_RIVALS = 5
+LEAST_ODDS = 1e-3  # of a rival that is worth a word
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A support of one equation, the others as chosen. coef: SI, of its terms, by name.
+
+    deviance: -2 log likelihood of the trajectories plus the prices of all terms, beside the
+    chosen model's; linearised about that, so exact for what is close to it.
+    """
+
+    coef: Mapping[str, float]
+    deviance: float
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another support of one equation, and its odds against the chosen one: 1 is even."""
+
+    state: str
+    terms: tuple[str, ...]
+    odds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """States and coefficients, estimated together.
+
+    model: with the covariance of its coefficients. paths: by run, the states that the model and
+    the samples agree on, (samples, d), in SI. noise_std: (d,), of the samples' noise, in SI;
+    memory: (d,), its correlation from one sample to the next, 0 for white noise.
+    flow_error: how far from the model the states move from sample to sample, as a share of the
+    noise; 0 where nothing but noise is left. misfit: why these equations do not explain the data;
+    empty where they do. weighed: by state, the best supports of every size. rivals: what else
+    may be, most likely first.
+    """
+
+    model: SparseModel
+    paths: tuple[Float[np.ndarray, "samples d"], ...] = field(repr=False)
+    noise_std: Float[np.ndarray, " d"]
+    memory: Float[np.ndarray, " d"]
+    flow_error: float
+    misfit: str
+    weighed: Mapping[str, Sequence[Weighed]] = field(repr=False)
+    rivals: Sequence[Rival]
+
+    @property
+    def note(self) -> str:
+        """What a reader must know of the fit, on one line."""
+        if self.misfit:
+            return self.misfit
+        if not self.rivals:
+            return "no other support of an equation has odds above 1:1000"
+        first = self.rivals[0]
+        return f"next: {first.state}' of {', '.join(first.terms)}, odds {first.odds:.2g}:1"
+
+
+def estimate(
+    runs: Sequence[Trajectory],
+    library: Library,
+    search: Joint | None = None,
+    *,
+    relations: Sequence[Relation] = (),
+    terms: Mapping[str, Sequence[str]] | None = None,
+    units: Mapping[str, str] | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> Estimate:
+    """Estimate states at every sample and sparse coefficients together, by their likelihood.
+
+    runs: share the coefficients; samples may come at unequal times. Inputs are taken as exact.
+    relations: between coefficients, held in fit and search. terms: by state, all the terms of an
+    equation that is known but for its coefficients. Raises ValueError for a library that needs
+    more samples than there are, or a variable that no run has.
+    """
+    search = search or Joint()
+    check_runs(runs, library)
+    problem = scaled_problem(runs, library, relations, terms)
+    found = solve(problem, max_terms=search.terms_for(problem))
+    fit, level = found.annealed.fit, found.annealed.level
+    pair = gram(problem, fit, level)
+    weighed = {
+        state: _weighed(problem, pair, found, block, search)
+        for block, state in enumerate(problem.states)
+    }
+    return Estimate(
+        model=_model(problem, library, found, units or runs[0].units, provenance or {}),
+        paths=tuple(path * problem.scale for path in fit.paths),
+        noise_std=found.noise.std * problem.scale,
+        memory=found.noise.memory,
+        flow_error=found.flow_error,
+        misfit=_misfit(problem, found),
+        weighed=weighed,
+        rivals=_rivals(problem, found, weighed),
+    )
+
+
+def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
+    """Raise ValueError for a variable that no run has, or runs too short to begin with."""
+    if missing := [v for v in library.variables if v not in runs[0].names]:
+        raise ValueError(
+            f"the library needs {missing}, and the runs have {list(runs[0].names)}: states and "
+            "coefficients can be estimated together only where every state is sampled; derive "
+            "the missing one (+exp=trace does, of one signal), or pass it as an input"
+        )
+    n_samples = sum(run.n_samples for run in runs)
+    if n_samples <= len(library):
+        raise ValueError(
+            f"a library of {len(library)} terms needs more samples than terms: {n_samples} came; "
+            "use a smaller library or more data"
+        )
+    for run in runs:
+        if run.n_samples < 5:
+            raise ValueError(
+                f"a run must have five samples or more: {run.label or 'one'} has "
+                f"{run.n_samples}; leave it out, or join what belongs together"
+            )
+
+
+def _coef_SI(problem: Problem, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, " _"]:
+    return (problem.C @ free + problem.fixed) * problem.to_SI
+
+
+def _model(
+    problem: Problem,
+    library: Library,
+    found: Solution,
+    units: Mapping[str, str],
+    provenance: Mapping[str, str],
+) -> SparseModel:
+    fit = found.annealed.fit
+    values = _coef_SI(problem, fit.free)
+    coef = np.zeros((len(library), len(problem.states)))
+    coef[problem.column, problem.equation] = values
+    used = values != 0.0
+    order = np.lexsort((problem.column[used], problem.equation[used]))
+    rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
+    cov = rows @ covariance(problem, fit, found.annealed.level) @ rows.T
+    return SparseModel(library, problem.states, coef, units, provenance, cov)
+
+
+def _weighed(
+    problem: Problem, pair: Gram, found: Solution, block: int, search: Joint
+) -> list[Weighed]:
+    """Supports of one equation, by size and then by deviance."""
+    fit = found.annealed.fit
+    chosen = priced(pair, fit.support, found.prices).score
+    masks = supports_by_size(problem, pair, fit.support, block, max_terms=search.terms_for(problem))
+    masks = [m for m in masks if not np.array_equal(m, fit.support)]
+    rows = []
+    for mask in [fit.support, *masks]:
+        each = priced(pair, mask, found.prices)
+        free = fit.free if mask is fit.support else each.free
+        values = _coef_SI(problem, free)
+        own = (problem.equation == block) & (values != 0.0)
+        names = [problem.library.names[j] for j in problem.column[own]]
+        coef = dict(zip(names, values[own].tolist(), strict=True))
+        rows.append(Weighed(coef, max(each.score - chosen, 0.0)))
+    return sorted(rows, key=lambda w: (len(w.coef), w.deviance))
+
+
+def _rivals(
+    problem: Problem, found: Solution, weighed: Mapping[str, Sequence[Weighed]]
+) -> tuple[Rival, ...]:
+    fit = found.annealed.fit
+    rivals = []
+    for block, state in enumerate(problem.states):
+        values = _coef_SI(problem, fit.free)
+        own = (problem.equation == block) & (values != 0.0)
+        chosen = {problem.library.names[j] for j in problem.column[own]}
+        for each in weighed[state]:
+            odds = float(np.exp(-0.5 * each.deviance))
+            if set(each.coef) != chosen and odds >= LEAST_ODDS:
+                rivals.append(Rival(state, tuple(each.coef), odds))
+    return tuple(sorted(rivals, key=lambda r: -r.odds)[:MOST_RIVALS])
+
+
+def _misfit(problem: Problem, found: Solution) -> str:
+    if found.fits:
+        return ""
+    signs = []
+    if found.flow_error:
+        signs.append(f"the states leave the model by {found.flow_error:g} of the noise per sample")
+    for state, memory in zip(problem.states, found.noise.unexplained, strict=True):
+        if memory:
+            signs.append(f"what is left of {state} lasts ({memory:.2f} from sample to sample)")
+    return (
+        "no model of this library fits these data as far as their noise: "
+        + "; ".join(signs)
+        + ". The equations are the nearest found; add terms or states, or judge them by free run"
+    )

@@ -1,0 +1,197 @@
+"""Compiled kernels of the trajectory likelihood: sensitivities, filter, smoother.
+
+A record has n samples of d states; p coefficients are free. The flow takes a state over one step
+between samples; `flow`: (n - 1, d, d + p) holds its derivatives by the state, then by the
+coefficients. All is linear about a path: `misses` (n - 1, d) is flow minus the next state,
+`residuals` (n, d) samples minus states, and what is sought are departures from the path.
+
+Loops in place of array expressions: those take seconds more to compile.
+"""
+
+import numpy as np
+
+from ep2sindy.machine.compilation import compiled
+
+
+@compiled
+def term_values(columns, table):
+    """Products of the columns that each row of a table names: (samples, rows)."""
+    n_factors = table.shape[1]
+    values = np.empty((len(columns), len(table)))
+    for k in range(len(columns)):
+        for j in range(len(table)):
+            value = columns[k, table[j, 0]]
+            for i in range(1, n_factors):
+                value *= columns[k, table[j, i]]
+            values[k, j] = value
+    return values
+
+
+@compiled
+def sensitivity_stage(jacobian, terms, equation, column, start, lead, slope, weight, total):
+    """One Runge-Kutta stage of the sensitivities, at every sample at once.
+
+    start: (n, d, d + p) where the step began; lead: (n,), how far from there along `slope`, of
+    the stage before, this stage stands. slope becomes this stage's, and total grows by weight (n,)
+    times it. The coefficient c stands in equation[c] before terms[:, column[c]].
+    """
+    n, d, width = start.shape
+    here = np.empty((d, width))
+    for k in range(n):
+        for i in range(d):
+            for c in range(width):
+                here[i, c] = start[k, i, c] + lead[k] * slope[k, i, c]
+        for i in range(d):
+            for c in range(width):
+                value = 0.0
+                for j in range(d):
+                    value += jacobian[k, i, j] * here[j, c]
+                slope[k, i, c] = value
+        for c in range(width - d):
+            slope[k, equation[c], d + c] += terms[k, column[c]]
+        for i in range(d):
+            for c in range(width):
+                total[k, i, c] += weight[k] * slope[k, i, c]
+
+
+@compiled
+def _seen(i, residual, variance, mean, by_coef, cov, gain):
+    """Learn from one sample of state i; returns its innovation and the innovation's variance."""
+    d, p = by_coef.shape
+    spread = cov[i, i] + variance
+    innovation = residual - mean[i]
+    for j in range(d):
+        gain[j] = cov[j, i] / spread
+    for j in range(d):
+        mean[j] += gain[j] * innovation
+        if j != i:
+            for a in range(p):
+                by_coef[j, a] -= gain[j] * by_coef[i, a]
+    for a in range(p):
+        by_coef[i, a] *= 1.0 - gain[i]
+    for j in range(d):
+        for m in range(j + 1):
+            cov[j, m] -= gain[j] * gain[m] * spread
+            cov[m, j] = cov[j, m]
+    return innovation, spread
+
+
+@compiled
+def _stepped(flow, miss, mean, by_coef, cov, process, buffer):
+    """Take mean, its derivatives by the coefficients and covariance over one step."""
+    d, p = by_coef.shape
+    for i in range(d):
+        value = miss[i]
+        for j in range(d):
+            value += flow[i, j] * mean[j]
+        buffer[i, 0] = value
+        for a in range(p):
+            value = flow[i, d + a]
+            for j in range(d):
+                value += flow[i, j] * by_coef[j, a]
+            buffer[i, 1 + a] = value
+        for m in range(d):
+            value = 0.0
+            for j in range(d):
+                value += flow[i, j] * cov[j, m]
+            buffer[i, 1 + p + m] = value
+    for i in range(d):
+        mean[i] = buffer[i, 0]
+        for a in range(p):
+            by_coef[i, a] = buffer[i, 1 + a]
+        for m in range(i + 1):
+            value = 0.0
+            for j in range(d):
+                value += buffer[i, 1 + p + j] * flow[m, j]
+            cov[i, m] = value
+            cov[m, i] = value
+        cov[i, i] += process[i]
+
+
+@compiled
+def eliminated(flow, misses, residuals, variance, process, free_start):
+    """Eliminate all states: what is left of the squares as a function of the coefficients.
+
+    variance, process: (d,), of the samples' noise and of the flow's error; free_start: variance
+    of the first state before any sample. A residual that is not finite is no sample.
+    Returns hessian (p, p) and gradient (p,), so that the squares are least - 2 gradient' c +
+    c' hessian c for a change c of the coefficients, then least, and the sum of the logarithms of
+    the innovations' variances. Exact for the linearised problem (de Jong 1991,
+    doi:10.1214/aos/1176348139).
+    """
+    n, d = residuals.shape
+    p = flow.shape[2] - d
+    hessian, gradient = np.zeros((p, p)), np.zeros(p)
+    mean, by_coef, cov, gain = np.zeros(d), np.zeros((d, p)), np.zeros((d, d)), np.empty(d)
+    row, buffer = np.empty(p), np.empty((d, 1 + p + d))
+    least, log_spread = 0.0, 0.0
+    for i in range(d):
+        cov[i, i] = free_start
+    for k in range(n):
+        for i in range(d):
+            if not np.isfinite(residuals[k, i]):
+                continue
+            for a in range(p):
+                row[a] = by_coef[i, a]
+            innovation, spread = _seen(i, residuals[k, i], variance[i], mean, by_coef, cov, gain)
+            least += innovation * innovation / spread
+            log_spread += np.log(spread)
+            for a in range(p):
+                share = row[a] / spread
+                gradient[a] += share * innovation
+                for b in range(a + 1):
+                    hessian[a, b] += share * row[b]
+        if k < n - 1:
+            _stepped(flow[k], misses[k], mean, by_coef, cov, process, buffer)
+    for a in range(p):
+        for b in range(a):
+            hessian[b, a] = hessian[a, b]
+    return hessian, gradient, least, log_spread
+
+
+@compiled
+def departures(flow, misses, residuals, variance, process, free_start):
+    """The departures (n, d) of all states from the path that leave the least squares.
+
+    Arguments as for `eliminated`, of whose `flow` the first d columns count. Backwards by the
+    adjoint of the filter, which inverts no matrix (Bierman 1973, doi:10.1016/0005-1098(73)90089-3).
+    """
+    n, d = residuals.shape
+    means, covs = np.empty((n, d)), np.empty((n, d, d))
+    gains, innovations = np.zeros((n, d, d)), np.zeros((n, d))
+    mean, none, cov = np.zeros(d), np.zeros((d, 0)), np.zeros((d, d))
+    buffer = np.empty((d, 1 + d))
+    for i in range(d):
+        cov[i, i] = free_start
+    for k in range(n):
+        for i in range(d):
+            means[k, i] = mean[i]
+            for j in range(d):
+                covs[k, i, j] = cov[i, j]
+        for i in range(d):
+            if np.isfinite(residuals[k, i]):
+                innovation, spread = _seen(
+                    i, residuals[k, i], variance[i], mean, none, cov, gains[k, i]
+                )
+                innovations[k, i] = innovation / spread
+        if k < n - 1:
+            _stepped(flow[k], misses[k], mean, none, cov, process, buffer)
+    adjoint, carried = np.zeros(d), np.zeros(d)
+    for k in range(n - 1, -1, -1):
+        for j in range(d):
+            carried[j] = 0.0
+            for i in range(d):
+                if k < n - 1:
+                    carried[j] += flow[k, i, j] * adjoint[i]
+        for j in range(d):
+            adjoint[j] = carried[j]
+        for i in range(d - 1, -1, -1):
+            if np.isfinite(residuals[k, i]):
+                value = innovations[k, i]
+                for j in range(d):
+                    value += gains[k, i, j] * adjoint[j]
+                adjoint[i] -= value
+        for i in range(d):
+            for j in range(d):
+                means[k, i] -= covs[k, i, j] * adjoint[j]
+    return means

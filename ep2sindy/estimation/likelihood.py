@@ -1,0 +1,186 @@
+"""The likelihood of whole trajectories: states at every sample and coefficients, fitted together.
+
+What is least is the sum of ((sample - state) / noise)^2 and, from each sample to the next, of
+((flow of the state - next state) / (rho noise))^2. With rho large the states are nearly free;
+as it falls they become an exact trajectory of the model, and the squares its chi-squared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.estimation.kernels import departures, eliminated
+from ep2sindy.estimation.problem import Flow, Problem
+
+FREE_START = 100.0  # variance of the first state before any sample: ten times its RMS
+MOST_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
+SETTLED = 1e-2  # a step that lowers the squares by less is the last: a term costs ten
+RIDGE = 1e-12  # of a Hessian of unit diagonal
+MOST_SUBSTEPS = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """How exact samples and flow are held to be: noise (d,), and rho, the flow's share of it."""
+
+    noise: Float[np.ndarray, " d"]
+    rho: float
+    n_substeps: int = 1
+
+    @property
+    def variance(self) -> Float[np.ndarray, " d"]:
+        return np.square(self.noise)
+
+    @property
+    def process(self) -> Float[np.ndarray, " d"]:
+        return np.square(self.rho * self.noise)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """States and coefficients. paths: by record, (samples, d), scaled. free: (free,), zero
+    outside the support. squares: (d,), what is least, by state; infinite where the flow is."""
+
+    paths: tuple[np.ndarray, ...]
+    free: Float[np.ndarray, " free"]
+    support: Bool[np.ndarray, " free"]
+    squares: Float[np.ndarray, " d"]
+
+    @property
+    def total(self) -> float:
+        return float(self.squares.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Gram:
+    """The squares as a function of all free coefficients, the states following them.
+
+    squares(z) = offset - 2 linear' z + z' quadratic z, exact where the fit is linear.
+    """
+
+    quadratic: Float[np.ndarray, "free free"]
+    linear: Float[np.ndarray, " free"]
+    offset: float
+
+
+def squares(
+    problem: Problem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
+) -> Float[np.ndarray, " d"]:
+    """What is least, by state."""
+    total = np.zeros(len(problem.states))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for record, path in zip(problem.records, paths, strict=True):
+            misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
+            total += np.nansum(np.square(record.samples - path), axis=0) / level.variance
+            total += np.square(misses).sum(axis=0) / level.process
+    return np.where(np.isfinite(total), total, np.inf)
+
+
+def fitted(problem: Problem, fit: Fit, level: Level) -> Fit:
+    """The nearest least squares over states and coefficients, by Gauss-Newton with halved steps."""
+    fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
+    if not np.isfinite(fit.total):
+        return fit  # there is no slope to follow
+    for _ in range(MOST_STEPS):
+        change, moves = _step(problem, fit, level)
+        if not np.isfinite(change).all():
+            return fit  # derivatives overflow where the flow itself does not yet
+        share = 1.0
+        while share > SHORTEST:
+            paths = tuple(p + share * m for p, m in zip(fit.paths, moves, strict=True))
+            free = fit.free + share * change
+            tried = replace(
+                fit, paths=paths, free=free, squares=squares(problem, paths, free, level)
+            )
+            if tried.total < fit.total:
+                break
+            share /= 2.0
+        else:
+            return fit
+        gain, fit = fit.total - tried.total, tried
+        if share == 1.0 and gain < SETTLED:
+            return fit
+    return fit
+
+
+def gram(problem: Problem, fit: Fit, level: Level) -> Gram:
+    """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
+    everything = np.ones_like(fit.support)
+    quadratic, gradient, least = _hessian(problem, fit, everything, level)[:3]
+    linear = quadratic @ fit.free + gradient
+    offset = least + fit.free @ quadratic @ fit.free + 2.0 * fit.free @ gradient
+    return Gram(quadratic, linear, float(offset))
+
+
+def covariance(problem: Problem, fit: Fit, level: Level) -> Float[np.ndarray, "support support"]:
+    """Of the support's free coefficients, scaled."""
+    hessian = _hessian(problem, fit, fit.support, level)[0]
+    size = np.sqrt(np.maximum(np.diag(hessian), np.finfo(np.float64).tiny))
+    return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
+
+
+def enough_substeps(problem: Problem, fit: Fit, level: Level, *, share: float = 0.1) -> int:
+    """Runge-Kutta steps between samples that err by less than a share of what the flow may."""
+    n = level.n_substeps
+    while n < MOST_SUBSTEPS:
+        with np.errstate(over="ignore", invalid="ignore"):
+            errors = [
+                problem.ends(record, path[:-1], fit.free, n)
+                - problem.ends(record, path[:-1], fit.free, 2 * n)
+                for record, path in zip(problem.records, fit.paths, strict=True)
+            ]
+            rms = np.sqrt(np.square(np.concatenate(errors)).mean(axis=0))
+        if (rms <= share * level.rho * level.noise).all():
+            break
+        n *= 2
+    return n
+
+
+def _step(
+    problem: Problem, fit: Fit, level: Level
+) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
+    """One Gauss-Newton step: of the free coefficients, and of every path."""
+    hessian, gradient, _, flows = _hessian(problem, fit, fit.support, level)
+    size = np.sqrt(np.maximum(np.diag(hessian), np.finfo(np.float64).tiny))
+    scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
+    if not (np.isfinite(scaled).all() and np.isfinite(gradient).all()):
+        return np.full_like(fit.free, np.nan), []
+    step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
+    change = np.zeros_like(fit.free)
+    change[fit.support] = step
+    d = len(problem.states)
+    moves = []
+    for record, path, flow in zip(problem.records, fit.paths, flows, strict=True):
+        misses = flow.ends - path[1:] + flow.slopes[:, :, d:] @ step
+        by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
+        residuals = record.samples - path
+        moves.append(
+            departures(by_state, misses, residuals, level.variance, level.process, FREE_START)
+        )
+    return change, moves
+
+
+def _hessian(
+    problem: Problem, fit: Fit, support: Bool[np.ndarray, " free"], level: Level
+) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
+    """Half the second derivatives by the support's coefficients, minus half the first, the least
+    squares with none of them changed, and the flows."""
+    n = int(support.sum())
+    hessian, gradient, least, flows = np.zeros((n, n)), np.zeros(n), 0.0, []
+    for record, path in zip(problem.records, fit.paths, strict=True):
+        flow = problem.flow(record, path[:-1], fit.free, support, level.n_substeps)
+        h, g, rest, _ = eliminated(
+            flow.slopes,
+            flow.ends - path[1:],
+            record.samples - path,
+            level.variance,
+            level.process,
+            FREE_START,
+        )
+        hessian, gradient, least = hessian + h, gradient + g, least + rest
+        flows.append(flow)
+    return hessian, gradient, least, flows

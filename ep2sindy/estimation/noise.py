@@ -1,0 +1,132 @@
+"""The noise that a fit leaves: how large, whether it lasts, and whether the model explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.estimation.kernels import eliminated
+from ep2sindy.estimation.likelihood import FREE_START, Fit, Level, fitted
+from ep2sindy.estimation.problem import Problem
+
+FLOOR = 1e-3  # of the RMS: no model and no integration is exact
+SIGNIFICANT = 3.5  # standard errors of an autocorrelation
+MOST_LASTING = 0.98
+ALIKE = 7.0  # of the logarithm of their mean square, which scatters by 2.15 over sqrt(n)
+LONGER = 6.0  # of autocorrelations, which scatter by up to 1.7 over sqrt(n)
+LAGS = (2, 3, 4, 5, 6)
+TINY = float(np.finfo(np.float64).tiny)
+ORDER = 3  # of differences: they leave little of a signal that the samples resolve
+LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of error of the flow that are tried
+ERROR_SHOWS = 2.0  # by which a flow with error must be likelier, twice its logarithm
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """What is left of the samples beside a fit, by state.
+
+    std: (d,), scaled, no lower than the floor. memory: (d,), autocorrelation from one sample to
+    the next where noise lasts, else 0. unexplained: (d,), the same where the samples alone show
+    no such noise: then it is the model's error. deviance: -2 log likelihood of the residuals.
+    """
+
+    std: Float[np.ndarray, " d"]
+    memory: Float[np.ndarray, " d"]
+    unexplained: Float[np.ndarray, " d"]
+    deviance: float
+
+    @property
+    def effective(self) -> Float[np.ndarray, " d"]:
+        """Standard deviation of white noise that tells as little about slow signals."""
+        return self.std * np.sqrt((1.0 + self.memory) / (1.0 - self.memory))
+
+    @property
+    def independent(self) -> Float[np.ndarray, " d"]:
+        """Share of the samples that count."""
+        return (1.0 - self.memory) / (1.0 + self.memory)
+
+
+def noise_beside(problem: Problem, fit: Fit) -> Noise:
+    """Size and memory of what a fit leaves; memory from one sample to the next as AR(1)."""
+    left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
+    n = problem.n_samples
+    squares = sum(np.square(e).sum(axis=0) for e in left)
+    lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in left)
+    per_state = fit.support.sum() / len(problem.states) + len(left)
+    std = np.sqrt(squares / max(n - per_state, 1.0))
+    memory = np.clip(lagged / np.maximum(squares, TINY), 0.0, MOST_LASTING)
+    shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
+    believed = shows & _forgets(left, memory) & _shown_by_samples(problem, std, memory)
+    std = np.maximum(std, FLOOR)
+    lasting = np.where(believed, memory, 0.0)
+    return Noise(
+        std=std,
+        memory=lasting,
+        unexplained=np.where(shows & ~believed, memory, 0.0),
+        deviance=float(n * np.log(np.square(std) * (1.0 - np.square(lasting))).sum()),
+    )
+
+
+def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
+    """rho under which the fit's support is most likely; 0 where an exact flow is.
+
+    Assumes white noise of these samples. Source of the likelihood by innovations: Schweppe 1965,
+    doi:10.1109/TIT.1965.1053737.
+    """
+    best, found = _deviance(problem, fit, exact) - ERROR_SHOWS, 0.0
+    for rho in LEVELS:
+        level = Level(noise.std, rho, exact.n_substeps)
+        fit = fitted(problem, fit, level)
+        deviance = _deviance(problem, fit, level)
+        if deviance < best:
+            best, found = deviance, rho
+    return found
+
+
+def _deviance(problem: Problem, fit: Fit, level: Level) -> float:
+    """-2 log likelihood of the samples by their innovations, all noise scaled to its best size."""
+    least = spread = 0.0
+    none = np.zeros_like(fit.support)
+    for record, path in zip(problem.records, fit.paths, strict=True):
+        flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
+        residuals, misses = record.samples - path, flow.ends - path[1:]
+        _, _, squares, logs = eliminated(
+            flow.slopes, misses, residuals, level.variance, level.process, FREE_START
+        )
+        least, spread = least + squares, spread + logs
+    n = problem.n_samples * len(problem.states)
+    return spread + n * np.log(max(least, TINY) / n)
+
+
+def _forgets(
+    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"]
+) -> Bool[np.ndarray, " d"]:
+    """Whether residuals forget as fast as noise of this memory; what a model leaves of a signal
+    lasts longer beside white noise than from one sample to the next."""
+    squares = sum(np.square(e).sum(axis=0) for e in left)
+    n = sum(map(len, left))
+    faster = np.ones(len(memory), dtype=np.bool_)
+    for lag in LAGS:
+        products = sum((e[lag:] * e[:-lag]).sum(axis=0) for e in left)
+        faster &= products / np.maximum(squares, TINY) - memory**lag < LONGER / np.sqrt(n)
+    return faster
+
+
+def _shown_by_samples(
+    problem: Problem, std: Float[np.ndarray, " d"], memory: Float[np.ndarray, " d"]
+) -> Bool[np.ndarray, " d"]:
+    """Whether noise of this size and memory would leave differences as large as the samples'.
+
+    What a model leaves of a signal is smooth: it would make them smaller than they are.
+    """
+    differences = [np.diff(r.samples, ORDER, axis=0) for r in problem.records]
+    count = max(sum(map(len, differences)), 1)
+    measured = sum(np.square(d).sum(axis=0) for d in differences) / count
+    weights = (np.poly1d([1.0, -1.0]) ** ORDER).coeffs
+    own, lags = np.convolve(weights, weights[::-1]), np.abs(np.arange(-ORDER, ORDER + 1))
+    expected = np.square(std) * (own * memory[:, None] ** lags).sum(axis=1)
+    far = np.abs(np.log(np.maximum(measured, TINY) / expected))
+    return far < ALIKE / np.sqrt(count)

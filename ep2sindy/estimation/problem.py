@@ -1,0 +1,237 @@
+"""What is estimated: records in scaled variables, and all coefficients that a model may have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.interpolate import make_interp_spline
+
+from ep2sindy.constraints.relations import Relation, constraint
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.kernels import sensitivity_stage, term_values
+from ep2sindy.library.library import Library
+
+# Where each Runge-Kutta stage stands in its step, and the share of its slope in the sum.
+STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One trajectory in scaled variables.
+
+    steps: (samples - 1,), in units of the mean step. samples: (samples, d). inputs: cubics
+    through the samples' inputs, of time in units of the mean step; times: (samples,) so.
+    """
+
+    times: Float[np.ndarray, " samples"]
+    samples: Float[np.ndarray, "samples d"]
+    inputs: Float[np.ndarray, "samples n_inputs"]
+
+    @cached_property
+    def steps(self) -> Float[np.ndarray, " steps"]:
+        return np.diff(self.times)
+
+    def inputs_at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
+        """Inputs where a share of every step has passed."""
+        if not self.inputs.shape[1]:
+            return np.empty((len(self.steps), 0))
+        return self._curve(self.times[:-1] + share * self.steps)
+
+    @cached_property
+    def _curve(self) -> Callable[[np.ndarray], np.ndarray]:
+        # What is switched is held for most steps, and cubics would overshoot.
+        switched = (np.diff(self.inputs, axis=0) == 0.0).mean(axis=0) > 0.5
+        degree = 1 if switched.any() else min(3, len(self.inputs) - 1)
+        return make_interp_spline(self.times, self.inputs, k=degree)
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """Where a model takes states over each step, and how that depends on them.
+
+    ends: (steps, d). slopes: (steps, d, d + coefficients): by the state, then by coefficients.
+    """
+
+    ends: Float[np.ndarray, "steps d"]
+    slopes: Float[np.ndarray, "steps d columns"]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Records, the library of their variables, and the coefficients: coef = C free + fixed.
+
+    library: of scaled variables, states first. equation, column: (coefficients,), where each
+    stands. C: (coefficients, free), fixed: (coefficients,), both scaled; without relations C is
+    the identity. required: (free,), those that are never left out. to_SI: (coefficients,), what
+    takes each from scaled to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
+    """
+
+    library: Library
+    states: tuple[str, ...]
+    records: tuple[Record, ...]
+    equation: Int[np.ndarray, " coefficients"]
+    column: Int[np.ndarray, " coefficients"]
+    C: Float[np.ndarray, "coefficients free"]
+    fixed: Float[np.ndarray, " coefficients"]
+    required: Bool[np.ndarray, " free"]
+    to_SI: Float[np.ndarray, " coefficients"]
+    scale: Float[np.ndarray, " d"]
+    step_s: float
+
+    @property
+    def n_samples(self) -> int:
+        return sum(len(record.samples) for record in self.records)
+
+    @property
+    def related(self) -> bool:
+        """Whether relations hold between coefficients."""
+        return self.C.shape[0] != self.C.shape[1] or not np.array_equal(self.C, np.eye(len(self.C)))
+
+    @cached_property
+    def block(self) -> Int[np.ndarray, " free"]:
+        """The equation that each free coefficient belongs to; a shared one, to its first."""
+        return self.equation[np.argmax(self.C != 0.0, axis=0)]
+
+    @cached_property
+    def degrees(self) -> Int[np.ndarray, " free"]:
+        """Of each free coefficient's term; of several, the least."""
+        degrees = self.library.degrees[self.column]
+        return np.where(self.C != 0.0, degrees[:, None], degrees.max()).min(axis=0)
+
+    def coef(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, "terms d"]:
+        """Scaled coefficients as a matrix."""
+        coef = np.zeros((len(self.library), len(self.states)))
+        coef[self.column, self.equation] = self.C @ free + self.fixed
+        return coef
+
+    def ends(
+        self,
+        record: Record,
+        states: Float[np.ndarray, "steps d"],
+        free: Float[np.ndarray, " free"],
+        n_substeps: int,
+    ) -> Float[np.ndarray, "steps d"]:
+        """Where the flow takes states over each step, by `n_substeps` classical RK4 steps."""
+        rates = self._shares[:, 0].T @ self.coef(free)
+        h = record.steps[:, None] / n_substeps
+        for k in range(n_substeps):
+            slope, total = np.zeros_like(states), states
+            for lead, weight in STAGES:
+                here = states + lead * h * slope
+                slope = self._products_at(record, here, (k + lead) / n_substeps) @ rates
+                total = total + weight * h * slope
+            states = total
+        return states
+
+    def flow(
+        self,
+        record: Record,
+        states: Float[np.ndarray, "steps d"],
+        free: Float[np.ndarray, " free"],
+        support: Bool[np.ndarray, " free"],
+        n_substeps: int,
+    ) -> Flow:
+        """The same with its derivatives, by the states and by the free ones of a support."""
+        d = len(self.states)
+        involved = np.flatnonzero(self.C[:, support].any(axis=1))
+        equation, column = self.equation[involved], self._places[self.column[involved]]
+        by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], self.coef(free))
+        rates = np.column_stack(
+            [self._shares[:, 0].T @ self.coef(free), by_state.reshape(-1, d * d)]
+        )
+        h = record.steps / n_substeps
+        slopes = np.zeros((len(states), d, d + len(involved)))
+        slopes[:, np.arange(d), np.arange(d)] = 1.0
+        for k in range(n_substeps):
+            slope, total = np.zeros_like(states), states
+            stage, sums = np.zeros_like(slopes), slopes.copy()
+            for lead, weight in STAGES:
+                here = states + (lead * h)[:, None] * slope
+                values = self._products_at(record, here, (k + lead) / n_substeps)
+                both = values @ rates
+                slope, jacobian = both[:, :d], both[:, d:].reshape(-1, d, d)
+                sensitivity_stage(
+                    jacobian, values, equation, column, slopes, lead * h, stage, weight * h, sums
+                )
+                total = total + (weight * h)[:, None] * slope
+            states, slopes = total, sums
+        if self.related:
+            by_free = slopes[:, :, d:] @ self.C[np.ix_(involved, support)]
+            slopes = np.concatenate([slopes[:, :, :d], by_free], axis=2)
+        return Flow(states, slopes)
+
+    def _products_at(
+        self, record: Record, states: Float[np.ndarray, "steps d"], share: float
+    ) -> Float[np.ndarray, "steps products"]:
+        inputs = record.inputs_at(share)
+        columns = np.concatenate([states, inputs, np.ones((len(states), 1))], axis=1)
+        return term_values(self._products.with_functions(columns, axis=1), self._products.table)
+
+    @cached_property
+    def _derived(self) -> tuple[Library, np.ndarray]:
+        return self.library.with_derivatives(len(self.states))
+
+    @property
+    def _products(self) -> Library:
+        return self._derived[0]
+
+    @property
+    def _shares(self) -> Float[np.ndarray, "terms columns products"]:
+        return self._derived[1]
+
+    @cached_property
+    def _places(self) -> Int[np.ndarray, " terms"]:
+        """Which product each term is."""
+        return np.argmax(self._shares[:, 0] != 0.0, axis=1)
+
+
+def scaled_problem(
+    runs: Sequence[Trajectory],
+    library: Library,
+    relations: Sequence[Relation] = (),
+    terms: Mapping[str, Sequence[str]] | None = None,
+) -> Problem:
+    """Scale records and library, and gather the coefficients that may be in the model.
+
+    relations: hold between coefficients. terms: by state, all the terms of an equation that is
+    known but for its coefficients.
+    """
+    states, names = runs[0].state_names, runs[0].names
+    over = library.over(names)
+    values = np.concatenate([run.values for run in runs])
+    size = zero_to_one(np.sqrt(np.square(values).mean(axis=0)))
+    step_s = float(np.mean(np.concatenate([np.diff(run.t) for run in runs])))
+    scaled, numbers = over.scaled(size)
+    asked = {state: (terms or {}).get(state, over.names) for state in states}
+    held = constraint(over, asked, relations)
+    column = np.array([over.index(term) for _, term in held.coefficients])
+    equation = np.array([states.index(state) for state, _ in held.coefficients])
+    to_SI = size[equation] / (numbers[column] * step_s)
+    known = np.isin(equation, [states.index(state) for state in terms or {}])
+    return Problem(
+        library=scaled,
+        states=tuple(states),
+        records=tuple(_record(run, size, step_s) for run in runs),
+        equation=equation,
+        column=column,
+        C=held.C * to_SI[held.free] / to_SI[:, None],
+        fixed=held.d / to_SI,
+        required=(held.C[known] != 0.0).any(axis=0),
+        to_SI=to_SI,
+        scale=size[: len(states)],
+        step_s=step_s,
+    )
+
+
+def _record(run: Trajectory, size: np.ndarray, step_s: float) -> Record:
+    d = len(run.state_names)
+    return Record(
+        times=(run.t - run.t[0]) / step_s,
+        samples=run.states / size[:d],
+        inputs=run.inputs / size[d:],
+    )

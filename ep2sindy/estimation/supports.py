@@ -1,0 +1,125 @@
+"""Which coefficients pay for themselves: supports of all equations from one Gram pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.estimation.likelihood import Gram
+from ep2sindy.estimation.problem import Problem
+from ep2sindy.search.searches import BestSubset
+
+MOST_SWEEPS = 10  # over the equations: two or three are the rule
+N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
+CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which terms are dependent
+
+
+@dataclass(frozen=True, eq=False)
+class Priced:
+    """A support, the best free coefficients on it, and its squares plus the prices of its terms."""
+
+    support: Bool[np.ndarray, " free"]
+    free: Float[np.ndarray, " free"]
+    score: float
+
+
+def term_prices(problem: Problem, n_samples: float) -> Float[np.ndarray, " free"]:
+    """What a coefficient must lower the squares by: log n, and what singles it out.
+
+    A term of degree q is one of d C(d + q, q), and every degree above the first is half as likely
+    to be there as the one below; a constant is no simpler than a variable.
+    Source: Schwarz 1978, doi:10.1214/aos/1176344136, for log n; Chen & Chen 2008,
+    doi:10.1093/biomet/asn034, for the count.
+    """
+    degrees = np.maximum(problem.degrees, 1)
+    counts = np.array([(problem.degrees <= degree).sum() for degree in degrees])
+    return np.log(n_samples) + 2.0 * np.log(counts) + 2.0 * np.log(2.0) * (degrees - 1)
+
+
+def best_support(
+    problem: Problem,
+    gram: Gram,
+    prices: Float[np.ndarray, " free"],
+    start: Bool[np.ndarray, " free"],
+    *,
+    max_terms: int,
+) -> Priced:
+    """The support of least score: every equation's exactly, given the others', until none changes.
+
+    max_terms: of one equation. Those required are always in.
+    """
+    best = priced(gram, start, prices)
+    for _ in range(MOST_SWEEPS):
+        before = best
+        for block in np.unique(problem.block):
+            own = problem.block == block
+            if problem.required[own].all():
+                continue
+            offered = _offered(problem, gram, best.support, own, max_terms)
+            best = min([best, *(priced(gram, s, prices) for s in offered)], key=lambda p: p.score)
+        if best is before:
+            return best
+    return best
+
+
+def supports_by_size(
+    problem: Problem, gram: Gram, chosen: Bool[np.ndarray, " free"], block: int, *, max_terms: int
+) -> list[Bool[np.ndarray, " free"]]:
+    """The best few supports of every size of one equation, the others as chosen."""
+    return _offered(problem, gram, chosen, problem.block == block, max_terms)
+
+
+def priced(
+    gram: Gram, support: Bool[np.ndarray, " free"], prices: Float[np.ndarray, " free"]
+) -> Priced:
+    """The least squares on a support, with its terms' prices."""
+    free = np.zeros(len(support))
+    quadratic, linear = gram.quadratic[np.ix_(support, support)], gram.linear[support]
+    inverse = _inverse(quadratic)
+    free[support] = inverse @ linear
+    # One refinement: what the cutoff dropped has no part in it.
+    free[support] += inverse @ (linear - quadratic @ free[support])
+    rest = gram.offset - 2.0 * gram.linear @ free + free @ gram.quadratic @ free
+    return Priced(support, free, float(rest + prices[support].sum()))
+
+
+def _offered(
+    problem: Problem,
+    gram: Gram,
+    chosen: Bool[np.ndarray, " free"],
+    own: Bool[np.ndarray, " free"],
+    max_terms: int,
+) -> list[Bool[np.ndarray, " free"]]:
+    """Supports of one equation's coefficients, the others' and those required kept free."""
+    kept = (chosen & ~own) | problem.required
+    own = own & ~problem.required
+    if not own.any():
+        return [kept]
+    inverse = _inverse(gram.quadratic[np.ix_(kept, kept)])
+    share = gram.quadratic[np.ix_(own, kept)] @ inverse
+    xx = gram.quadratic[np.ix_(own, own)] - share @ gram.quadratic[np.ix_(kept, own)]
+    xy = gram.linear[own] - share @ gram.linear[kept]
+    yy = max(gram.offset - gram.linear[kept] @ inverse @ gram.linear[kept], 1.0)
+    # A column that those kept make up leaves rounding: it is not at hand.
+    square = np.diag(xx).copy()
+    square[square <= CUTOFF * np.diag(gram.quadratic)[own]] = 0.0
+    size = np.sqrt(zero_to_one(square))
+    at_hand = square > 0.0
+    unit = np.where(at_hand[:, None] & at_hand, xx / np.outer(size, size), 0.0)
+    search = BestSubset(max_terms=min(max_terms, int(own.sum())), n_best=N_BEST)
+    masks = search.supports(unit, np.where(at_hand, xy / size, 0.0) / np.sqrt(yy), 1.0)
+    found = []
+    for mask in masks:
+        support = kept.copy()
+        support[own] = mask
+        found.append(support)
+    return found
+
+
+def _inverse(quadratic: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    size = np.sqrt(zero_to_one(np.diag(quadratic)))
+    unit = quadratic / np.outer(size, size)
+    return np.linalg.pinv(unit, rcond=CUTOFF, hermitian=True) / np.outer(size, size)
