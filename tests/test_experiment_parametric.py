@@ -265,7 +265,7 @@ def own_files(output: Path, *points: str) -> list[str]:
         *toy(output)[:1],
         *toy(output)[5:],
         "data=file",
-        "data.path=none.nc",
+        "data.path=null",
         "data.variables.R_ion.name=R_ion",
         "data.variables.u_iz.name=u_iz",
         "parameters={V_D_V: null, mdot_mg_s: null}",

@@ -2,6 +2,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from omegaconf import DictConfig
@@ -9,6 +10,8 @@ from omegaconf import DictConfig
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.operating_law import OperatingLaw
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.studies.predict.branch import map_points
 from ep2sindy.studies.predict.study import Study, expanded
 from tests import programs
@@ -54,6 +57,10 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     assert {p.stem for p in (folder / "figures").glob("*.png")} == {
         "left_out", f"laws_{name}", f"map_{name}",
     }  # fmt: skip
+    assert branch["left_out"]["n_lives"] <= 6
+    log = (folder / "run.log").read_text()
+    assert "at V_D_V, mdot_mg_s = (150, 2)" in log
+    assert "amplitude n_i" in log
     page = (folder / "report.html").read_text()
     assert "Points left out" in page
     assert "6 coefficients of 3 functions each, 18 numbers, from 6 records" in page
@@ -73,6 +80,8 @@ def test_ranges_of_points_are_every_combination_once() -> None:
     blocks = [{"a": [1.0, 2.0], "b": [3.0, 4.0]}, {"a": 2.0, "b": [4.0, 5.0]}]
     found = expanded(blocks, ["a", "b"])
     assert [(p["a"], p["b"]) for p in found] == [(1, 3), (1, 4), (2, 3), (2, 4), (2, 5)]
+    whole = expanded([{"a": 300, "b": 5.0}, {"b": [5], "a": 300.0}], ["a", "b"])
+    assert whole == [{"a": 300, "b": 5.0}]
     (own,) = expanded([{"a": 1.0, "data": {"path": "a.nc"}}], ["a"])
     assert own == {"a": 1.0, "data": {"path": "a.nc"}}
 
@@ -92,6 +101,15 @@ def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
         (["model.n_i=[n_i,u_iz]"], "a law's model runs freely, on its states ['n_i', 'n_n'] alone"),
         (["model.n_n=[]"], "model must list the terms of every state"),
         (["points=[{V_D_V: [250, 300]}]"], "a point must have ['V_D_V', 'mdot_mg_s']"),
+        (
+            ["points=[{V_D_V: 300, mdot_mg_s: [4, 5, 6, 7]}]"],
+            "points must vary in every parameter: V_D_V is 300 at all 4; give it more values, or "
+            "leave it out (~parameters.V_D_V)",
+        ),
+        (
+            ["points=[{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}]"],
+            "a law of degree 1 has 3 functions of ['V_D_V', 'mdot_mg_s'] and needs more points",
+        ),
         (["points=[]"], "points must be a list like [{V_D_V: [250,300]"),
         (["parameters.V_D_V=operating_point.volts"], "parameters must name numbers of the data"),
         (["degrees=[]"], "degrees must be a list such as [a,b]"),
@@ -105,9 +123,43 @@ def test_settings_that_cannot_work_cost_no_simulation(overrides: list[str], mess
 
 
 def test_points_that_are_quiet_have_no_law(tmp_path: Path) -> None:
-    quiet = "points=[{V_D_V: 150.0, mdot_mg_s: [2.0, 3.0]}]"
+    quiet = "points=[{V_D_V: [150.0, 155.0], mdot_mg_s: [2.0, 2.5]}]"
     with pytest.raises(ValueError, match="operating points that oscillate: none of these does"):
         programs.computed(composed(*toy(tmp_path), quiet))
+
+
+def own_records(folder: Path, *values: float) -> list[str]:
+    """Lienard's van der Pol over one parameter, in CSV files; a period takes seven seconds."""
+    points = []
+    for a in values:
+        library = polynomial(["p", "q"], degree=3)
+        terms = [{"p": a, "q": -1.0, "p^3": -0.3}, {"p": 1.0}]
+        model = SparseModel(library, ["p", "q"], coef_matrix(library, terms))
+        states = model.simulate(0.1 * np.arange(1000), [1.0, 0.0]).states[300:]
+        path = folder / f"{a}.csv"
+        table = pd.DataFrame({"time": 0.1 * np.arange(700), "p": states[:, 0], "q": states[:, 1]})
+        table.to_csv(path, index=False)
+        points.append(f"{{a: {a}, data: {{path: {path}}}}}")
+    return [
+        f"output={folder}", "data=file", "data.path=null", "data.z.name=null",
+        "trajectory.zone.z=null", "data.variables.n_i.name=p", "data.variables.n_n.name=q",
+        "~parameters.V_D_V", "~parameters.mdot_mg_s", "+parameters.a=null",
+        f"points=[{','.join(points)}]", "model.n_i=[n_i,n_n,'n_i^3']", "model.n_n=[n_i]",
+        "degrees=[1]", "windows.n_windows=4", "map_points=5", "parallel=serial",
+    ]  # fmt: skip
+
+
+def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) -> None:
+    folder = run_config(composed(*own_records(tmp_path, 0.6, 0.9, 1.2, 1.5))).folder
+    law = OperatingLaw.load(folder / "law_all.json")
+    np.testing.assert_allclose(law.model_at({"a": 1.0}).terms("n_i")["n_i"], 1.0, atol=1e-3)
+    assert {p.stem for p in (folder / "figures").glob("*.png")} == {
+        "laws_all", "left_out", "map_all",
+    }  # fmt: skip
+    log = " ".join((folder / "run.log").read_text().split())
+    assert "4 of 4 live, diverging: 0." in log
+    assert "f (mHz)" in log
+    assert "also: other cycles" not in log
 
 
 def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(tmp_path: Path) -> None:
@@ -119,3 +171,4 @@ def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(tmp_p
     table = found.outcome.tables()["structures"]
     assert table["chosen"].sum() == 1
     assert "Structure and order" in found.log
+    assert found.log.count("<- chosen") == 1

@@ -93,7 +93,8 @@ def check_records(records: Sequence[OperatingRecord]) -> None:
             )
     if len(records) == 1:
         raise ValueError(
-            f"one operating point, {point_text(records[0].parameters)}, has no law: add points"
+            f"a law needs more than one operating point: {point_text(records[0].parameters)} came "
+            "alone; add points near it"
         )
     values = values_of(records)
     for name, column in zip(names, values.T, strict=True):

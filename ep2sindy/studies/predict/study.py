@@ -18,7 +18,7 @@ from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.opening import PointSource, point_sources
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
 from ep2sindy.studies.predict.branch import Branch, How, Searched, branch_of, grouped
-from ep2sindy.studies.predict.view import Outcome
+from ep2sindy.studies.predict.view import Outcome, n_points
 from ep2sindy.studies.simulate_scan import compile_kernels
 from ep2sindy.studies.source import Source
 
@@ -71,7 +71,9 @@ class Study:
 
     def __post_init__(self) -> None:
         self._how(0)
-        point_sources(self.source, self.parameters, expanded(self.points, list(self.parameters)))
+        given = expanded(self.points, list(self.parameters))
+        sources = point_sources(self.source, self.parameters, given)
+        _check_enough([source.parameters for source in sources], min(self.degrees))
 
     def compute(self, run: Run) -> Outcome:
         how = self._how(run.seed)
@@ -87,12 +89,14 @@ class Study:
         everywhere = [source.parameters for source in sources]
         groups = grouped(records)
         for name, members in groups.items():
-            run.say(f"{name}: {len(members)} points")
+            cycle = "" if len(groups) == 1 else f" on the {name} cycle"
+            run.say(f"fitting a law to {n_points(len(members))}{cycle} ...")
             try:
                 found[name] = branch_of(name, members, everywhere, how, self.parallel)
             except ValueError as error:
                 reasons[name] = str(error)
-                run.warn(f"the {name} cycle has no law: {error}")
+                if len(groups) > 1:
+                    run.warn(f"two cycles coexist, and the {name} one gets no law: {error}")
         if not found:
             raise ValueError(f"no law: {'; '.join(reasons.values())}")
         for name, branch in found.items():
@@ -128,7 +132,10 @@ class Study:
 def expanded(
     blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Every combination of the values in each block; a point that comes again comes once."""
+    """Every combination of the values in each block; a point that comes again comes once.
+
+    That is, with the same data. 300 and 300.0 are one, in whatever order a block names parameters.
+    """
     found: dict[str, dict[str, Any]] = {}
     for block in blocks:
         lists = {
@@ -139,8 +146,26 @@ def expanded(
         rest = {name: value for name, value in block.items() if name not in lists}
         for values in product(*lists.values()):
             point = {**dict(zip(lists, values, strict=True)), **rest}
-            found.setdefault(str(point), point)
+            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
+            found.setdefault(str(sorted(same.items(), key=lambda item: item[0])), point)
     return list(found.values())
+
+
+def _check_enough(points: Sequence[Mapping[str, float]], degree: int) -> None:
+    """Raise ValueError for points that bear no law even if all of them oscillate."""
+    for name in points[0]:
+        values = {point[name] for point in points}
+        if len(values) == 1:
+            raise ValueError(
+                f"points must vary in every parameter: {name} is {values.pop():g} at all "
+                f"{len(points)}; give it more values, or leave it out (~parameters.{name})"
+            )
+    functions = polynomial(list(points[0]), degree=degree)
+    if len(points) <= len(functions):
+        raise ValueError(
+            f"a law of degree {degree} has {len(functions)} functions of {list(points[0])} and "
+            f"needs more points than these, since each is left out in turn: {len(points)} came"
+        )
 
 
 def _records(opened: Sequence[PointData], run: Run) -> tuple[list[OperatingRecord], dict[str, str]]:

@@ -113,6 +113,12 @@ def _left_out_row(each: LeftOut, branches: Mapping[str, Branch], own: str) -> di
     }
 
 
+def states_of(left_out: pd.DataFrame) -> list[str]:
+    """States of a table of points left out."""
+    names = [str(name) for name in left_out]
+    return [n.removeprefix("amplitude_") for n in names if n.startswith("amplitude_")]
+
+
 def structures_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
     """One row per structure and degree that was tried, with weighted laws at points left out."""
     rows = []

@@ -12,45 +12,24 @@ import pandas as pd
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.discovery.operating_points import OperatingRecord, values_of
-from ep2sindy.figures.operating import laws_figure, left_out_figure, map_figure
+from ep2sindy.figures.operating import frequency_scale, laws_figure, left_out_figure
+from ep2sindy.figures.operating_map import line_figure, map_figure
 from ep2sindy.model.free_run import Verdict
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
+from ep2sindy.report.document import (
+    Block,
+    Captioned,
+    Equation,
+    Picture,
+    Section,
+    Table,
+    Text,
+    places,
+)
 from ep2sindy.studies.parametric.oscillation import OSCILLATING, point_label
 from ep2sindy.studies.predict import tables
 from ep2sindy.studies.predict.branch import Branch
-
-INTERVALS = (
-    "±: half the 95 % interval, from a sandwich with the windows of all points as clusters: how "
-    "far other windows of the same records would move a number, not how far a law of this form is "
-    "from the truth; for that see the points left out."
-)
-LEFT_OUT = (
-    "Each point in turn read off the law of the others, tied in one refinement, and run freely "
-    "from one sample of its record, where the states move least. f, amplitude and waveform: errors "
-    "against the record's cycle; enclosed: whether the others enclose it; also: other cycles whose "
-    "law oscillates there, inside its points."
-)
-TRIED = (
-    "error: mean over the points left out of the largest deviation from the cycle, in units of its "
-    "bound (1 % of frequency, 10 % of amplitude, 0.2 of waveform), 10 at most; laws through "
-    "separate refinements. Chosen: the fewest numbers within a standard error of the least."
-)
-CAPTIONS = {
-    "laws": "Coefficients over the operating parameters: refined at each point alone (open, with "
-    "95 % intervals) and by the law that all points share (lines). Where the open points leave "
-    "the lines by more than their bars, other coefficients make up for it: points are sloppy in "
-    "some directions, and the law is fitted to the records, not to them.",
-    "left_out": "Points left out, each read off the law of the others. Left: frequency of the free "
-    "run over the record's, the band 1 %. Right: errors of amplitude and waveform of each "
-    "state, those beyond the panel filled on its edge; band and line are the bounds of a "
-    "model that lives.",
-    "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameters, and of the simulated points in the same colours (circles); "
-    "crosses: simulated points that do not oscillate. Black line: where the model's cycle ends; "
-    "dashed: where its fixed point turns stable; grey: the points that the law was fitted to "
-    "enclose this. White: no cycle.",
-}
+from ep2sindy.studies.predict.words import ALSO, CAPTIONS, INTERVALS, LEFT_OUT, TRIED
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +86,15 @@ class Outcome:
                 laws_figure, at_points, branch.law, parameters=self.parameters, labels=self.labels
             )
             found[f"laws_{name}"] = Captioned(draw, CAPTIONS["laws"])
-            if branch.map and len(self.parameters) == 2:
-                points = self._tables["points"]
-                own = (points["branch"] == name) | (points["branch"] == "")
-                draw = partial(
-                    map_figure, self._of("map", name), points[own], branch.law.points,
-                    parameters=self.parameters, labels=self.labels,
+            if branch.map:
+                drawn, caption = (map_figure, "map") if len(self.parameters) == 2 else (
+                    line_figure, "line",
                 )  # fmt: skip
-                found[f"map_{name}"] = Captioned(draw, CAPTIONS["map"])
+                draw = partial(
+                    drawn, self._of("map", name), self._tables["points"], branch.law.points,
+                    branch=name, parameters=self.parameters, labels=self.labels,
+                )  # fmt: skip
+                found[f"map_{name}"] = Captioned(draw, CAPTIONS[caption])
         return found
 
     def _of(self, table: str, branch: str) -> pd.DataFrame:
@@ -131,25 +111,39 @@ class Outcome:
         ]
 
     def _point_lines(self) -> list[Block]:
-        counts: dict[str, list[str]] = {}
-        for label, status in self.statuses.items():
-            counts.setdefault(status, []).append(label)
-        lines: list[Block] = []
-        for status, labels in counts.items():
-            where = "" if status == OSCILLATING else f": {'; '.join(labels)}"
-            lines.append(Text(f"{len(labels)} {status}{where}"))
+        groups: dict[str, list[Mapping[str, float]]] = {}
+        for point in self.points:
+            groups.setdefault(self.statuses[point_label(point)], []).append(point)
+        lines = [
+            f"{len(points)} {status}{'' if status == OSCILLATING else self._at(points)}"
+            for status, points in groups.items()
+        ]
         if len(self.members) > 1:
-            for name, group in self.members.items():
-                where = "; ".join(point_label(point) for point in group)
-                lines.append(Text(f"{name} cycle, {len(group)} points: {where}"))
-        return lines
+            counts = [f"{n_points(len(group))} on the {n}" for n, group in self.members.items()]
+            few = min(self.members.values(), key=len)
+            lines.append(f"two cycles: {' one, '.join(counts)} one{self._at(few)}")
+        return [Text(line) for line in lines]
+
+    def _at(self, points: Sequence[Mapping[str, float]]) -> str:
+        """` at V_D_V, mdot_mg_s = (150, 3), (175, 2)`."""
+        texts = [", ".join(f"{value:g}" for value in point.values()) for point in points]
+        if len(self.parameters) > 1:
+            texts = [f"({text})" for text in texts]
+        return f" at {', '.join(self.parameters)} = {', '.join(texts)}"
+
+    def _cycle(self, name: str) -> str:
+        """Of a heading: nothing where there is but one cycle."""
+        return "" if len(self.members) == 1 else f" of the {name} cycle"
 
     def _structures(self, name: str) -> Section:
-        rows = self._of("structures", name).drop(columns="branch")
-        shown = rows.drop(columns="chosen").sort_values("error", kind="stable")
-        places = np.flatnonzero(rows.loc[shown.index, "chosen"]).tolist()
-        shown["f_error"] = [_percent(value) for value in shown["f_error"]]
-        return Section(f"Structure and order: {name}", [Table(shown, bold=places, note=TRIED)])
+        rows = self._of("structures", name).sort_values("error", kind="stable")
+        bold = np.flatnonzero(rows["chosen"]).tolist()
+        shown = rows.drop(columns=["branch", "chosen"]).rename(columns={"f_error": "f error"})
+        shown["f error"] = [_percent(value) for value in rows["f_error"]]
+        marks = np.where(rows["chosen"], "  <- chosen", "")
+        shown["terms"] = [text + mark for text, mark in zip(rows["terms"], marks, strict=True)]
+        title = f"Structure and order{self._cycle(name)}"
+        return Section(title, [Table(shown, bold=bold, note=TRIED)])
 
     def _law(self, name: str, branch: Branch) -> Section:
         law, found = branch.law, branch.tied
@@ -172,43 +166,48 @@ class Outcome:
             f"{found.loss.mean():.3g} of a constant's. At {point_label(middle.parameters)}:"
         )
         blocks = [Text(text), *equations, Table(pd.DataFrame(shown), note=INTERVALS)]
-        return Section(f"Law: {name}", [*blocks, Picture(f"laws_{name}")])
+        return Section(f"Law{self._cycle(name)}", [*blocks, Picture(f"laws_{name}")])
 
     def _left_out(self) -> list[Block]:
         rows = self._tables["left_out"]
-        shown = rows.copy()
-        if len(self.branches) == 1:
-            shown = shown.drop(columns=["branch", "also"])
-        shown = shown.drop(columns="f_model_kHz").rename(columns={"f_error": "f"})
-        shown["f"] = [_percent(value, sign=True) for value in rows["f_error"]]
-        for column in [c for c in map(str, rows) if c.startswith(("amplitude_", "waveform_"))]:
-            change = column.startswith("amplitude_")
-            shown[column] = [
-                _percent(value - 1.0, sign=True) if change else f"{value:.3f}".replace("nan", "-")
-                for value in rows[column]
-            ]
-        for name in self.parameters:
-            shown[name] = [f"{value:g}" for value in rows[name]]
-        shown["f_kHz"] = [f"{value:.2f}" for value in rows["f_kHz"]]
-        shown["enclosed"] = ["yes" if value else "no" for value in rows["enclosed"]]
-        headings = {c: str(c).replace("_", " ") for c in shown if c not in self.parameters}
-        shown = shown.rename(columns=headings)
+        rows = rows.sort_values(["branch", *self.parameters], kind="stable")
+        several = len(self.branches) > 1
+        columns: dict[str, list[str]] = {"cycle": rows["branch"].tolist()} if several else {}
+        columns |= {name: [f"{value:g}" for value in rows[name]] for name in self.parameters}
+        columns["enclosed"] = ["yes" if value else "no" for value in rows["enclosed"]]
+        factor, unit = frequency_scale(rows["f_kHz"])
+        columns[f"f ({unit})"] = [places(factor * value, 2) for value in rows["f_kHz"]]
+        columns["f error"] = [_percent(value, sign=True) for value in rows["f_error"]]
+        for state in tables.states_of(rows):
+            ratios = rows[f"amplitude_{state}"]
+            columns[f"amplitude {state}"] = [_percent(r - 1.0, sign=True) for r in ratios]
+        for state in tables.states_of(rows):
+            columns[f"waveform {state}"] = [places(v, 3) for v in rows[f"waveform_{state}"]]
+        columns["verdict"] = rows["verdict"].tolist()
+        if several:
+            columns["also"] = rows["also"].tolist()
         lines: list[Block] = [Text(self._spread(name)) for name in self.branches]
-        return [*lines, Table(shown, note=LEFT_OUT), Picture("left_out")]
+        table = Table(pd.DataFrame(columns), note=LEFT_OUT + (ALSO if several else ""))
+        return [*lines, table, Picture("left_out")]
 
     def _spread(self, name: str) -> str:
         found = self._numbers(name)
         smooth_f, smooth_amplitude = self.branches[name].smooth
+        lead = f"{name} cycle: " if len(self.members) > 1 else ""
+        most = f"nine in ten within {_percent(found['f_90'])}"
+        if not np.isfinite(found["f_90"]):
+            most = "more than one in ten do not oscillate"
         return (
-            f"{name}: frequency {_percent(found['f_median'])} in the median, nine in ten "
-            f"{_percent(found['f_90'])}; {found['diverging']:.0f} of {found['n']:.0f} diverge; "
-            f"amplitude {_percent(found['amplitude_median'])}, waveform "
-            f"{found['waveform_median']:.3f}. The records' own frequencies and amplitudes, "
+            f"{lead}{found['n_lives']} of {found['n']} live, diverging: {found['diverging']}. "
+            f"Errors in the median: frequency {_percent(found['f_median'])} ({most}), the worst "
+            "state's amplitude "
+            f"{_percent(found['amplitude_median'])} and waveform "
+            f"{places(found['waveform_median'], 3)}. The records' own frequencies and amplitudes, "
             f"interpolated by the same functions, miss by {_percent(float(np.median(smooth_f)))} "
             f"and {_percent(float(np.median(smooth_amplitude)))} in the median."
         )
 
-    def _numbers(self, name: str) -> dict[str, float]:
+    def _numbers(self, name: str) -> dict[str, float | int]:
         found = self.branches[name].left_out
         f = np.array([abs(each.run.f_error) for each in found])
         f[np.isnan(f)] = np.inf
@@ -216,9 +215,9 @@ class Outcome:
         amplitude = np.array([np.abs(each - 1.0).max() for each in ratios])
         waveform = np.array([max(each.run.waveform_error.values()) for each in found])
         return {
-            "n": float(len(found)),
-            "n_lives": float(sum(each.run.verdict is Verdict.LIVES for each in found)),
-            "diverging": float(sum(each.run.rollout.diverged for each in found)),
+            "n": len(found),
+            "n_lives": sum(each.run.verdict is Verdict.LIVES for each in found),
+            "diverging": sum(each.run.rollout.diverged for each in found),
             "f_median": float(np.median(f)),
             "f_90": float(np.quantile(f, 0.9, method="higher")),
             "amplitude_median": _median(amplitude),
@@ -255,8 +254,14 @@ class Outcome:
 
     def headline(self) -> dict[str, float]:
         right, n, _, _ = tables.agreement(self.branches, self.statuses)
-        first = self._numbers(next(iter(self.branches)))
+        numbers = self._numbers(next(iter(self.branches)))
+        first = {key: float(value) for key, value in numbers.items()}
         return {"n_points": float(len(self.points)), **first, "map_right": right / n}
+
+
+def n_points(n: int) -> str:
+    """`1 point`, `3 points`."""
+    return f"{n} point" if n == 1 else f"{n} points"
 
 
 def _middle(records: Sequence[OperatingRecord]) -> OperatingRecord:
@@ -272,7 +277,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def _percent(value: float, *, sign: bool = False) -> str:
-    if np.isnan(value):
+    if not np.isfinite(value):
         return "-"
     return f"{100.0 * value:{'+' if sign else ''}.2f} %"
 
