@@ -76,7 +76,7 @@ def _from_start(problem: Problem, log10_ratio: float | None, max_terms: int) -> 
     """Anneal with the smoother's noise, then with the noise that the model leaves, until both
     and the support agree."""
     fit, std = smoothed_start(problem, log10_ratio)
-    prices = term_prices(problem, problem.n_samples)
+    prices = term_prices(problem, float(problem.n_samples))
     found = annealed(problem, fit, std, prices, COOLING, max_terms=max_terms)
     for _ in range(MOST_PASSES):
         before, noise = found.fit.support, noise_beside(problem, found.fit)
@@ -86,6 +86,6 @@ def _from_start(problem: Problem, log10_ratio: float | None, max_terms: int) -> 
             break
     noise = noise_beside(problem, found.fit)
     error = 0.0
-    if np.isfinite(found.score) and not noise.memory.any() and (noise.std > FLOOR).any():
+    if np.isfinite(found.score) and (noise.std > FLOOR).any():
         error = flow_error(problem, found.fit, noise, found.level)
     return Solution(found, noise, prices, error)

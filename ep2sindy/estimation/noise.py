@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -73,12 +73,14 @@ def noise_beside(problem: Problem, fit: Fit) -> Noise:
 def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
     """rho under which the fit's support is most likely; 0 where an exact flow is.
 
-    Assumes white noise of these samples. Source of the likelihood by innovations: Schweppe 1965,
-    doi:10.1109/TIT.1965.1053737.
+    An exact flow is weighed with noise that lasts, where it does; one with error in white noise.
+    Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
-    best, found = _deviance(problem, fit, exact) - ERROR_SHOWS, 0.0
+    white = replace(exact, noise=noise.std)
+    by_memory = problem.n_samples * np.log1p(-np.square(noise.memory)).sum()
+    best, found = _deviance(problem, fit, white) + by_memory - ERROR_SHOWS, 0.0
     for rho in LEVELS:
-        level = Level(noise.std, rho, exact.n_substeps)
+        level = replace(white, rho=rho)
         fit = fitted(problem, fit, level)
         deviance = _deviance(problem, fit, level)
         if deviance < best:

@@ -1,0 +1,113 @@
+"""How often the joint estimator finds known equations, in noise of every kind; and its misfits.
+
+    python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
+    python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
+    python -m benchmarks.estimation samples             # CPU against the number of samples
+
+`counts` prints per system and noise: selected exactly right, wrong ones that are called a misfit,
+right ones that are, median CPU-s and the longest; of the right ones the median relative error of a
+coefficient and the share of 95 % intervals that hold the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+import ep2sindy as ep
+from benchmarks.known_systems import KINDS, OTHERS, noisy
+from ep2sindy.synthetic.draws import DRAWS
+from ep2sindy.synthetic.systems import System, lorenz
+
+
+def judged(system: System, found: ep.Estimate, cpu_s: float) -> dict[str, float]:
+    """Whether the support is right, and of a right one errors and coverage."""
+    true, coef = system.model.coef, found.model.coef
+    right = bool(((coef != 0.0) == (true != 0.0)).all())
+    row = {"right": float(right), "misfit": float(bool(found.misfit)), "cpu_s": cpu_s}
+    if right:
+        used = true.T != 0.0
+        std = np.sqrt(np.diag(found.model.covariance))
+        off = (coef - true).T[used]
+        row["error"] = float(np.median(np.abs(off / true.T[used])))
+        row["inside"] = float((np.abs(off) <= 1.96 * std).mean())
+    return row
+
+
+def counts(systems: Sequence[str], noises: Sequence[float], kind: str, n: int) -> None:
+    print(f"{'system':16} noise  right  misfit(wrong right)  CPU-s median max  error %  inside %")
+    for name, noise in product(systems, noises):
+        rows = []
+        for number in range(n):
+            system, run = noisy(name, noise, number, kind)
+            start = time.process_time()
+            found = ep.estimate([run], system.model.library)
+            rows.append(judged(system, found, time.process_time() - start))
+        print(f"{name:16} {noise:5g}  {_line(rows)}", flush=True)
+
+
+def _line(rows: Sequence[dict[str, float]]) -> str:
+    right = [row for row in rows if row["right"]]
+    wrong = [row for row in rows if not row["right"]]
+    cpu = [row["cpu_s"] for row in rows]
+    flagged = f"{sum(r['misfit'] for r in wrong):.0f}/{len(wrong)} "
+    flagged += f"{sum(r['misfit'] for r in right):.0f}/{len(right)}"
+    error = 100.0 * np.median([row["error"] for row in right]) if right else np.nan
+    inside = 100.0 * np.mean([row["inside"] for row in right]) if right else np.nan
+    return (
+        f"{len(right):3d}/{len(rows)}  {flagged:>18}  {np.median(cpu):11.2f} {max(cpu):5.2f}"
+        f"  {error:7.2f}  {inside:7.1f}"
+    )
+
+
+def misfits(systems: Sequence[str], n: int) -> None:
+    print("system            a true term left out, called a misfit")
+    for name in systems:
+        flagged = total = 0
+        for number in range(n):
+            system, run = noisy(name, 0.05, number)
+            library = system.model.library
+            present = np.flatnonzero((system.model.coef != 0.0).any(axis=1))
+            term = np.random.default_rng(number).choice(present)
+            found = ep.estimate([run], library.take(np.arange(len(library)) != term))
+            flagged, total = flagged + bool(found.misfit), total + 1
+        print(f"{name:16} {flagged}/{total}", flush=True)
+
+
+def samples() -> None:
+    print("samples  CPU-s  right")
+    for n in (1000, 3000, 10_000, 30_000, 100_000):
+        system = lorenz()
+        longer = System(system.name, system.model, system.initial, n / 300.0, 300.0)
+        run = longer.trajectory(noise=0.05, rng=0)
+        start = time.process_time()
+        found = ep.estimate([run], system.model.library)
+        row = judged(system, found, time.process_time() - start)
+        print(f"{n:7d}  {row['cpu_s']:5.2f}  {bool(row['right'])}", flush=True)
+
+
+def main() -> None:
+    every = [*DRAWS, *OTHERS]
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("what", choices=["counts", "misfit", "samples"])
+    parser.add_argument("--n", type=int, default=100)
+    parser.add_argument("--systems", nargs="+", default=every, choices=every)
+    parser.add_argument("--noises", nargs="+", type=float, default=[0.0, 0.05, 0.2, 0.4])
+    parser.add_argument("--kind", default="white", choices=KINDS)
+    asked = parser.parse_args()
+    if asked.what == "counts":
+        counts(asked.systems, asked.noises, asked.kind, asked.n)
+    elif asked.what == "misfit":
+        misfits(asked.systems, asked.n)
+    else:
+        samples()
+
+
+if __name__ == "__main__":
+    main()
