@@ -3,6 +3,7 @@
     python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
     python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
     python -m benchmarks.estimation samples             # CPU against the number of samples
+    python -m benchmarks.estimation thruster            # the breathing mode, beside free runs
 
 `counts` prints per system and noise: selected exactly right, wrong ones that are called a misfit,
 right ones that are, median CPU-s and the longest; of the right ones the median relative error of a
@@ -20,6 +21,8 @@ import numpy as np
 
 import ep2sindy as ep
 from benchmarks.known_systems import KINDS, OTHERS, noisy
+from benchmarks.living import DOWNSTREAM_MM, POINTS, parts, record
+from ep2sindy.studies.living import start_of
 from ep2sindy.synthetic.draws import DRAWS
 from ep2sindy.synthetic.systems import System, lorenz
 
@@ -90,12 +93,29 @@ def samples() -> None:
         print(f"{n:7d}  {row['cpu_s']:5.2f}  {bool(row['right'])}", flush=True)
 
 
+def thruster() -> None:
+    """Six operating points: the estimator's own model, and what free runs choose of its fronts."""
+    for label in POINTS:
+        fitted, held = parts(record(label, DOWNSTREAM_MM), "last")
+        for rule in (ep.Evidence(), ep.FreeRunScore()):
+            start = time.process_time()
+            recipe = ep.Recipe(search=ep.Joint(max_terms=4), selection=rule, depth=2)
+            found = ep.discover(fitted, ep.polynomial(["n_i", "n_n"], degree=2), recipe)
+            cpu_s = time.process_time() - start
+            run = ep.free_run(found.model, held, initial=start_of(held, found.model))
+            print(
+                f"{label} {rule.label:9} {np.count_nonzero(found.model.coef)} terms, {run.text}; "
+                f"flow error {found.estimate.flow_error:g}, {cpu_s:.1f} CPU-s",
+                flush=True,
+            )
+
+
 def main() -> None:
     every = [*DRAWS, *OTHERS]
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("what", choices=["counts", "misfit", "samples"])
+    parser.add_argument("what", choices=["counts", "misfit", "samples", "thruster"])
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--systems", nargs="+", default=every, choices=every)
     parser.add_argument("--noises", nargs="+", type=float, default=[0.0, 0.05, 0.2, 0.4])
@@ -105,8 +125,10 @@ def main() -> None:
         counts(asked.systems, asked.noises, asked.kind, asked.n)
     elif asked.what == "misfit":
         misfits(asked.systems, asked.n)
-    else:
+    elif asked.what == "samples":
         samples()
+    else:
+        thruster()
 
 
 if __name__ == "__main__":

@@ -10,12 +10,12 @@ from jaxtyping import Float
 
 from ep2sindy.estimation.likelihood import Fit, Level, enough_substeps, fitted, gram, squares
 from ep2sindy.estimation.problem import Problem
-from ep2sindy.estimation.supports import best_support
+from ep2sindy.estimation.supports import best_support, excess
 
 # rho, and the share of a term's price that is asked there: free states hide part of what a term
 # explains, and what is dropped too early would have to be found again.
 COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
-COLD = ((0.03, 1.0), (0.001, 1.0), (0.0001, 1.0))
+COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
 MOST_EXCHANGES = 3  # of supports at one level
 
 
@@ -63,7 +63,8 @@ def _exchanged(
             break
         tried = fitted(problem, replace(fit, support=found.support, free=found.free), level)
         tried_score = tried.total + prices[found.support].sum()
-        if not tried_score < score:
+        too_large = excess(problem, fit.support, max_terms) > 0
+        if not (tried_score < score or (too_large and np.isfinite(tried_score))):
             break
         fit, score = tried, tried_score
     return fit, float(score)

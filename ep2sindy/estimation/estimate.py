@@ -18,6 +18,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 
 MOST_RIVALS = 5
+SAMPLES_PER_TERM = 5
 LEAST_ODDS = 1e-3  # of a rival that is worth a word
 
 
@@ -51,8 +52,9 @@ class Estimate:
     memory: (d,), its correlation from one sample to the next, 0 for white noise.
     flow_error: how far from the model the states move from sample to sample, as a share of the
     noise; 0 where nothing but noise is left. misfit: why these equations do not explain the data;
-    empty where they do. weighed: by state, the best supports of every size. rivals: what else
-    may be, most likely first.
+    empty where they do. few: a word where there are too few samples to tell; else empty.
+    weighed: by state, the best supports of every size. rivals: what else may be, most likely
+    first.
     """
 
     model: SparseModel
@@ -61,6 +63,7 @@ class Estimate:
     memory: Float[np.ndarray, " d"]
     flow_error: float
     misfit: str
+    few: str
     weighed: Mapping[str, Sequence[Weighed]] = field(repr=False)
     rivals: Sequence[Rival]
 
@@ -70,9 +73,10 @@ class Estimate:
         if self.misfit:
             return self.misfit
         if not self.rivals:
-            return "no other support of an equation has odds above 1:1000"
+            return self.few or "no other support of an equation has odds above 1:1000"
         first = self.rivals[0]
-        return f"next: {first.state}' of {', '.join(first.terms)}, odds {first.odds:.2g}:1"
+        odds = f"{first.state}' of {', '.join(first.terms)} at odds of 1:{1.0 / first.odds:.3g}"
+        return f"{self.few}; next is {odds}" if self.few else f"the next best: {odds}"
 
 
 def estimate(
@@ -109,6 +113,7 @@ def estimate(
         memory=found.noise.memory,
         flow_error=found.flow_error,
         misfit=_misfit(problem, found),
+        few=_few(problem),
         weighed=weighed,
         rivals=_rivals(problem, found, weighed),
     )
@@ -194,10 +199,22 @@ def _rivals(
     return tuple(sorted(rivals, key=lambda r: -r.odds)[:MOST_RIVALS])
 
 
+def _few(problem: Problem) -> str:
+    n, n_terms = problem.n_samples, len(problem.library)
+    if n >= SAMPLES_PER_TERM * n_terms:
+        return ""
+    return (
+        f"{n} samples do not tell which of {n_terms} terms: {SAMPLES_PER_TERM * n_terms} and more "
+        "would; name the terms that you know (terms=...), or take a smaller library"
+    )
+
+
 def _misfit(problem: Problem, found: Solution) -> str:
     if found.fits:
         return ""
     signs = []
+    if not np.isfinite(found.score):
+        signs.append("whatever was tried runs away between two samples")
     if found.flow_error:
         signs.append(f"the states leave the model by {found.flow_error:g} of the noise per sample")
     for state, memory in zip(problem.states, found.noise.unexplained, strict=True):

@@ -15,6 +15,8 @@ from ep2sindy.estimation.start import smoothed_start
 from ep2sindy.estimation.supports import term_prices
 
 FEWEST_SAMPLES = 3  # a term
+LET_GO = 0.5  # of a state's spread: what is left of a state that the model does not follow
+ENOUGH_SAMPLES = 300  # to trust the first start: fewer are quickly tried from all
 MOST_PASSES = 4  # until noise and support agree: two are the rule
 # Of the smoother, by log10 of process to measurement noise: where the likely one leads astray.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
@@ -59,16 +61,24 @@ class Solution:
     @property
     def fits(self) -> bool:
         """Whether what is left looks like noise."""
-        return self.flow_error == 0.0 and not self.noise.unexplained.any()
+        exact = self.flow_error == 0.0 and not self.noise.unexplained.any()
+        return exact and bool(np.isfinite(self.score))
 
 
 def solve(problem: Problem, *, max_terms: int) -> Solution:
     """The most likely support from the likely smoothing, and from others where it fits badly."""
+    spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
+
+    def rank(each: Solution) -> tuple[int, float]:
+        # A crude model may be likeliest where it follows one state exactly and another not at all.
+        let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
+        return int(let_go.sum()), each.score
+
     best = _from_start(problem, None, max_terms)
     for log10_ratio in OTHER_STARTS:
-        if best.fits:
+        if best.fits and problem.n_samples >= ENOUGH_SAMPLES:
             break
-        best = min([best, _from_start(problem, log10_ratio, max_terms)], key=lambda s: s.score)
+        best = min([best, _from_start(problem, log10_ratio, max_terms)], key=rank)
     return best
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.scales import zero_to_one
 from ep2sindy.estimation.kernels import departures, eliminated
 from ep2sindy.estimation.problem import Flow, Problem
 
@@ -119,7 +120,7 @@ def gram(problem: Problem, fit: Fit, level: Level) -> Gram:
 def covariance(problem: Problem, fit: Fit, level: Level) -> Float[np.ndarray, "support support"]:
     """Of the support's free coefficients, scaled."""
     hessian = _hessian(problem, fit, fit.support, level)[0]
-    size = np.sqrt(np.maximum(np.diag(hessian), np.finfo(np.float64).tiny))
+    size = _sizes(hessian)
     return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
@@ -145,10 +146,10 @@ def _step(
 ) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
     """One Gauss-Newton step: of the free coefficients, and of every path."""
     hessian, gradient, _, flows = _hessian(problem, fit, fit.support, level)
-    size = np.sqrt(np.maximum(np.diag(hessian), np.finfo(np.float64).tiny))
-    scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
-    if not (np.isfinite(scaled).all() and np.isfinite(gradient).all()):
+    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         return np.full_like(fit.free, np.nan), []
+    size = _sizes(hessian)
+    scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
     step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
     change = np.zeros_like(fit.free)
     change[fit.support] = step
@@ -184,3 +185,8 @@ def _hessian(
         hessian, gradient, least = hessian + h, gradient + g, least + rest
         flows.append(flow)
     return hessian, gradient, least, flows
+
+
+def _sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+    """Roots of the diagonal; one for a term that has no part, whose row is zero or rounding."""
+    return np.sqrt(zero_to_one(np.maximum(np.diag(hessian), 0.0)))

@@ -21,6 +21,9 @@ LAGS = (2, 3, 4, 5, 6)
 TINY = float(np.finfo(np.float64).tiny)
 ORDER = 3  # of differences: they leave little of a signal that the samples resolve
 LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of error of the flow that are tried
+# What is believed beforehand, worth so many samples: noise is alike in all states. Else, with few
+# samples, a model is likeliest that follows one state exactly and lets go of another.
+ALIKE_SAMPLES = 5.0
 ERROR_SHOWS = 2.0  # by which a flow with error must be likelier, twice its logarithm
 
 
@@ -62,11 +65,12 @@ def noise_beside(problem: Problem, fit: Fit) -> Noise:
     believed = shows & _forgets(left, memory) & _shown_by_samples(problem, std, memory)
     std = np.maximum(std, FLOOR)
     lasting = np.where(believed, memory, 0.0)
+    alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std).mean()
     return Noise(
         std=std,
         memory=lasting,
         unexplained=np.where(shows & ~believed, memory, 0.0),
-        deviance=float(n * np.log(np.square(std) * (1.0 - np.square(lasting))).sum()),
+        deviance=float(n * np.log(alike * (1.0 - np.square(lasting))).sum()),
     )
 
 

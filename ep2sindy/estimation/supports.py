@@ -51,6 +51,10 @@ def best_support(
 
     max_terms: of one equation. Those required are always in.
     """
+
+    def rank(each: Priced) -> tuple[int, float]:
+        return excess(problem, each.support, max_terms), each.score
+
     best = priced(gram, start, prices)
     for _ in range(MOST_SWEEPS):
         before = best
@@ -59,10 +63,16 @@ def best_support(
             if problem.required[own].all():
                 continue
             offered = _offered(problem, gram, best.support, own, max_terms)
-            best = min([best, *(priced(gram, s, prices) for s in offered)], key=lambda p: p.score)
+            best = min([best, *(priced(gram, s, prices) for s in offered)], key=rank)
         if best is before:
             return best
     return best
+
+
+def excess(problem: Problem, support: Bool[np.ndarray, " free"], max_terms: int) -> int:
+    """By how many terms a support is too large, of those that are not required."""
+    sizes = np.bincount(problem.block[support & ~problem.required], minlength=1)
+    return int(np.maximum(sizes - max_terms, 0).sum())
 
 
 def supports_by_size(
