@@ -28,7 +28,8 @@ def linear_case(
     flow = rng.normal(size=(n - 1, d, d + p))
     residuals = rng.normal(size=(n, d))
     residuals[2, 0] = np.nan  # a sample is missing
-    return flow, rng.normal(size=(n - 1, d)), residuals, np.array([0.5, 2.0]), np.array([0.1, 0.3])
+    variance, process = rng.uniform(0.2, 2.0, (n, d)), rng.uniform(0.1, 0.3, (n - 1, d))
+    return flow, rng.normal(size=(n - 1, d)), residuals, variance, process
 
 
 def dense_rows(
@@ -51,16 +52,16 @@ def dense_rows(
                 rows.append(row / np.sqrt(free_start))
                 targets.append(0.0)
             if np.isfinite(residuals[k, i]):
-                rows.append(row / np.sqrt(variance[i]))
-                targets.append(residuals[k, i] / np.sqrt(variance[i]))
+                rows.append(row / np.sqrt(variance[k, i]))
+                targets.append(residuals[k, i] / np.sqrt(variance[k, i]))
     for k in range(n - 1):
         for i in range(d):
             row = np.zeros(n * d + p)
             row[(k + 1) * d + i] = 1.0
             row[k * d : (k + 1) * d] -= flow[k, i, :d]
             row[n * d :] -= flow[k, i, d:]
-            rows.append(row / np.sqrt(process[i]))
-            targets.append(misses[k, i] / np.sqrt(process[i]))
+            rows.append(row / np.sqrt(process[k, i]))
+            targets.append(misses[k, i] / np.sqrt(process[k, i]))
     return np.array(rows), np.array(targets)
 
 
@@ -90,8 +91,8 @@ def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
             to[k * d : (k + 1) * d, start * d : (start + 1) * d] = block
             if k < n - 1:
                 block = flow[k, :, :d] @ block
-    own = np.concatenate([np.full(d, 10.0), np.tile(process, n - 1)])
-    cov = to @ np.diag(own) @ to.T + np.diag(np.tile(variance, n))
+    own = np.concatenate([np.full(d, 10.0), process.reshape(-1)])
+    cov = to @ np.diag(own) @ to.T + np.diag(variance.reshape(-1))
     seen = np.isfinite(residuals).reshape(-1)
     assert log_spread == pytest.approx(np.linalg.slogdet(cov[np.ix_(seen, seen)])[1])
 
@@ -175,7 +176,7 @@ def fit_of_truth(problem: Problem, model: ep.SparseModel) -> Fit:
 
 def test_a_fit_is_where_the_squares_have_no_slope() -> None:
     problem, _ = lorenz_problem()
-    level = Level(np.full(3, 0.05), 0.01)
+    level = Level((np.full((200, 3), 0.05),), 0.01)
     fit = fitted(problem, fit_of_truth(problem, ep.lorenz().model), level)
     step = np.where(fit.support, 1e-4 * np.abs(fit.free), 0.0)
     for j in np.flatnonzero(fit.support):
@@ -187,7 +188,7 @@ def test_a_fit_is_where_the_squares_have_no_slope() -> None:
 
 def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
     problem, _ = lorenz_problem()
-    level = Level(np.full(3, 0.05), 0.1)
+    level = Level((np.full((200, 3), 0.05),), 0.1)
     fit = fitted(problem, fit_of_truth(problem, ep.lorenz().model), level)
     pair = gram(problem, fit, level)
     nothing = np.zeros(len(fit.free))
@@ -203,7 +204,7 @@ def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
 
 def test_block_by_block_finds_the_best_support_of_all() -> None:
     problem, _ = lorenz_problem()
-    level = Level(np.full(3, 0.05), 0.1)
+    level = Level((np.full((200, 3), 0.05),), 0.1)
     fit = fitted(problem, fit_of_truth(problem, ep.lorenz().model), level)
     pair, prices = gram(problem, fit, level), term_prices(problem, 200.0)
     full = best_support(problem, pair, prices, np.ones_like(fit.support), max_terms=10)
@@ -283,6 +284,16 @@ def test_the_noise_is_measured_beside_the_model() -> None:
     # The states come closer to the truth than the samples by far.
     left = np.sqrt(np.square(found.paths[0] - clean.states).mean(axis=0))
     assert (left < 0.2 * found.noise_std).all()
+
+
+def test_noise_that_grows_with_the_state_is_weighed_so() -> None:
+    system, rng = ep.damped_oscillator(), np.random.default_rng(0)
+    clean = system.trajectory()
+    noise = 0.05 * clean.states * rng.standard_normal(clean.states.shape)
+    run = ep.Trajectory(clean.t, clean.states + noise, clean.state_names)
+    found = ep.estimate([run], system.model.library)
+    assert is_right(found.model, system)
+    assert found.misfit == ""
 
 
 @pytest.mark.parametrize("term", ["x^3", "x"])

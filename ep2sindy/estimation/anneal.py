@@ -31,7 +31,7 @@ class Annealed:
 def annealed(
     problem: Problem,
     fit: Fit,
-    noise: Float[np.ndarray, " d"],
+    noise: tuple[np.ndarray, ...],
     prices: Float[np.ndarray, " free"],
     schedule: Sequence[tuple[float, float]],
     *,

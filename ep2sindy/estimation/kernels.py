@@ -112,8 +112,8 @@ def _stepped(flow, miss, mean, by_coef, cov, process, buffer):
 def eliminated(flow, misses, residuals, variance, process, free_start):
     """Eliminate all states: what is left of the squares as a function of the coefficients.
 
-    variance, process: (d,), of the samples' noise and of the flow's error; free_start: variance
-    of the first state before any sample. A residual that is not finite is no sample.
+    variance: (n, d), of the samples' noise; process: (n - 1, d), of the flow's error; free_start:
+    variance of the first state before any sample. A residual that is not finite is no sample.
     Returns hessian (p, p) and gradient (p,), so that the squares are least - 2 gradient' c +
     c' hessian c for a change c of the coefficients, then least, and the sum of the logarithms of
     the innovations' variances. Exact for the linearised problem (de Jong 1991,
@@ -133,7 +133,7 @@ def eliminated(flow, misses, residuals, variance, process, free_start):
                 continue
             for a in range(p):
                 row[a] = by_coef[i, a]
-            innovation, spread = _seen(i, residuals[k, i], variance[i], mean, by_coef, cov, gain)
+            innovation, spread = _seen(i, residuals[k, i], variance[k, i], mean, by_coef, cov, gain)
             least += innovation * innovation / spread
             log_spread += np.log(spread)
             for a in range(p):
@@ -142,7 +142,7 @@ def eliminated(flow, misses, residuals, variance, process, free_start):
                 for b in range(a + 1):
                     hessian[a, b] += share * row[b]
         if k < n - 1:
-            _stepped(flow[k], misses[k], mean, by_coef, cov, process, buffer)
+            _stepped(flow[k], misses[k], mean, by_coef, cov, process[k], buffer)
     for a in range(p):
         for b in range(a):
             hessian[b, a] = hessian[a, b]
@@ -171,11 +171,11 @@ def departures(flow, misses, residuals, variance, process, free_start):
         for i in range(d):
             if np.isfinite(residuals[k, i]):
                 innovation, spread = _seen(
-                    i, residuals[k, i], variance[i], mean, none, cov, gains[k, i]
+                    i, residuals[k, i], variance[k, i], mean, none, cov, gains[k, i]
                 )
                 innovations[k, i] = innovation / spread
         if k < n - 1:
-            _stepped(flow[k], misses[k], mean, none, cov, process, buffer)
+            _stepped(flow[k], misses[k], mean, none, cov, process[k], buffer)
     adjoint, carried = np.zeros(d), np.zeros(d)
     for k in range(n - 1, -1, -1):
         for j in range(d):

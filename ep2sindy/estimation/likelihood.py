@@ -26,19 +26,23 @@ MOST_SUBSTEPS = 32
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """How exact samples and flow are held to be: noise (d,), and rho, the flow's share of it."""
+    """How exact samples and flow are held to be.
 
-    noise: Float[np.ndarray, " d"]
+    noise: by record, (samples, d), the samples' standard deviations, scaled. rho: the flow's share
+    of it.
+    """
+
+    noise: tuple[np.ndarray, ...]
     rho: float
     n_substeps: int = 1
 
     @property
-    def variance(self) -> Float[np.ndarray, " d"]:
-        return np.square(self.noise)
+    def variances(self) -> list[Float[np.ndarray, "samples d"]]:
+        return [np.square(noise) for noise in self.noise]
 
     @property
-    def process(self) -> Float[np.ndarray, " d"]:
-        return np.square(self.rho * self.noise)
+    def processes(self) -> list[Float[np.ndarray, "steps d"]]:
+        return [np.square(self.rho * noise[:-1]) for noise in self.noise]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +78,12 @@ def squares(
     """What is least, by state."""
     total = np.zeros(len(problem.states))
     with np.errstate(over="ignore", invalid="ignore"):
-        for record, path in zip(problem.records, paths, strict=True):
+        for record, path, variance, process in zip(
+            problem.records, paths, level.variances, level.processes, strict=True
+        ):
             misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
-            total += np.nansum(np.square(record.samples - path), axis=0) / level.variance
-            total += np.square(misses).sum(axis=0) / level.process
+            total += np.nansum(np.square(record.samples - path) / variance, axis=0)
+            total += (np.square(misses) / process).sum(axis=0)
     return np.where(np.isfinite(total), total, np.inf)
 
 
@@ -130,12 +136,16 @@ def enough_substeps(problem: Problem, fit: Fit, level: Level, *, share: float = 
     while n < MOST_SUBSTEPS:
         with np.errstate(over="ignore", invalid="ignore"):
             errors = [
-                problem.ends(record, path[:-1], fit.free, n)
-                - problem.ends(record, path[:-1], fit.free, 2 * n)
-                for record, path in zip(problem.records, fit.paths, strict=True)
+                np.square(
+                    problem.ends(record, path[:-1], fit.free, n)
+                    - problem.ends(record, path[:-1], fit.free, 2 * n)
+                )
+                / process
+                for record, path, process in zip(
+                    problem.records, fit.paths, level.processes, strict=True
+                )
             ]
-            rms = np.sqrt(np.square(np.concatenate(errors)).mean(axis=0))
-        if (rms <= share * level.rho * level.noise).all():
+        if (np.concatenate(errors).mean(axis=0) <= share**2).all():
             break
         n *= 2
     return n
@@ -155,12 +165,14 @@ def _step(
     change[fit.support] = step
     d = len(problem.states)
     moves = []
-    for record, path, flow in zip(problem.records, fit.paths, flows, strict=True):
+    for k, (record, path, flow) in enumerate(zip(problem.records, fit.paths, flows, strict=True)):
         misses = flow.ends - path[1:] + flow.slopes[:, :, d:] @ step
         by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
         residuals = record.samples - path
         moves.append(
-            departures(by_state, misses, residuals, level.variance, level.process, FREE_START)
+            departures(
+                by_state, misses, residuals, level.variances[k], level.processes[k], FREE_START
+            )
         )
     return change, moves
 
@@ -172,14 +184,16 @@ def _hessian(
     squares with none of them changed, and the flows."""
     n = int(support.sum())
     hessian, gradient, least, flows = np.zeros((n, n)), np.zeros(n), 0.0, []
-    for record, path in zip(problem.records, fit.paths, strict=True):
+    for record, path, variance, process in zip(
+        problem.records, fit.paths, level.variances, level.processes, strict=True
+    ):
         flow = problem.flow(record, path[:-1], fit.free, support, level.n_substeps)
         h, g, rest, _ = eliminated(
             flow.slopes,
             flow.ends - path[1:],
             record.samples - path,
-            level.variance,
-            level.process,
+            variance,
+            process,
             FREE_START,
         )
         hessian, gradient, least = hessian + h, gradient + g, least + rest

@@ -19,6 +19,8 @@ ALIKE = 7.0  # of the logarithm of their mean square, which scatters by 2.15 ove
 LONGER = 6.0  # of autocorrelations, which scatter by up to 1.7 over sqrt(n)
 LAGS = (2, 3, 4, 5, 6)
 TINY = float(np.finfo(np.float64).tiny)
+SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of variance that grows
+GROWTH_SHOWS = 12.0  # by which growing noise must be likelier, twice its logarithm
 ORDER = 3  # of differences: they leave little of a signal that the samples resolve
 LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of error of the flow that are tried
 # What is believed beforehand, worth so many samples: noise is alike in all states. Else, with few
@@ -29,22 +31,30 @@ ERROR_SHOWS = 2.0  # by which a flow with error must be likelier, twice its loga
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """What is left of the samples beside a fit, by state.
+    """What is left of the samples beside a fit.
 
-    std: (d,), scaled, no lower than the floor. memory: (d,), autocorrelation from one sample to
-    the next where noise lasts, else 0. unexplained: (d,), the same where the samples alone show
-    no such noise: then it is the model's error. deviance: -2 log likelihood of the residuals.
+    std: (d,), RMS over all samples, scaled, no lower than the floor. shape: by record,
+    (samples, d), the size at a sample in units of std: one, or growing with the state. memory:
+    (d,), correlation from one sample to the next where noise lasts, else 0. unexplained: (d,), the
+    same where the samples show no such noise: then it is the model's error. deviance: -2 log
+    likelihood of the residuals.
     """
 
     std: Float[np.ndarray, " d"]
+    shape: tuple[np.ndarray, ...]
     memory: Float[np.ndarray, " d"]
     unexplained: Float[np.ndarray, " d"]
     deviance: float
 
     @property
-    def effective(self) -> Float[np.ndarray, " d"]:
-        """Standard deviation of white noise that tells as little about slow signals."""
-        return self.std * np.sqrt((1.0 + self.memory) / (1.0 - self.memory))
+    def white(self) -> tuple[np.ndarray, ...]:
+        """Standard deviations, by record (samples, d)."""
+        return tuple(np.maximum(self.std * shape, FLOOR) for shape in self.shape)
+
+    @property
+    def effective(self) -> tuple[np.ndarray, ...]:
+        """Those of white noise that tells as little about slow signals."""
+        return tuple(noise / np.sqrt(self.independent) for noise in self.white)
 
     @property
     def independent(self) -> Float[np.ndarray, " d"]:
@@ -53,25 +63,49 @@ class Noise:
 
 
 def noise_beside(problem: Problem, fit: Fit) -> Noise:
-    """Size and memory of what a fit leaves; memory from one sample to the next as AR(1)."""
+    """Size, shape and memory of what a fit leaves; memory as AR(1)."""
     left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
     n = problem.n_samples
-    squares = sum(np.square(e).sum(axis=0) for e in left)
-    lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in left)
     per_state = fit.support.sum() / len(problem.states) + len(left)
-    std = np.sqrt(squares / max(n - per_state, 1.0))
+    freedom = n / max(n - per_state, 1.0)
+    std = np.sqrt(freedom * sum(np.square(e).sum(axis=0) for e in left) / n)
+    shape = _shapes(fit.paths, left)
+    unit = [e / s for e, s in zip(left, shape, strict=True)]
+    squares = sum(np.square(e).sum(axis=0) for e in unit)
+    lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in unit)
     memory = np.clip(lagged / np.maximum(squares, TINY), 0.0, MOST_LASTING)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
-    believed = shows & _forgets(left, memory) & _shown_by_samples(problem, std, memory)
+    believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, std, memory)
     std = np.maximum(std, FLOOR)
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std).mean()
+    logs = sum(np.log(np.square(s)).sum() for s in shape)
     return Noise(
         std=std,
+        shape=shape,
         memory=lasting,
         unexplained=np.where(shows & ~believed, memory, 0.0),
-        deviance=float(n * np.log(alike * (1.0 - np.square(lasting))).sum()),
+        deviance=float(logs + n * np.log(alike * (1.0 - np.square(lasting))).sum()),
     )
+
+
+def _shapes(
+    paths: Sequence[Float[np.ndarray, "samples d"]], left: Sequence[Float[np.ndarray, "samples d"]]
+) -> tuple[np.ndarray, ...]:
+    """How noise grows with the state: variance of 1 - w + w x^2 / mean of x^2, w by likelihood."""
+    x2, e2 = (np.square(np.concatenate(list(parts))) for parts in (paths, left))
+    relative = x2 / np.maximum(x2.mean(axis=0), TINY)
+    variance = np.ones_like(x2)
+    best = len(x2) * np.log(np.maximum(e2.mean(axis=0), TINY)) - GROWTH_SHOWS
+    for share in SHARES:
+        tried = 1.0 - share + share * relative
+        ratio = (e2 / tried).mean(axis=0)
+        deviance = np.log(tried).sum(axis=0) + len(x2) * np.log(np.maximum(ratio, TINY))
+        better = deviance < best
+        best = np.where(better, deviance, best)
+        variance = np.where(better, tried, variance)
+    ends = np.cumsum([len(path) for path in paths])[:-1]
+    return tuple(np.split(np.sqrt(variance), ends))
 
 
 def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
@@ -80,7 +114,7 @@ def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
     An exact flow is weighed with noise that lasts, where it does; one with error in white noise.
     Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
-    white = replace(exact, noise=noise.std)
+    white = replace(exact, noise=noise.white)
     by_memory = problem.n_samples * np.log1p(-np.square(noise.memory)).sum()
     best, found = _deviance(problem, fit, white) + by_memory - ERROR_SHOWS, 0.0
     for rho in LEVELS:
@@ -96,11 +130,13 @@ def _deviance(problem: Problem, fit: Fit, level: Level) -> float:
     """-2 log likelihood of the samples by their innovations, all noise scaled to its best size."""
     least = spread = 0.0
     none = np.zeros_like(fit.support)
-    for record, path in zip(problem.records, fit.paths, strict=True):
+    for record, path, variance, process in zip(
+        problem.records, fit.paths, level.variances, level.processes, strict=True
+    ):
         flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
         residuals, misses = record.samples - path, flow.ends - path[1:]
         _, _, squares, logs = eliminated(
-            flow.slopes, misses, residuals, level.variance, level.process, FREE_START
+            flow.slopes, misses, residuals, variance, process, FREE_START
         )
         least, spread = least + squares, spread + logs
     n = problem.n_samples * len(problem.states)

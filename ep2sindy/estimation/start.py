@@ -17,8 +17,8 @@ CUTOFF = 1e-8  # singular values of unit columns: smaller ones follow noise
 
 def smoothed_start(
     problem: Problem, log10_ratio: float | None
-) -> tuple[Fit, Float[np.ndarray, " d"]]:
-    """All coefficients free, on smoothed states; and the noise beside them, (d,).
+) -> tuple[Fit, tuple[np.ndarray, ...]]:
+    """All coefficients free, on smoothed states; and the noise beside them, by record (samples, d).
 
     log10_ratio: of the smoother; None finds the most likely one of each record and state. Below
     some twenty samples a period the likely one may take signal for noise.
@@ -36,7 +36,8 @@ def smoothed_start(
     rates = np.concatenate([e.derivative for e in estimates])
     support = np.ones(problem.C.shape[1], dtype=np.bool_)
     fit = Fit(paths, _regressed(problem, theta, rates), support, np.full(len(variance), np.inf))
-    return fit, np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
+    std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
+    return fit, tuple(np.tile(std, (len(path), 1)) for path in paths)
 
 
 def _regressed(
