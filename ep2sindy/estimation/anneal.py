@@ -56,9 +56,10 @@ def _exchanged(
     """Exchange terms by the Gram pair, fit again, and accept what lowers squares plus prices."""
     score = fit.total + prices[fit.support].sum()
     for _ in range(MOST_EXCHANGES):
-        found = best_support(
-            problem, gram(problem, fit, level), prices, fit.support, max_terms=max_terms
-        )
+        pair = gram(problem, fit, level)
+        if not (pair.finite and np.isfinite(score)):
+            break
+        found = best_support(problem, pair, prices, fit.support, max_terms=max_terms)
         if np.array_equal(found.support, fit.support):
             break
         tried = fitted(problem, replace(fit, support=found.support, free=found.free), level)

@@ -145,6 +145,14 @@ def _coef_SI(problem: Problem, free: Float[np.ndarray, " free"]) -> Float[np.nda
     return (problem.C @ free + problem.fixed) * problem.to_SI
 
 
+def _named_coef(problem: Problem, free: Float[np.ndarray, " free"], block: int) -> dict[str, float]:
+    """Term -> SI coefficient of one equation, those that are not zero."""
+    values = _coef_SI(problem, free)
+    own = (problem.equation == block) & (values != 0.0)
+    names = [problem.library.names[j] for j in problem.column[own]]
+    return dict(zip(names, values[own].tolist(), strict=True))
+
+
 def _model(
     problem: Problem,
     library: Library,
@@ -159,7 +167,8 @@ def _model(
     used = values != 0.0
     order = np.lexsort((problem.column[used], problem.equation[used]))
     rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
-    cov = rows @ covariance(problem, fit, found.annealed.level) @ rows.T
+    free_cov = covariance(problem, fit, found.annealed.level)
+    cov = None if free_cov is None else rows @ free_cov @ rows.T
     return SparseModel(library, problem.states, coef, units, provenance, cov)
 
 
@@ -168,6 +177,8 @@ def _weighed(
 ) -> list[Weighed]:
     """Supports of one equation, by size and then by deviance."""
     fit = found.annealed.fit
+    if not pair.finite:
+        return [Weighed(_named_coef(problem, fit.free, block), 0.0)]
     chosen = priced(pair, fit.support, found.prices).score
     masks = supports_by_size(problem, pair, fit.support, block, max_terms=search.terms_for(problem))
     masks = [m for m in masks if not np.array_equal(m, fit.support)]
@@ -175,10 +186,7 @@ def _weighed(
     for mask in [fit.support, *masks]:
         each = priced(pair, mask, found.prices)
         free = fit.free if mask is fit.support else each.free
-        values = _coef_SI(problem, free)
-        own = (problem.equation == block) & (values != 0.0)
-        names = [problem.library.names[j] for j in problem.column[own]]
-        coef = dict(zip(names, values[own].tolist(), strict=True))
+        coef = _named_coef(problem, free, block)
         rows.append(Weighed(coef, max(each.score - chosen, 0.0)))
     return sorted(rows, key=lambda w: (len(w.coef), w.deviance))
 
@@ -189,9 +197,7 @@ def _rivals(
     fit = found.annealed.fit
     rivals = []
     for block, state in enumerate(problem.states):
-        values = _coef_SI(problem, fit.free)
-        own = (problem.equation == block) & (values != 0.0)
-        chosen = {problem.library.names[j] for j in problem.column[own]}
+        chosen = set(_named_coef(problem, fit.free, block))
         for each in weighed[state]:
             odds = float(np.exp(-0.5 * each.deviance))
             if set(each.coef) != chosen and odds >= LEAST_ODDS:

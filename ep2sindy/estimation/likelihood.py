@@ -71,6 +71,11 @@ class Gram:
     linear: Float[np.ndarray, " free"]
     offset: float
 
+    @property
+    def finite(self) -> bool:
+        """False where terms that no fit has yet overflow between two samples."""
+        return bool(np.isfinite(self.quadratic).all() and np.isfinite(self.linear).all())
+
 
 def squares(
     problem: Problem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
@@ -123,10 +128,14 @@ def gram(problem: Problem, fit: Fit, level: Level) -> Gram:
     return Gram(quadratic, linear, float(offset))
 
 
-def covariance(problem: Problem, fit: Fit, level: Level) -> Float[np.ndarray, "support support"]:
-    """Of the support's free coefficients, scaled."""
+def covariance(
+    problem: Problem, fit: Fit, level: Level
+) -> Float[np.ndarray, "support support"] | None:
+    """Of the support's free coefficients, scaled; None where the fit runs away."""
     hessian = _hessian(problem, fit, fit.support, level)[0]
-    size = _sizes(hessian)
+    if not np.isfinite(hessian).all():
+        return None
+    size = unit_sizes(hessian)
     return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
@@ -158,7 +167,7 @@ def _step(
     hessian, gradient, _, flows = _hessian(problem, fit, fit.support, level)
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         return np.full_like(fit.free, np.nan), []
-    size = _sizes(hessian)
+    size = unit_sizes(hessian)
     scaled = hessian / np.outer(size, size) + RIDGE * np.eye(len(size))
     step = np.linalg.lstsq(scaled, gradient / size, rcond=None)[0] / size
     change = np.zeros_like(fit.free)
@@ -201,6 +210,6 @@ def _hessian(
     return hessian, gradient, least, flows
 
 
-def _sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
     """Roots of the diagonal; one for a term that has no part, whose row is zero or rounding."""
     return np.sqrt(zero_to_one(np.maximum(np.diag(hessian), 0.0)))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.estimation.likelihood import Gram
+from ep2sindy.estimation.likelihood import Gram, unit_sizes
 from ep2sindy.estimation.problem import Problem
 from ep2sindy.search.searches import BestSubset
 
@@ -130,6 +130,6 @@ def _offered(
 
 
 def _inverse(quadratic: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    size = np.sqrt(zero_to_one(np.diag(quadratic)))
+    size = unit_sizes(quadratic)
     unit = quadratic / np.outer(size, size)
     return np.linalg.pinv(unit, rcond=CUTOFF, hermitian=True) / np.outer(size, size)
