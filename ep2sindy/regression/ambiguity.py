@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.regression.gram_fits import independent_terms
 from ep2sindy.regression.rows import Regression
@@ -29,13 +29,32 @@ class Ambiguity:
 
 
 def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
-    """Terms that are not zero and do not repeat an earlier one, over the training rows."""
+    """Terms that are not zero and do not depend on simpler ones, over the training rows.
+
+    Simpler is of lower degree, or earlier in the library.
+    """
     xx = problem.train_gram.xx[0]
-    usable = np.diag(xx) > 0.0
-    repeats = np.triu(np.abs(xx) > 1.0 - SAME, k=1)
-    for first, second in np.argwhere(repeats):
-        usable[second] &= not usable[first]
+    usable = _distinct(problem, xx)
+    order = _simplest_first(problem)
+    columns = order[usable[order]]
+    usable[columns] = independent_terms(xx[np.ix_(columns, columns)])
     return usable
+
+
+def _simplest_first(problem: Regression) -> Int[np.ndarray, " terms"]:
+    return np.argsort(problem.library.degrees, kind="stable")
+
+
+def _distinct(
+    problem: Regression, xx: Float[np.ndarray, "terms terms"]
+) -> Bool[np.ndarray, " terms"]:
+    """Terms that are not zero and do not repeat a simpler one."""
+    order = _simplest_first(problem)
+    distinct = np.diag(xx) > 0.0
+    repeats = np.triu(np.abs(xx[np.ix_(order, order)]) > 1.0 - SAME, k=1)
+    for first, second in order[np.argwhere(repeats)]:
+        distinct[second] &= not distinct[first]
+    return distinct
 
 
 def ambiguities(problem: Regression) -> tuple[Ambiguity, ...]:
@@ -53,11 +72,16 @@ def _zero(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Amb
 
 
 def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
-    names = problem.term_names
+    """Pairs of terms that are proportional, the simpler one first; what is left out only once."""
+    names, order = problem.term_names, _simplest_first(problem)
+    kept = _distinct(problem, xx)
+    cosines = np.abs(xx[np.ix_(order, order)])
     found = []
-    for i, j in np.argwhere(np.triu(np.abs(xx) > 1.0 - ALIKE, k=1)):
+    for i, j in order[np.argwhere(np.triu(cosines > 1.0 - ALIKE, k=1))]:
         pair = (names[i], names[j])
         exact = abs(xx[i, j]) > 1.0 - SAME
+        if not kept[i] or (not exact and not kept[j]):
+            continue
         if exact:
             message = f"{pair[1]!r} is a multiple of {pair[0]!r} on every row and is left out"
         else:
@@ -70,17 +94,16 @@ def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Am
 
 
 def _dependent(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
-    """Each term that is a combination of earlier ones, with the terms that make it up."""
+    """Each term that is a combination of simpler ones, with the terms that make it up."""
     names = problem.term_names
-    columns = np.flatnonzero(usable_terms(problem))
-    usable = xx[np.ix_(columns, columns)]
-    independent = independent_terms(usable)
-    found = []
-    for j in np.flatnonzero(~independent):
-        basis = np.flatnonzero(independent[:j])
-        weights = np.linalg.solve(usable[np.ix_(basis, basis)], usable[basis, j])
-        parts = [names[columns[i]] for i in basis[np.abs(weights) > 1e-6]]
-        name = names[columns[j]]
-        message = f"{name!r} is a linear combination of {parts} on every row"
-        found.append(Ambiguity((name, *parts), message, True))
+    usable, distinct = usable_terms(problem), _distinct(problem, xx)
+    order, found = _simplest_first(problem), []
+    for rank, j in enumerate(order):
+        if usable[j] or not distinct[j]:
+            continue
+        basis = np.sort(order[:rank][usable[order[:rank]]])
+        weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, j])
+        parts = [names[i] for i in basis[np.abs(weights) > 1e-6]]
+        message = f"{names[j]!r} is a linear combination of {parts} on every row and is left out"
+        found.append(Ambiguity((names[j], *parts), message, True))
     return found
