@@ -5,11 +5,13 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.last_fit import reweighted
 from ep2sindy.library.library import polynomial
 from ep2sindy.regression.exact_inputs import is_switched
 from ep2sindy.regression.rows import NoisyRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
+from ep2sindy.search.front import fit_support
 from ep2sindy.signals.smoothers import SavitzkyGolay
 
 T = np.arange(2000) * 0.01
@@ -90,3 +92,15 @@ def test_a_switched_input_is_found_in_noise_and_what_repeats_it_named(degree: in
         assert found.model.terms("x")[term] == pytest.approx(truth, rel=0.02)
     messages = [a.message for a in found.ambiguities]
     assert "'u^2' is a multiple of 'u' on every row and is left out" in messages
+
+
+def test_corrections_of_nearly_equal_terms_do_not_run_away() -> None:
+    """A smoothed switch tells u^2 from 30 u by its corners alone; whole steps end at 5000 u."""
+    run = driven(SWITCH, noise=0.2)
+    form = replace(EVERY_ROW, exact_inputs=[])
+    library = polynomial(run.names, degree=2)
+    (problem,) = form.assemble([run], library, rng=np.random.default_rng(0))
+    x, u, square = reweighted(problem, fit_support(problem, "x", ["u", "u^2", "x"])).coef
+    assert abs(u) < 20.0
+    assert u + 30.0 * square == pytest.approx(2.0, rel=0.02)
+    assert x == pytest.approx(-1.0, rel=0.02)
