@@ -5,10 +5,12 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.regression.ambiguity import ambiguities, usable_terms
+from ep2sindy.regression.ambiguity import ambiguities, few_rows, largest_support, usable_terms
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.searches import BestSubset
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
 from ep2sindy.synthetic.systems import lotka_volterra
 
@@ -159,6 +161,18 @@ def test_the_user_is_told_what_cannot_be_told_apart() -> None:
     combination = "'a_plus_2b' is a linear combination of ['a', 'b'] on every row"
     assert f"{combination} and is left out" in messages
     assert any("'a' and 'nearly_a' are nearly proportional" in m for m in messages)
+
+
+@pytest.mark.parametrize(("n_rows", "largest"), [(18, 6), (17, 3), (13, 2), (6, 1)])
+def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> None:
+    theta = np.random.default_rng(0).normal(size=(n_rows, 6))
+    problem = problem_of(theta, theta[:, :1], list("abcdef"))
+    assert largest_support(problem) == largest
+    (supports,) = pooled_supports(
+        problem, BestSubset(), Bootstraps(n=0), rng=np.random.default_rng(0)
+    )
+    assert supports.masks.sum(axis=1).max() == largest
+    assert bool(few_rows(problem)) == (largest < 6)
 
 
 def test_a_healthy_library_has_no_ambiguities() -> None:

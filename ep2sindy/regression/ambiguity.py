@@ -15,12 +15,20 @@ SAME = 1e-10
 
 ALIKE = 1e-3
 
+# Rows per term of the library below which a search would fit the noise of its rows...
+FEW = 3
+
+# ...unless each coefficient has this many rows to itself: the least that is held to do
+# (Vittinghoff & McCulloch 2007, doi:10.1093/aje/kwk052).
+ROWS_PER_COEFFICIENT = 5
+
 
 @dataclass(frozen=True)
 class Ambiguity:
     """A finding about some terms, in words for the user.
 
-    exact: no data of this kind could tell; otherwise it is a matter of noise.
+    exact: no data of this kind could tell, and the search has acted on it; otherwise it is a
+    matter of noise.
     """
 
     terms: tuple[str, ...]
@@ -39,6 +47,24 @@ def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
     columns = order[usable[order]]
     usable[columns] = independent_terms(xx[np.ix_(columns, columns)])
     return usable
+
+
+def largest_support(problem: Regression) -> int:
+    """How many terms an equation may have: all that are usable, unless the rows are few."""
+    n_terms, n_rows = int(usable_terms(problem).sum()), len(problem.train_rows)
+    return n_terms if n_rows >= FEW * n_terms else max(1, n_rows // ROWS_PER_COEFFICIENT)
+
+
+def few_rows(problem: Regression) -> tuple[Ambiguity, ...]:
+    """What is said where `largest_support` holds equations down."""
+    largest, n_terms = largest_support(problem), int(usable_terms(problem).sum())
+    if largest == n_terms:
+        return ()
+    message = (
+        f"{len(problem.train_rows)} rows are few for {n_terms} terms: equations of "
+        f"{', '.join(problem.equations)} were searched with at most {largest}"
+    )
+    return (Ambiguity((), message, True),)
 
 
 def _simplest_first(problem: Regression) -> Int[np.ndarray, " terms"]:
