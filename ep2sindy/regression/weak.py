@@ -13,6 +13,7 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.exact_inputs import exact_columns
 from ep2sindy.regression.rows import NoisyRows, Regression
+from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, Windows
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
@@ -69,8 +70,10 @@ class Weak:
         Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
         """
         check_agreement(trajectories, library.variables)
-        runs = [self._sampled(run, library, rng) for run in trajectories]
-        return tuple(self._problem(state, runs, library) for state in range(len(runs[0].windows)))
+        pieces = [piece for run in trajectories for piece in _pieces(run)]
+        runs = [self._sampled(piece, library, rng) for piece in pieces]
+        states = range(len(runs[0].windows))
+        return tuple(self._problem(k, runs, library, trajectories) for k in states)
 
     def _sampled(self, run: Trajectory, library: Library, rng: np.random.Generator) -> _Sampled:
         windows = [self.test_functions.windows(run.t, x, rng=rng) for x in run.states.T]
@@ -114,7 +117,13 @@ class Weak:
             return estimate.smoothed, estimate
         return np.where(exact, values, self.smoother.smooth(t, values)), estimate
 
-    def _problem(self, state: int, runs: Sequence[_Sampled], library: Library) -> Regression:
+    def _problem(
+        self,
+        state: int,
+        runs: Sequence[_Sampled],
+        library: Library,
+        trajectories: Sequence[Trajectory],
+    ) -> Regression:
         name = runs[0].run.state_names[state]
         parts = [run.rows(state) for run in runs]
         test = np.concatenate([part.test for part in parts])
@@ -129,7 +138,7 @@ class Weak:
                 [part.segment + n for part, n in zip(parts, n_segments[:-1], strict=True)]
             ),
             test=test,
-            trajectories=tuple(run.run for run in runs),
+            trajectories=tuple(trajectories),
             noisy=_noisy_rows(name, runs, mean[~test], slope[~test])
             if self.errors_in_variables
             else None,
@@ -138,7 +147,7 @@ class Weak:
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """One trajectory on its way to rows: its terms, its windows per state, its segments.
+    """One stretch without gaps on its way to rows: its terms, its windows per state, its segments.
 
     names: the library's variables, then states that it lacks.
     segment, held_out: (samples,), which piece of the time a sample is in, and if that is held out.
@@ -175,6 +184,12 @@ class _Rows:
     slope: csr_array
     segment: Int[np.ndarray, " rows"]
     test: Bool[np.ndarray, " rows"]
+
+
+def _pieces(run: Trajectory) -> list[Trajectory]:
+    """The stretches of a trajectory between its gaps, each with rows of its own."""
+    parts = stretches(run.t)
+    return [run] if parts == [(0, run.n_samples)] else [run.window(*part) for part in parts]
 
 
 def _stacked(blocks: Iterable[csr_array]) -> csr_array:
