@@ -163,6 +163,15 @@ def test_the_user_is_told_what_cannot_be_told_apart() -> None:
     assert any("'a' and 'nearly_a' are nearly proportional" in m for m in messages)
 
 
+def test_a_combination_of_many_terms_is_named_and_stays_in_the_search() -> None:
+    theta = np.random.default_rng(0).normal(size=(50, 5))
+    theta[:, 4] = theta[:, :4].sum(axis=1)
+    problem = problem_of(theta, theta[:, 4:], list("abcde"))
+    assert usable_terms(problem).all()
+    (found,) = ambiguities(problem)
+    assert found.message == "'e' is a linear combination of ['a', 'b', 'c', 'd'] on every row"
+
+
 @pytest.mark.parametrize(("n_rows", "largest"), [(18, 6), (17, 3), (13, 2), (6, 1)])
 def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> None:
     theta = np.random.default_rng(0).normal(size=(n_rows, 6))

@@ -15,6 +15,10 @@ SAME = 1e-10
 
 ALIKE = 1e-3
 
+# Simpler terms that a term is left out for. Without noise, every term on a periodic orbit is nearly
+# a combination of many others, and the law may be the shorter for it.
+MOST_PARTS = 3
+
 # Rows per term of the library below which a search would fit the noise of its rows...
 FEW = 3
 
@@ -27,8 +31,8 @@ ROWS_PER_COEFFICIENT = 5
 class Ambiguity:
     """A finding about some terms, in words for the user.
 
-    exact: no data of this kind could tell, and the search has acted on it; otherwise it is a
-    matter of noise.
+    exact: it holds of these rows whatever their noise, and the search keeps to it; otherwise it
+    is a matter of noise.
     """
 
     terms: tuple[str, ...]
@@ -37,15 +41,14 @@ class Ambiguity:
 
 
 def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
-    """Terms that are not zero and do not depend on simpler ones, over the training rows.
+    """Terms that are not zero and are no combination of a few simpler ones on the training rows.
 
     Simpler is of lower degree, or earlier in the library.
     """
     xx = problem.train_gram.xx[0]
     usable = _distinct(problem, xx)
-    order = _simplest_first(problem)
-    columns = order[usable[order]]
-    usable[columns] = independent_terms(xx[np.ix_(columns, columns)])
+    for j, parts in _combinations(problem, xx):
+        usable[j] = len(parts) > MOST_PARTS
     return usable
 
 
@@ -122,14 +125,25 @@ def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Am
 def _dependent(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     """Each term that is a combination of simpler ones, with the terms that make it up."""
     names = problem.term_names
-    usable, distinct = usable_terms(problem), _distinct(problem, xx)
-    order, found = _simplest_first(problem), []
-    for rank, j in enumerate(order):
-        if usable[j] or not distinct[j]:
-            continue
-        basis = np.sort(order[:rank][usable[order[:rank]]])
-        weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, j])
-        parts = [names[i] for i in basis[np.abs(weights) > 1e-6]]
-        message = f"{names[j]!r} is a linear combination of {parts} on every row and is left out"
+    found = []
+    for j, columns in _combinations(problem, xx):
+        parts = [names[i] for i in columns]
+        left_out = " and is left out" if len(parts) <= MOST_PARTS else ""
+        message = f"{names[j]!r} is a linear combination of {parts} on every row{left_out}"
         found.append(Ambiguity((names[j], *parts), message, True))
+    return found
+
+
+def _combinations(
+    problem: Regression, xx: Float[np.ndarray, "terms terms"]
+) -> list[tuple[int, list[int]]]:
+    """Distinct terms that depend on simpler ones, each with those that it is made of."""
+    order = _simplest_first(problem)
+    columns = order[_distinct(problem, xx)[order]]
+    independent = independent_terms(xx[np.ix_(columns, columns)])
+    found = []
+    for rank in np.flatnonzero(~independent):
+        basis = np.sort(columns[:rank][independent[:rank]])
+        weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
+        found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found
