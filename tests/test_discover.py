@@ -14,6 +14,13 @@ from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.knees import Knee
 from ep2sindy.synthetic.systems import lotka_volterra
 
+# Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.
+HARE = [30, 47.2, 70.2, 77.4, 36.3, 20.6, 18.1, 21.4, 22, 25.4, 27.1, 40.3, 57, 76.6, 52.3, 19.5]
+HARE += [11.2, 7.6, 14.6, 16.2, 24.7]
+LYNX = [4, 6.1, 9.8, 35.2, 59.4, 41.7, 19, 13, 8.3, 9.1, 7.4, 8, 12.3, 19.5, 45.7, 51.1, 29.7]
+LYNX += [15.8, 9.7, 10.1, 8.6]
+PELTS = Trajectory(np.arange(1900.0, 1921.0), np.stack([HARE, LYNX], axis=1), ["hare", "lynx"])
+
 RECIPE = Recipe(Differential(), AdaptiveLasso(), Bootstraps(n=8), Knee("library"))
 
 
@@ -77,3 +84,24 @@ def test_the_model_may_use_inputs() -> None:
     )
     found = discover([run], polynomial(["x", "u"], degree=2), RECIPE, seed=0)
     assert found.model.terms("x") == pytest.approx({"x": -1.0, "u": 2.0}, rel=2e-3)
+
+
+def test_hare_and_lynx_are_predator_and_prey_in_21_counts() -> None:
+    """Least squares of whole trajectories gives 0.481, 0.0248, 0.926 and 0.0275."""
+    found = discover(PELTS)
+    truth = {"hare": {"hare": 0.481, "hare*lynx": -0.0248}}
+    truth["lynx"] = {"lynx": -0.926, "hare*lynx": 0.0275}
+    for state, terms in truth.items():
+        assert found.model.terms(state) == pytest.approx(terms, rel=0.05)
+    few = "13 rows are few for 6 terms: equations of lynx were searched with at most 2"
+    assert few in [a.message for a in found.ambiguities]
+    run = found.model.rollout(PELTS)
+    assert not run.diverged
+    assert run.states.max() < 2.0 * PELTS.states.max()
+
+
+def test_an_equation_that_is_given_is_not_held_down() -> None:
+    given = ["1", "hare", "lynx"]
+    found = discover(PELTS, terms={"hare": given, "lynx": ["lynx", "hare*lynx"]})
+    assert set(found.model.terms("hare")) == set(given)
+    assert not any("rows are few" in a.message for a in found.ambiguities)

@@ -5,10 +5,12 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.regression.ambiguity import ambiguities, usable_terms
+from ep2sindy.regression.ambiguity import ambiguities, few_rows, largest_support, usable_terms
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
+from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.search.searches import BestSubset
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
 from ep2sindy.synthetic.systems import lotka_volterra
 
@@ -131,16 +133,55 @@ def degenerate() -> Regression:
     return problem_of(np.stack(columns, axis=1), (a + b)[:, None], names)
 
 
-def test_zero_and_repeated_terms_are_left_out() -> None:
-    assert usable_terms(degenerate()).tolist() == [True, True, False, False, True, True, True]
+def test_zero_repeated_and_dependent_terms_are_left_out() -> None:
+    assert usable_terms(degenerate()).tolist() == [True, True, False, False, True, False, False]
+
+
+def test_of_dependent_terms_the_simplest_are_kept() -> None:
+    """u is a switch between 0 and 30, so u^2 = 30 u; s and c are a sine and its cosine."""
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=60), np.where(rng.random(60) < 0.5, 0.0, 30.0)
+    names = ["u^2", "x*u^2", "x", "x*u", "u", "s^2", "c^2", "1"]
+    library = named_terms(["x", "u", "s", "c"], names)
+    theta = library.evaluate(np.stack([x, u, np.sin(x), np.cos(x)], axis=1))
+    problem = replace(problem_of(theta, x[:, None], list("abcdefgh")), library=library)
+    kept = {name for name, k in zip(names, usable_terms(problem), strict=True) if k}
+    assert kept == {"x", "x*u", "u", "s^2", "1"}
+    assert [a.message for a in ambiguities(problem)] == [
+        "'u^2' is a multiple of 'u' on every row and is left out",
+        "'x*u^2' is a multiple of 'x*u' on every row and is left out",
+        "'c^2' is a linear combination of ['s^2', '1'] on every row and is left out",
+    ]
 
 
 def test_the_user_is_told_what_cannot_be_told_apart() -> None:
     messages = [a.message for a in ambiguities(degenerate())]
     assert "'zero' is zero on every row and is left out" in messages
     assert "'minus_3a' is a multiple of 'a' on every row and is left out" in messages
-    assert "'a_plus_2b' is a linear combination of ['a', 'b'] on every row" in messages
+    combination = "'a_plus_2b' is a linear combination of ['a', 'b'] on every row"
+    assert f"{combination} and is left out" in messages
     assert any("'a' and 'nearly_a' are nearly proportional" in m for m in messages)
+
+
+def test_a_combination_of_many_terms_is_named_and_stays_in_the_search() -> None:
+    theta = np.random.default_rng(0).normal(size=(50, 5))
+    theta[:, 4] = theta[:, :4].sum(axis=1)
+    problem = problem_of(theta, theta[:, 4:], list("abcde"))
+    assert usable_terms(problem).all()
+    (found,) = ambiguities(problem)
+    assert found.message == "'e' is a linear combination of ['a', 'b', 'c', 'd'] on every row"
+
+
+@pytest.mark.parametrize(("n_rows", "largest"), [(18, 6), (17, 3), (13, 2), (6, 1)])
+def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> None:
+    theta = np.random.default_rng(0).normal(size=(n_rows, 6))
+    problem = problem_of(theta, theta[:, :1], list("abcdef"))
+    assert largest_support(problem) == largest
+    (supports,) = pooled_supports(
+        problem, BestSubset(), Bootstraps(n=0), rng=np.random.default_rng(0)
+    )
+    assert supports.masks.sum(axis=1).max() == largest
+    assert bool(few_rows(problem)) == (largest < 6)
 
 
 def test_a_healthy_library_has_no_ambiguities() -> None:

@@ -175,8 +175,3 @@ def test_impossible_settings_are_refused(build: object, message: str) -> None:
 def test_windows_that_do_not_fit_are_refused(functions: WindowFunctions, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         windows_of(functions)
-
-
-def test_bumps_refuse_unequal_steps_and_name_the_way_out() -> None:
-    with pytest.raises(ValueError, match="need equal time steps.*interpolate .* or use Boxes"):
-        windows_of(Bumps(), uneven_times())

@@ -22,7 +22,8 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.screen import N_LINES, one_screen
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.ambiguity import Ambiguity, ambiguities
+from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows
+from ep2sindy.regression.rows import Regression
 from ep2sindy.search.front import Candidate, ParetoFront
 
 MOST_NOTES = 6  # on a screen
@@ -35,8 +36,9 @@ class Discovery:
     scores: by state, one per candidate of its front, the lowest selected.
     chosen: by state, the selected candidate as it stands in the model: where the noise of the
     samples is followed into the rows, fitted again with weights, with its covariance.
-    ambiguities: terms that these data cannot tell apart. note: how a rule that judges whole
-    systems of equations came to its model, or how sure a joint search is; empty for the others.
+    ambiguities: terms that these data cannot tell apart, and rows that are few for the terms.
+    note: how a rule that judges whole systems of equations came to its model, or how sure a joint
+    search is; empty for the others.
     estimate: of states and coefficients together, where the search was joint.
     """
 
@@ -107,16 +109,28 @@ def discover(
         provenance=recipe.provenance | {"trajectories": labels},
         estimate=estimate,
     )
-    problems = dict.fromkeys(front.problem for front in fronts.values())
+    findings = _findings([front.problem for front in fronts.values()], recipe, asked)
     return Discovery(
         fronts=fronts,
         scores=dict(zip(fronts, choice.scores, strict=True)),
         chosen=dict(zip(fronts, choice.chosen, strict=True)),
         model=choice.model,
-        ambiguities=tuple(dict.fromkeys(a for problem in problems for a in ambiguities(problem))),
+        ambiguities=findings,
         note=choice.note,
         estimate=estimate,
     )
+
+
+def _findings(
+    problems: Sequence[Regression], recipe: Recipe, asked: Asked
+) -> tuple[Ambiguity, ...]:
+    """What is to be said of the rows, each once; those of a joint search hold nothing down."""
+    found: list[Ambiguity] = []
+    for problem in problems:
+        if not isinstance(recipe.search, Joint) and not set(problem.equations) <= set(asked.terms):
+            found += few_rows(problem)
+        found += ambiguities(problem)
+    return tuple(dict.fromkeys(found))
 
 
 def _searched(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.regression.gram_fits import independent_terms
 from ep2sindy.regression.rows import Regression
@@ -15,12 +15,24 @@ SAME = 1e-10
 
 ALIKE = 1e-3
 
+# Simpler terms that a term is left out for. Without noise, every term on a periodic orbit is nearly
+# a combination of many others, and the law may be the shorter for it.
+MOST_PARTS = 3
+
+# Rows per term of the library below which a search would fit the noise of its rows...
+FEW = 3
+
+# ...unless each coefficient has this many rows to itself: the least that is held to do
+# (Vittinghoff & McCulloch 2007, doi:10.1093/aje/kwk052).
+ROWS_PER_COEFFICIENT = 5
+
 
 @dataclass(frozen=True)
 class Ambiguity:
     """A finding about some terms, in words for the user.
 
-    exact: no data of this kind could tell; otherwise it is a matter of noise.
+    exact: it holds of these rows whatever their noise, and the search keeps to it; otherwise it
+    is a matter of noise.
     """
 
     terms: tuple[str, ...]
@@ -29,13 +41,49 @@ class Ambiguity:
 
 
 def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
-    """Terms that are not zero and do not repeat an earlier one, over the training rows."""
+    """Terms that are not zero and are no combination of a few simpler ones on the training rows.
+
+    Simpler is of lower degree, or earlier in the library.
+    """
     xx = problem.train_gram.xx[0]
-    usable = np.diag(xx) > 0.0
-    repeats = np.triu(np.abs(xx) > 1.0 - SAME, k=1)
-    for first, second in np.argwhere(repeats):
-        usable[second] &= not usable[first]
+    usable = _distinct(problem, xx)
+    for j, parts in _combinations(problem, xx):
+        usable[j] = len(parts) > MOST_PARTS
     return usable
+
+
+def largest_support(problem: Regression) -> int:
+    """How many terms an equation may have: all that are usable, unless the rows are few."""
+    n_terms, n_rows = int(usable_terms(problem).sum()), len(problem.train_rows)
+    return n_terms if n_rows >= FEW * n_terms else max(1, n_rows // ROWS_PER_COEFFICIENT)
+
+
+def few_rows(problem: Regression) -> tuple[Ambiguity, ...]:
+    """What is said where `largest_support` holds equations down."""
+    largest, n_terms = largest_support(problem), int(usable_terms(problem).sum())
+    if largest == n_terms:
+        return ()
+    message = (
+        f"{len(problem.train_rows)} rows are few for {n_terms} terms: equations of "
+        f"{', '.join(problem.equations)} were searched with at most {largest}"
+    )
+    return (Ambiguity((), message, True),)
+
+
+def _simplest_first(problem: Regression) -> Int[np.ndarray, " terms"]:
+    return np.argsort(problem.library.degrees, kind="stable")
+
+
+def _distinct(
+    problem: Regression, xx: Float[np.ndarray, "terms terms"]
+) -> Bool[np.ndarray, " terms"]:
+    """Terms that are not zero and do not repeat a simpler one."""
+    order = _simplest_first(problem)
+    distinct = np.diag(xx) > 0.0
+    repeats = np.triu(np.abs(xx[np.ix_(order, order)]) > 1.0 - SAME, k=1)
+    for first, second in order[np.argwhere(repeats)]:
+        distinct[second] &= not distinct[first]
+    return distinct
 
 
 def ambiguities(problem: Regression) -> tuple[Ambiguity, ...]:
@@ -53,11 +101,16 @@ def _zero(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Amb
 
 
 def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
-    names = problem.term_names
+    """Pairs of terms that are proportional, the simpler one first; what is left out only once."""
+    names, order = problem.term_names, _simplest_first(problem)
+    kept = _distinct(problem, xx)
+    cosines = np.abs(xx[np.ix_(order, order)])
     found = []
-    for i, j in np.argwhere(np.triu(np.abs(xx) > 1.0 - ALIKE, k=1)):
+    for i, j in order[np.argwhere(np.triu(cosines > 1.0 - ALIKE, k=1))]:
         pair = (names[i], names[j])
         exact = abs(xx[i, j]) > 1.0 - SAME
+        if not kept[i] or (not exact and not kept[j]):
+            continue
         if exact:
             message = f"{pair[1]!r} is a multiple of {pair[0]!r} on every row and is left out"
         else:
@@ -70,17 +123,27 @@ def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Am
 
 
 def _dependent(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
-    """Each term that is a combination of earlier ones, with the terms that make it up."""
+    """Each term that is a combination of simpler ones, with the terms that make it up."""
     names = problem.term_names
-    columns = np.flatnonzero(usable_terms(problem))
-    usable = xx[np.ix_(columns, columns)]
-    independent = independent_terms(usable)
     found = []
-    for j in np.flatnonzero(~independent):
-        basis = np.flatnonzero(independent[:j])
-        weights = np.linalg.solve(usable[np.ix_(basis, basis)], usable[basis, j])
-        parts = [names[columns[i]] for i in basis[np.abs(weights) > 1e-6]]
-        name = names[columns[j]]
-        message = f"{name!r} is a linear combination of {parts} on every row"
-        found.append(Ambiguity((name, *parts), message, True))
+    for j, columns in _combinations(problem, xx):
+        parts = [names[i] for i in columns]
+        left_out = " and is left out" if len(parts) <= MOST_PARTS else ""
+        message = f"{names[j]!r} is a linear combination of {parts} on every row{left_out}"
+        found.append(Ambiguity((names[j], *parts), message, True))
+    return found
+
+
+def _combinations(
+    problem: Regression, xx: Float[np.ndarray, "terms terms"]
+) -> list[tuple[int, list[int]]]:
+    """Distinct terms that depend on simpler ones, each with those that it is made of."""
+    order = _simplest_first(problem)
+    columns = order[_distinct(problem, xx)[order]]
+    independent = independent_terms(xx[np.ix_(columns, columns)])
+    found = []
+    for rank in np.flatnonzero(~independent):
+        basis = np.sort(columns[:rank][independent[:rank]])
+        weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
+        found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from ep2sindy.signals.spectrum import is_uniform
+from ep2sindy.regression.sampling import even_grid, is_even, one_about_each
 
 # A bump is this large, relative to its centre, at the first sample inside its edge.
 EDGE = 1e-10
@@ -129,27 +129,36 @@ class Bumps:
         *,
         rng: np.random.Generator,
     ) -> Windows:
-        """Raises ValueError for unequal steps, or windows that do not fit the trajectory."""
-        if not is_uniform(t):
-            steps = np.diff(t)
-            raise ValueError(
-                f"smooth test functions need equal time steps: {steps.min():.4g} s to "
-                f"{steps.max():.4g} s came; interpolate onto equal steps first, or use Boxes"
-            )
-        dt_s = (t[-1] - t[0]) / (len(t) - 1)
+        """Unequal steps are interpolated on to an even grid, by weights that the rows take over.
+
+        Then there is one window about a sample at most: more would depend on each other.
+        Raises ValueError for windows that do not fit the trajectory.
+        """
+        if is_even(t):
+            return self._even_windows(x, (t[-1] - t[0]) / (len(t) - 1))
+        grid, lines = even_grid(t)
+        windows = self._even_windows(lines @ x, grid[1] - grid[0])
+        middle = grid[(windows.first + windows.last) // 2]
+        kept = one_about_each(t, middle)
+        mean, slope = windows.mean[kept] @ lines, windows.slope[kept] @ lines
+        mean.sort_indices()
+        slope.sort_indices()
+        return Windows(mean, slope)
+
+    def _even_windows(self, x: np.ndarray, dt_s: float) -> Windows:
         half_width = self._half_width(x, dt_s)
-        _check_width(2 * half_width + 1, len(t), "half_width_s")
+        _check_width(2 * half_width + 1, len(x), "half_width_s")
         power = bump_power(half_width)
         s = np.arange(-half_width, half_width + 1) / half_width
         phi = (1.0 - s**2) ** power
         fall = s * (1.0 - s**2) ** (power - 1.0)
         # Scaled so that a straight line has its own slope however few samples a bump spans.
         fall /= fall @ s * half_width * dt_s
-        first = np.arange(0, len(t) - 2 * half_width, max(1, half_width // self.overlap))
+        first = np.arange(0, len(x) - 2 * half_width, max(1, half_width // self.overlap))
         inside = first[:, None] + np.arange(2 * half_width + 1)
         return Windows(
-            mean=_rows(inside, np.broadcast_to(phi / phi.sum(), inside.shape), len(t)),
-            slope=_rows(inside, np.broadcast_to(fall, inside.shape), len(t)),
+            mean=_rows(inside, np.broadcast_to(phi / phi.sum(), inside.shape), len(x)),
+            slope=_rows(inside, np.broadcast_to(fall, inside.shape), len(x)),
         )
 
     def _half_width(self, x: np.ndarray, dt_s: float) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,7 +11,9 @@ from scipy.sparse import block_diag, csr_array
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
+from ep2sindy.regression.exact_inputs import exact_columns
 from ep2sindy.regression.rows import NoisyRows, Regression
+from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, Windows
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
@@ -33,6 +35,8 @@ class Weak:
     errors_in_variables: carry the noise of the samples to the rows, so that criteria and the
     last fit can weight them by their covariance (see the module of that name). For Bumps only:
     Boxes may be more than there are samples, and then depend on each other.
+    exact_inputs: inputs without noise, which are neither smoothed nor corrected; None takes those
+    that are switched, held or constant, or of less noise than 0.1 % of their deviation.
     """
 
     test_functions: WindowFunctions = field(default_factory=Bumps)
@@ -40,8 +44,14 @@ class Weak:
     smooth_library: bool = True
     split: Split = field(default_factory=RandomSplit)
     errors_in_variables: bool = True
+    exact_inputs: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.exact_inputs, str):
+            raise ValueError(
+                f"exact_inputs must be a list of names: {self.exact_inputs!r} came; write "
+                f"[{self.exact_inputs!r}]"
+            )
         if self.errors_in_variables and isinstance(self.test_functions, Boxes):
             raise ValueError(
                 "errors_in_variables needs smooth test functions: Boxes came; use Bumps, or set "
@@ -60,8 +70,10 @@ class Weak:
         Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
         """
         check_agreement(trajectories, library.variables)
-        runs = [self._sampled(run, library, rng) for run in trajectories]
-        return tuple(self._problem(state, runs, library) for state in range(len(runs[0].windows)))
+        pieces = [piece for run in trajectories for piece in _pieces(run)]
+        runs = [self._sampled(piece, library, rng) for piece in pieces]
+        states = range(len(runs[0].windows))
+        return tuple(self._problem(k, runs, library, trajectories) for k in states)
 
     def _sampled(self, run: Trajectory, library: Library, rng: np.random.Generator) -> _Sampled:
         windows = [self.test_functions.windows(run.t, x, rng=rng) for x in run.states.T]
@@ -69,7 +81,7 @@ class Weak:
         n_segments = int(np.clip(run.n_samples // (2 * longest), 1, MAX_SEGMENTS))
         segment = np.arange(run.n_samples) * n_segments // run.n_samples
         names = tuple(dict.fromkeys([*library.variables, *run.state_names]))
-        at_hand, estimate = self._smoothed(run.t, run.columns(names))
+        at_hand, estimate = self._smoothed(run, names)
         with np.errstate(over="ignore"):  # Regression names a term that is not finite
             terms = library.evaluate(at_hand[:, : len(library.variables)])
         return _Sampled(
@@ -83,20 +95,35 @@ class Weak:
         )
 
     def _smoothed(
-        self, t: np.ndarray, values: np.ndarray
+        self, run: Trajectory, names: Sequence[str]
     ) -> tuple[np.ndarray, KalmanEstimate | None]:
         """Samples for the library, and what the Kalman smoother says of them, where asked."""
+        t, values = run.t, run.columns(names)
         kalman = self.smoother if isinstance(self.smoother, KalmanSmoother) else None
         if kalman is None and self.errors_in_variables:
             kalman = KalmanSmoother()
         estimate = None if kalman is None else kalman.estimate(t, values)
+        noise_std = None if estimate is None else estimate.noise_std
+        exact = exact_columns(run, names, self.exact_inputs, noise_std)
+        if estimate is not None:
+            estimate = replace(
+                estimate,
+                smoothed=np.where(exact, values, estimate.smoothed),
+                noise_std=np.where(exact, 0.0, estimate.noise_std),
+            )
         if not self.smooth_library:
             return values, estimate
         if estimate is not None and kalman is self.smoother:
             return estimate.smoothed, estimate
-        return self.smoother.smooth(t, values), estimate
+        return np.where(exact, values, self.smoother.smooth(t, values)), estimate
 
-    def _problem(self, state: int, runs: Sequence[_Sampled], library: Library) -> Regression:
+    def _problem(
+        self,
+        state: int,
+        runs: Sequence[_Sampled],
+        library: Library,
+        trajectories: Sequence[Trajectory],
+    ) -> Regression:
         name = runs[0].run.state_names[state]
         parts = [run.rows(state) for run in runs]
         test = np.concatenate([part.test for part in parts])
@@ -111,7 +138,7 @@ class Weak:
                 [part.segment + n for part, n in zip(parts, n_segments[:-1], strict=True)]
             ),
             test=test,
-            trajectories=tuple(run.run for run in runs),
+            trajectories=tuple(trajectories),
             noisy=_noisy_rows(name, runs, mean[~test], slope[~test])
             if self.errors_in_variables
             else None,
@@ -120,7 +147,7 @@ class Weak:
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """One trajectory on its way to rows: its terms, its windows per state, its segments.
+    """One stretch without gaps on its way to rows: its terms, its windows per state, its segments.
 
     names: the library's variables, then states that it lacks.
     segment, held_out: (samples,), which piece of the time a sample is in, and if that is held out.
@@ -157,6 +184,12 @@ class _Rows:
     slope: csr_array
     segment: Int[np.ndarray, " rows"]
     test: Bool[np.ndarray, " rows"]
+
+
+def _pieces(run: Trajectory) -> list[Trajectory]:
+    """The stretches of a trajectory between its gaps, each with rows of its own."""
+    parts = stretches(run.t)
+    return [run] if parts == [(0, run.n_samples)] else [run.window(*part) for part in parts]
 
 
 def _stacked(blocks: Iterable[csr_array]) -> csr_array:

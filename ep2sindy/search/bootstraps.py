@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.ambiguity import largest_support, usable_terms
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.regression.resampling import moving_block_counts
 from ep2sindy.regression.rows import Grams, Regression
@@ -97,7 +97,8 @@ class Resamples:
 
     xx: (draws, terms, terms), xy: (draws, equations, terms), yy: (draws, equations); a term that
     a draw lacks is a column of zeros. at_hand: (draws, terms). scale: from the problem's scaled
-    columns to these. counted: False for the one search on all rows.
+    columns to these. counted: False for the one search on all rows. largest: terms that a
+    support may have on so many rows.
     """
 
     equations: Sequence[str]
@@ -108,11 +109,13 @@ class Resamples:
     scale: Float[np.ndarray, "draws terms"]
     kept: Bool[np.ndarray, "draws terms"]
     counted: bool
+    largest: int
 
     def searched(self, search: Search, equation: int) -> list[Bool[np.ndarray, "_ terms"]]:
-        """What a search proposes in every draw."""
+        """What a search proposes in every draw, as far as the rows can bear it."""
         draws = zip(self.xx, self.xy[:, equation], self.yy[:, equation].tolist(), strict=True)
-        return [search.supports(*draw) for draw in draws]
+        found = [search.supports(*draw) for draw in draws]
+        return [masks[masks.sum(axis=1) <= self.largest] for masks in found]
 
     def fits(
         self,
@@ -142,7 +145,7 @@ def resamples(
 ) -> Resamples:
     """Draw bootstraps of the training rows, once for all equations.
 
-    Terms that are zero, or repeat an earlier term, are left out (see `ambiguities`).
+    Terms that are zero, or depend on simpler ones, are left out (see `ambiguities`).
     """
     grams, kept = bootstraps.draw(problem, usable_terms(problem), rng)
     # A resample changes the norms: unit columns again, so that no unit or draw leaks in; a
@@ -159,6 +162,7 @@ def resamples(
         scale=scale,
         kept=kept,
         counted=bootstraps.n > 0,
+        largest=largest_support(problem),
     )
 
 
