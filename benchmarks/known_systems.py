@@ -55,8 +55,8 @@ def _lorenz96(n: int, forcing: float) -> dict[str, dict[str, float]]:
     }
 
 
-# Rossler 1976; Ueda's Duffing without forcing; FitzHugh 1961; Lorenz 1984; Prigogine & Lefever
-# 1968; May & Leonard 1975 with neutral cycles; Halvorsen; Chua with a cubic resistor; Lorenz 1996;
+# Rossler 1976; Duffing without forcing; FitzHugh 1961; Lorenz 1984; Prigogine & Lefever
+# 1968; Halvorsen; Chua with a cubic resistor; Lorenz 1996;
 # Rossler 1979 with two growing directions.
 OTHERS: Mapping[str, Known] = {
     "rossler": Known(
@@ -68,7 +68,7 @@ OTHERS: Mapping[str, Known] = {
         2, (1.0, 1.0, 0.0), 100.0, 20.0,
     ),
     "duffing": Known(
-        {"x": {"v": 1.0}, "v": {"x": 1.0, "x^3": -1.0, "v": -0.1}}, 3, (1.5, 0.0), 50.0, 20.0
+        {"x": {"v": 1.0}, "v": {"x": 1.0, "x^3": -1.0, "v": -0.1}}, 3, (2.5, 0.0), 50.0, 20.0
     ),
     "fitzhugh_nagumo": Known(
         {
@@ -88,14 +88,6 @@ OTHERS: Mapping[str, Known] = {
     "brusselator": Known(
         {"x": {"1": 1.0, "x^2*y": 1.0, "x": -4.0}, "y": {"x": 3.0, "x^2*y": -1.0}},
         3, (1.0, 1.0), 50.0, 40.0,
-    ),
-    "may_leonard": Known(
-        {
-            "x": {"x": 1.0, "x^2": -1.0, "x*y": -1.5, "x*z": -0.5},
-            "y": {"y": 1.0, "y^2": -1.0, "y*z": -1.5, "x*y": -0.5},
-            "z": {"z": 1.0, "z^2": -1.0, "x*z": -1.5, "y*z": -0.5},
-        },
-        2, (0.6, 0.25, 0.15), 150.0, 10.0,
     ),
     "halvorsen": Known(
         {
