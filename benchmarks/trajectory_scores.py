@@ -26,7 +26,7 @@ from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import Selection, selected
 from ep2sindy.synthetic.draws import realization
 
-SYSTEMS = ("lotka_volterra", "van_der_pol", "damped_oscillator", "lorenz")
+SYSTEMS = ("lotka_volterra", "van_der_pol", "oscillator", "lorenz")
 NOISES = (0.0, 0.05, 0.2)
 RULES: dict[str, Selection] = {
     "RefinedScore": RefinedScore(),
