@@ -136,6 +136,18 @@ def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
     assert other.model.covariance is not None  # refined, too
 
 
+@pytest.mark.parametrize("zeta", [-0.01, 0.01])
+def test_a_spiral_is_no_cycle_to_stay_on(zeta):
+    # Fourteen periods whose amplitude changes by a third from third to third.
+    system = ep.damped_oscillator(zeta=zeta)
+    run = system.trajectory(noise=0.05, rng=0)
+    assert ep.find_cycle(run.t, run.states) is not None
+    other = ep.discover(run, system.model.library, recipe(formulation=ep.WeightedWeak(), n_best=1))
+    assert "spirals: chosen by windows held out" in other.note
+    for state in system.model.states:
+        assert list(other.model.terms(state)) == list(system.model.terms(state))
+
+
 def test_units_change_nothing(found):
     run = record()
     plain = ep.Trajectory(1e6 * run.t, run.states / [1e18, 1e19], run.state_names)

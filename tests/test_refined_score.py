@@ -19,6 +19,7 @@ from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.integral import IntegralScore
 from ep2sindy.selection.refined import RefinedScore, _refined
 from ep2sindy.selection.rule import FLOOR, Selection, selected
+from ep2sindy.synthetic.draws import realization
 from ep2sindy.synthetic.systems import System, damped_oscillator, lorenz, lotka_volterra
 
 PREY = lotka_volterra()
@@ -170,10 +171,10 @@ def test_a_combination_that_diverges_gets_the_largest_error() -> None:
 
 
 def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
-    halves: list[list[Trajectory]] = []
+    batches: list[list[Trajectory]] = []
 
     def seen(runs: list[Trajectory], **settings: object) -> WindowBatch:
-        halves.append(runs)
+        batches.append(runs)
         return cut_windows(runs, **settings)
 
     monkeypatch.setattr(refined_score, "cut_windows", seen)
@@ -183,9 +184,29 @@ def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of(parts, PREY.model.library, choices)
     assert picked(RefinedScore(window_s=5.0, n_windows=10), fronts) == supports(PREY)
-    first, second = (np.concatenate([piece.t for piece in half]) for half in halves)
-    assert len(first) == len(second) == 5 * 51
-    assert len(np.unique(np.append(first, second))) == len(first) + len(second)
+    times = [np.concatenate([piece.t for piece in batch]) for batch in batches]
+    for fitted, held in zip(times[::2], times[1::2], strict=True):
+        assert len(np.unique(np.append(fitted, held))) == len(fitted) + len(held) == 10 * 51
+    judged = np.concatenate(times[1::2])
+    assert len(np.unique(judged)) == len(judged) == 10 * 51
+
+
+def test_two_windows_refine_and_judge_by_turns() -> None:
+    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1)).window(0, 400)
+    fronts = fronts_of([run], PREY.model.library, next_to_truth(PREY, WRONG["Lotka-Volterra"]))
+    assert picked(RefinedScore(n_windows=2), fronts) == supports(PREY)
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_windows_without_a_jump_do_not_decide_alone(number: int) -> None:
+    # Half of the windows of a slow relaxation oscillator hold none of its two or three jumps, and
+    # any multiple of the fast equation follows them.
+    system, (run,) = realization("van_der_pol", 0.05, number, seed=7)
+    terms = {s: system.model.terms(s) for s in system.model.states}
+    choices = {"x": [terms["x"]], "y": [terms["y"], {"x^3": 0.5 * terms["y"]["x"]}]}
+    assert picked(RefinedScore(), fronts_of([run], system.model.library, choices)) == supports(
+        system
+    )
 
 
 def models_of_different_terms() -> list[SparseModel]:

@@ -76,8 +76,9 @@ class FreeRunScore:
     trajectory ends. Only where the samples are followed to rounding, the truth being in the
     library, the systems that do so compete alone.
 
-    Where a record has no period, or fewer than six, there is no cycle to keep to: RefinedScore
-    decides. score = the largest deviation from the cycle, in units of its bound; at most 10.
+    Where a record has no period, or fewer than six, or spirals outward or inward through all of
+    them, there is no cycle to keep to: RefinedScore decides.
+    score = the largest deviation from the cycle, in units of its bound; at most 10.
     margin: systems that deviate by no more than this share of the bounds come first, however
     small others are: what barely keeps within them here will not in another record.
     judged: states whose cycle counts, such as one that was measured where others are made of it;

@@ -24,6 +24,10 @@ from ep2sindy.selection.systems import budget, system_of
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
 LEAST_PAIRS = 3
 
+# Parts that the windows are dealt to: half of the windows of a relaxation oscillation may hold
+# none of its jumps, and then they leave the coefficients of the fast equation open.
+N_FOLDS = 3
+
 # Standard errors that the winner may lie above the best.
 N_ERRORS = 2.0
 
@@ -32,11 +36,11 @@ N_ERRORS = 2.0
 class RefinedScore:
     """Judge equations together, at their best: which system follows windows it never saw?
 
-    The records are cut into pairs of windows. Every combination of candidates, one per equation,
-    is refined on the first window of each pair and judged on the second, then the other way
-    round; the two share no samples. So coefficients that noise in the library has biased are
-    mended before they count. Judging holds them and fits each window's start: from a smoothed
-    start the truth, if it is chaotic, runs away from its own samples.
+    The records are cut into windows that share no samples. Every combination of candidates, one
+    per equation, is refined on two of three windows and judged on the third, in turn for each of
+    the three. So coefficients that noise in the library has biased are mended before they count.
+    Judging holds them and fits each window's start: from a smoothed start the truth, if it is
+    chaotic, runs away from its own samples.
     The error is the mean square distance to the samples in variances of each state, averaged
     over the states with weights 1 / residual of the leader, the combination of greatest
     likelihood; at most 10, which also stands for a window that a combination cannot run through.
@@ -100,42 +104,54 @@ class RefinedScore:
         coef = np.stack([system.model.coef for system in systems], axis=2)
         ensemble = replace(ensemble_of(fronts, places), coef=coef)
         constraints = [system.constraint for system in systems]
-        halves = self._halves(records.runs, ensemble)
         spread = np.concatenate(records.smoothed).std(axis=0)
         residuals = np.concatenate(
             [
-                _residuals(_refined(ensemble, own, constraints), other)
-                * (other.scale[: len(spread)] / spread)
-                for own, other in (halves, halves[::-1])
+                _residuals(_refined(ensemble, fitted, constraints), held)
+                * (held.scale[: len(spread)] / spread)
+                for fitted, held in self._folds(records.runs, ensemble)
             ],
             axis=1,
         )
         return _errors_and_limit(residuals)
 
-    def _halves(self, runs: Sequence[Trajectory], ensemble: Ensemble) -> list[WindowBatch]:
-        """The first windows of all pairs, and the second."""
-        window = self._window(runs, ensemble.states)
+    def _folds(
+        self, runs: Sequence[Trajectory], ensemble: Ensemble
+    ) -> list[tuple[WindowBatch, WindowBatch]]:
+        """Windows to refine on and windows to judge on, by turns; each judges once."""
+        pieces = self._pieces(runs, self._window(runs, ensemble.states))
+        n_folds = min(N_FOLDS, len(pieces))
+        nothing_left_to_chance = np.random.default_rng(0)  # a trajectory for every window
+
+        def batch(chosen: list[Trajectory]) -> WindowBatch:
+            return cut_windows(
+                chosen,
+                states=ensemble.states,
+                inputs=ensemble.inputs,
+                n_windows=len(chosen),
+                window=chosen[0].n_samples,
+                rng=nothing_left_to_chance,
+            )
+
+        return [
+            (
+                batch([each for k, each in enumerate(pieces) if k % n_folds != fold]),
+                batch(pieces[fold::n_folds]),
+            )
+            for fold in range(n_folds)
+        ]
+
+    def _pieces(self, runs: Sequence[Trajectory], window: int) -> list[Trajectory]:
+        """Pairs of neighbouring windows, spread over every record that holds one."""
         n_samples = sum(run.n_samples for run in runs)
-        halves: list[list[Trajectory]] = [[], []]
+        pieces = []
         for run in runs:
             n_pairs = max(1, round(self.n_windows / 2 * run.n_samples / n_samples))
             n_pairs = min(n_pairs, run.n_samples // (2 * window))
             last = max(run.n_samples - 2 * window, 0)
             for start in np.linspace(0, last, n_pairs).round().astype(np.int64).tolist():
-                halves[0].append(run.window(start, start + window))
-                halves[1].append(run.window(start + window, start + 2 * window))
-        nothing_left_to_chance = np.random.default_rng(0)  # a trajectory for every window
-        return [
-            cut_windows(
-                half,
-                states=ensemble.states,
-                inputs=ensemble.inputs,
-                n_windows=len(half),
-                window=window,
-                rng=nothing_left_to_chance,
-            )
-            for half in halves
-        ]
+                pieces += [run.window(k, k + window) for k in (start, start + window)]
+        return pieces
 
     def _window(self, runs: Sequence[Trajectory], states: Sequence[str]) -> int:
         """Samples in each window."""

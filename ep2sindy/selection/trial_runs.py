@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.selection.folds import Stretch
@@ -13,6 +14,10 @@ from ep2sindy.signals.attractor import Cycle, find_cycle
 
 # Of a record, so that its folds leave windows of two: six, less what noise makes of them.
 LEAST_PERIODS = 5.5
+
+# Change of every state's amplitude from each third of a record to the next, in one direction, above
+# which it spirals: no one cycle has the amplitude of all folds within 10 %.
+MOST_DRIFT = 1.1
 
 # Periods of a trial run: enough for a transient to die out. A model without inputs runs on where
 # a stretch ends before.
@@ -30,8 +35,21 @@ def cycles_of(records: Records, states: Sequence[str]) -> list[Cycle] | str:
             return f"{name} has no period"
         if cycle.n_periods < LEAST_PERIODS:
             return f"{name} holds {cycle.n_periods:.1f} periods, not six"
+        if _spirals(cycle, run.columns(states)):
+            return f"{name} spirals"
         found.append(cycle)
     return found
+
+
+def _spirals(cycle: Cycle, states: Float[np.ndarray, "samples n_states"]) -> bool:
+    """Whether the fundamental of every state grows, or of every state decays, all along."""
+    amplitude = []
+    for phase, part in zip(np.array_split(cycle.phase, 3), np.array_split(states, 3), strict=True):
+        basis = np.column_stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
+        amplitude.append(np.hypot(*np.linalg.lstsq(basis, part, rcond=None)[0][1:]))
+    before, after = np.array(amplitude[:2]), np.array(amplitude[1:])
+    grows, decays = after > MOST_DRIFT * before, before > MOST_DRIFT * after
+    return bool(grows.all() or decays.all())
 
 
 def paths_over(
