@@ -21,7 +21,9 @@ FREE_START = 100.0  # variance of the first state before any sample: ten times i
 MOST_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
 SETTLED = 1e-2  # a step that lowers the squares by less is the last: a term costs ten
 RIDGE = 1e-12  # of a Hessian of unit diagonal
-MOST_SUBSTEPS = 32
+# What samples that resolve the motion never need: then it is coefficients that run away, and each
+# substep costs as much as the first.
+MOST_SUBSTEPS, FEWEST_ALLOWED, MOST_IN_ALL = 32, 4, 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +144,8 @@ def covariance(
 def enough_substeps(problem: Problem, fit: Fit, level: Level, *, share: float = 0.1) -> int:
     """Runge-Kutta steps between samples that err by less than a share of what the flow may."""
     n = level.n_substeps
-    while n < MOST_SUBSTEPS:
+    most = min(MOST_SUBSTEPS, max(FEWEST_ALLOWED, MOST_IN_ALL // problem.n_samples))
+    while 2 * n <= most:
         with np.errstate(over="ignore", invalid="ignore"):
             errors = [
                 np.square(
