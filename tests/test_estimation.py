@@ -9,12 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
+from benchmarks.known_systems import noisy
 from ep2sindy.constraints.relations import parse_relation
 from ep2sindy.estimation.kernels import departures, eliminated
-from ep2sindy.estimation.likelihood import Fit, Level, fitted, gram, squares
+from ep2sindy.estimation.likelihood import Fit, Gram, Level, fitted, gram, squares
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import Problem, scaled_problem
-from ep2sindy.estimation.supports import best_support, priced, term_prices
+from ep2sindy.estimation.supports import alternatives, best_support, priced, term_prices
 
 
 @pytest.fixture
@@ -213,6 +214,30 @@ def test_block_by_block_finds_the_best_support_of_all() -> None:
     for j in range(len(prices)):
         changed = full.support ^ (np.arange(len(prices)) == j)
         assert priced(pair, changed, prices).score >= full.score - 1e-6
+
+
+def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alone() -> None:
+    problem, _ = lorenz_problem()
+    n = len(problem.block)
+    first, other = 0, int(np.flatnonzero(problem.block == 1)[0])
+    columns = np.eye(n + 1, n)
+    columns[:, first], columns[:, other] = 0.0, 0.0
+    columns[first, first] = 1.0
+    columns[[first, other], other] = np.sqrt([0.99, 0.01])  # nearly the other equation's term
+    target = 10.0 * columns[:, other]
+    pair = Gram(columns.T @ columns, columns.T @ target, float(target @ target))
+    prices = np.full(n, 3.0)
+    chosen, true = np.arange(n) == first, np.arange(n) == other
+    assert np.array_equal(best_support(problem, pair, prices, chosen, max_terms=7).support, chosen)
+    found = alternatives(problem, pair, prices, chosen, within=3.0, max_terms=7)
+    assert np.array_equal(found[0].support, true)
+    assert found[0].score == pytest.approx(3.0)
+    assert all(each.score <= 4.0 + 3.0 for each in found)
+
+
+def test_a_near_miss_of_the_search_is_polished() -> None:
+    system, run = noisy("van_der_pol", 0.4, 45)  # annealed only, y^3 and x^2*y stand for x
+    assert is_right(ep.estimate([run], system.model.library).model, system)
 
 
 def test_prices_count_what_a_term_is_told_from() -> None:

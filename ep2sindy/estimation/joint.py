@@ -8,7 +8,7 @@ from math import inf
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed
+from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed, polished
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import Problem
 from ep2sindy.estimation.start import smoothed_start
@@ -94,6 +94,7 @@ def _from_start(problem: Problem, log10_ratio: float | None, max_terms: int) -> 
         found = annealed(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
         if np.array_equal(before, found.fit.support):
             break
+    found = polished(problem, found, prices, max_terms=max_terms)
     noise = noise_beside(problem, found.fit)
     error = 0.0
     if np.isfinite(found.score) and (noise.std > FLOOR).any():
