@@ -413,7 +413,7 @@ def test_a_switched_input_is_exact_and_its_multiples_are_no_terms() -> None:
 
 def test_a_joint_discovery_has_fronts_scores_and_a_model() -> None:
     system = ep.lorenz()
-    found = ep.discover(system.trajectory(noise=0.2, rng=0), recipe=ep.Recipe(search=ep.Joint()))
+    found = ep.discover(system.trajectory(noise=0.2, rng=0))
     assert is_right(found.model, system)
     assert found.estimate is not None
     for state, front in found.fronts.items():
@@ -451,10 +451,24 @@ def test_a_rule_of_rows_is_refused_for_trajectories(recipe: dict, message: str) 
         ep.Recipe(search=ep.Joint(), **recipe)
 
 
+def test_a_recipe_is_a_regression_where_something_of_one_is_asked_for() -> None:
+    assert ep.Recipe() == ep.Recipe(search=ep.Joint(), selection=ep.Evidence())
+    for asked in (
+        {"formulation": ep.WeightedWeak()},
+        {"bootstraps": ep.Bootstraps(n=0)},
+        {"selection": ep.EBIC()},
+        {"search": ep.BestSubset()},
+    ):
+        recipe = ep.Recipe(**asked)
+        assert recipe.search == ep.BestSubset()
+        assert recipe.selection == ep.EBIC()
+    assert isinstance(ep.Recipe(selection=ep.FreeRunScore()).search, ep.BestSubset)
+
+
 def test_evidence_is_refused_for_fronts_of_rows() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     with pytest.raises(ValueError, match="Evidence weighs what a joint search found"):
-        ep.discover(run, recipe=ep.Recipe(selection=ep.Evidence()))
+        ep.discover(run, recipe=ep.Recipe(search=ep.BestSubset(), selection=ep.Evidence()))
 
 
 def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
