@@ -139,8 +139,8 @@ class Recipe:
             raise ValueError(
                 "a joint search weighs models by the likelihood of trajectories: selection must "
                 "be Evidence() (selection=evidence), or a rule that runs models, such as "
-                f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, such "
-                "as BestSubset() (search=best_subset)"
+                f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, "
+                "such as BestSubset() (search=best_subset)"
             )
         if type(self.depth) is not int or self.depth < 1:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")
