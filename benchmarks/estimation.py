@@ -67,18 +67,33 @@ def _line(rows: Sequence[dict[str, float]]) -> str:
     )
 
 
+ROUTES = {"joint": ep.Recipe(), "regression": ep.Recipe(ep.WeightedWeak())}
+
+
 def misfits(systems: Sequence[str], n: int) -> None:
-    print("system            a true term left out, called a misfit")
+    """With a true term left out, and with the whole library where that is found."""
+    print("called a misfit:  a term left out, joint and regression; right equations, both")
+    totals = np.zeros((2, 2, 2), dtype=int)
     for name in systems:
-        flagged = total = 0
+        counts = np.zeros((2, 2, 2), dtype=int)  # library, route, (called, of)
         for number in range(n):
             system, run = noisy(name, 0.05, number)
-            library = system.model.library
-            present = np.flatnonzero((system.model.coef != 0.0).any(axis=1))
-            term = np.random.default_rng(number).choice(present)
-            found = ep.estimate([run], library.take(np.arange(len(library)) != term))
-            flagged, total = flagged + bool(found.misfit), total + 1
-        print(f"{name:16} {flagged}/{total}", flush=True)
+            library, true = system.model.library, system.model.coef != 0.0
+            left_out = np.random.default_rng(number).choice(np.flatnonzero(true.any(axis=1)))
+            for k, kept in enumerate(
+                (np.arange(len(library)) != left_out, np.full(len(library), True))
+            ):
+                for r, recipe in enumerate(ROUTES.values()):
+                    found = ep.discover(run, library.take(kept), recipe)
+                    if k == 0 or ((found.model.coef != 0.0) == true).all():
+                        counts[k, r] += bool(found.misfit), 1
+        totals += counts
+        print(f"{name:16} {_shares(counts)}", flush=True)
+    print(f"{'all':16} {_shares(totals)}")
+
+
+def _shares(counts: np.ndarray) -> str:
+    return "  ".join(f"{called}/{of}" for called, of in counts.reshape(-1, 2))
 
 
 def samples() -> None:

@@ -129,7 +129,24 @@ def test_terms_that_cannot_explain_the_data_still_give_finite_rows() -> None:
     problem = problems_of(system, noisy_runs(system, 0.2))[1]
     candidate = reweighted(problem, fit_support(problem, "y", ["1", "z^2"]))
     assert np.isfinite(candidate.coef).all()
-    assert np.isfinite(candidate.covariance).all()
+    assert candidate.chi_squared > 2.0
+    assert candidate.covariance is None  # it would not hold the truth
+
+
+@pytest.mark.parametrize("recipe", [Recipe(), Recipe(WeightedWeak())], ids=["joint", "regression"])
+@pytest.mark.parametrize("left_out", [None, "x", "x*y"])
+def test_a_library_without_a_true_term_is_told_and_gives_no_intervals(
+    recipe: Recipe, left_out: str | None
+) -> None:
+    system = lotka_volterra()
+    library = system.model.library
+    kept = np.array([name != left_out for name in library.names])
+    found = discover(system.trajectory(noise=0.05, rng=0), library.take(kept), recipe)
+    assert bool(found.misfit) == (left_out is not None)
+    assert (found.model.covariance is None) == (left_out is not None)
+    assert found.misfit in found.note
+    if left_out:
+        assert "of this library" in repr(found)
 
 
 def test_weighted_rows_leave_exact_data_their_exact_coefficients() -> None:

@@ -15,6 +15,7 @@ from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import choose
 from ep2sindy.discovery.estimated import estimated
+from ep2sindy.discovery.last_fit import misfit_of
 from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.estimation.joint import Joint
@@ -37,8 +38,8 @@ class Discovery:
     chosen: by state, the selected candidate as it stands in the model: where the noise of the
     samples is followed into the rows, fitted again with weights, with its covariance.
     ambiguities: terms that these data cannot tell apart, and rows that are few for the terms.
-    note: how a rule that judges whole systems of equations came to its model, or how sure a joint
-    search is; empty for the others.
+    note: how a rule that judges whole systems of equations came to its model, how sure a joint
+    search is, or that a model leaves more than noise; else empty.
     estimate: of states and coefficients together, where the search was joint.
     """
 
@@ -49,6 +50,14 @@ class Discovery:
     ambiguities: Sequence[Ambiguity]
     note: str = ""
     estimate: Estimate | None = field(default=None, repr=False)
+
+    @property
+    def misfit(self) -> str:
+        """Why the model does not explain the data as far as their noise; empty where it does, or
+        where the noise is not followed into the rows."""
+        return (
+            misfit_of(list(self.chosen.values())) if self.estimate is None else self.estimate.misfit
+        )
 
     def __repr__(self) -> str:
         notes = [f"note: {a.message}" for a in self.ambiguities][:MOST_NOTES]

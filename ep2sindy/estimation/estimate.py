@@ -46,9 +46,10 @@ class Rival:
 class Estimate:
     """States and coefficients, estimated together.
 
-    model: with the covariance of its coefficients. paths: by run, the states that the model and
-    the samples agree on, (samples, d), in SI. noise_std: (d,), of the samples' noise, in SI;
-    memory: (d,), its correlation from one sample to the next, 0 for white noise.
+    model: with the covariance of its coefficients, unless it is a misfit. paths: by run, the
+    states that the model and the samples agree on, (samples, d), in SI. noise_std: (d,), of the
+    samples' noise, in SI; memory: (d,), its correlation from one sample to the next, 0 for white
+    noise.
     flow_error: how far from the model the states move from sample to sample, as a share of the
     noise; 0 where nothing but noise is left. misfit: why these equations do not explain the data;
     empty where they do. few: a word where there are too few samples to tell; else empty.
@@ -166,7 +167,8 @@ def _model(
     used = values != 0.0
     order = np.lexsort((problem.column[used], problem.equation[used]))
     rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
-    free_cov = covariance(problem, fit, found.annealed.level)
+    # The intervals of a model that leaves more than noise would not hold the truth.
+    free_cov = covariance(problem, fit, found.annealed.level) if found.fits else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
     return SparseModel(library, problem.states, coef, units, provenance, cov)
 

@@ -26,7 +26,8 @@ class Candidate:
     terms, the share of bootstraps in which the term stood in a support of this size.
     covariance: (support, support) of coef, in SI, where noise has been followed to it.
     deviance: -2 log likelihood of whole trajectories plus the price of the terms, beside the best
-    system's; None where rows alone were fitted.
+    system's; None where rows alone were fitted. chi_squared: per row, of what the terms leave,
+    whitened by the noise that reaches the rows: 1 where the noise is all that is left.
     """
 
     equation: str
@@ -38,6 +39,7 @@ class Candidate:
     inclusion: Float[np.ndarray, " support"]
     covariance: Float[np.ndarray, "support support"] | None = None
     deviance: float | None = None
+    chi_squared: float | None = None
 
     @property
     def n_terms(self) -> int:
