@@ -28,7 +28,7 @@ from ep2sindy.report.document import (
 )
 from ep2sindy.search.front import Candidate
 from ep2sindy.selection.rule import selected
-from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.library_result import LibraryResult
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.living_view import (
@@ -137,8 +137,8 @@ class Outcome:
                     {
                         "model": "" if k else row["model"],
                         "state": state,
-                        "f data": frequency_text(row[f"f_data_{state}_Hz"]),
-                        "f model": frequency_text(row[f"f_model_{state}_Hz"]),
+                        "f data": self.data.clock.frequency_text(row[f"f_data_{state}_Hz"]),
+                        "f model": self.data.clock.frequency_text(row[f"f_model_{state}_Hz"]),
                         "nrmse": "" if k else places(row["nrmse"], 3),
                         "verdict": "" if k else row["verdict"],
                     }

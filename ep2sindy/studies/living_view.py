@@ -22,7 +22,6 @@ from ep2sindy.report.document import (
     pictures,
     places,
 )
-from ep2sindy.signals.spectrum import frequency_text
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.shown import coefficients, intervals, rollout_tables
 
@@ -89,7 +88,7 @@ def living_section(name: str, living: Living, figure_names: Iterable[str]) -> Se
         [
             {
                 "state": state,
-                "frequency": "" if k else frequency_text(run.frequency_Hz[first]),
+                "frequency": "" if k else run.rollout.clock.frequency_text(run.frequency_Hz[first]),
                 "error": "" if k else f"{places(100 * run.f_error, 2)} %",
                 "amplitude": places(run.amplitude_ratio[state], 3),
                 "waveform": places(run.waveform_error[state], 3),

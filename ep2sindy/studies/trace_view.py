@@ -36,7 +36,6 @@ from ep2sindy.report.document import (
 from ep2sindy.selection.rule import selected
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen
-from ep2sindy.signals.spectrum import frequency_text
 from ep2sindy.signals.trace import Trace
 from ep2sindy.studies.shown import coefficients, intervals, model_summary, rollout_tables
 from ep2sindy.studies.source import data_summary
@@ -138,8 +137,8 @@ class Outcome:
         per_period = signal.period_s / self.states.dt_s
         blocks: list[Block] = [
             Text(
-                f"{frequency_text(1.0 / signal.period_s)}, {signal.cycle.n_periods:.0f} periods of "
-                f"{per_period:.0f} samples"
+                f"{signal.clock.frequency_text(1.0 / signal.period_s)}, "
+                f"{signal.cycle.n_periods:.0f} periods of {per_period:.0f} samples"
             ),
             Text(f"states: {made} ({self.chosen.reason})"),
             Text(
@@ -198,7 +197,9 @@ class Outcome:
         measured = find_cycle(self.measured.t, self.measured.states[:, :1])
         rows = {
             "verdict": run.text,
-            "frequency of the data": frequency_text(measured.frequency_Hz) if measured else "-",
+            "frequency of the data": run.rollout.clock.frequency_text(
+                measured.frequency_Hz if measured else np.nan
+            ),
             "frequency error": _percent(run.f_error),
             f"amplitude error of {name}": _percent(run.amplitude_ratio[name] - 1.0),
             f"waveform error of {name}": f"{places(run.waveform_error[name], 3)} std",
