@@ -79,7 +79,7 @@ def test_terminal_and_page_show_both(toy_run: Path) -> None:
     log = (toy_run / "run.log").read_text()
     page = (toy_run / "report.html").read_text()
     for name in ("benchmark", "attractors", "trajectories"):
-        assert f"figures/{name}.png" in page
+        assert f'id="figure-{name}"' in page
     assert "Identified by ours" in page
     for title in ("True equations on the front, %", "True equations selected, %", "True terms"):
         assert title in log
@@ -89,7 +89,7 @@ def test_terminal_and_page_show_both(toy_run: Path) -> None:
     italic = next(row for row in page.split("<tr ") if "<td>100/92</td>" in row)
     assert italic.startswith('class="italic"><td>ALASSO, thesis</td>')
     assert "EBIC(gamma=1.0, coarsening=60.0)" in page
-    assert 'src="figures/benchmark.png"' in page
+    assert 'id="figure-benchmark"' in page
     for name in ("benchmark.png", "benchmark.pdf"):
         assert (toy_run / "figures" / name).stat().st_size > 0
     assert list((toy_run / "tensorboard").glob("events*"))

@@ -13,6 +13,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.machine.files import write_json
 from ep2sindy.model.model import SparseModel
 from ep2sindy.studies.libraries import Study
+from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, composed, computed
 
 
@@ -79,7 +80,7 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert shared["verdict"] == "lives"
     page = (breathing_run / "report.html").read_text()
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
-        assert f"figures/{figure}.png" in page
+        assert f'id="figure-{figure}"' in page
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
     names = {path.name for path in (breathing_run / "tables").iterdir()}
     assert {"living.csv", "coefficients_living.csv", "roles_simple.csv"} <= names
@@ -105,9 +106,44 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
     model = SparseModel.load(folder / "models" / "simple.json")
     assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]["terms"]
     page = (folder / "report.html").read_text()
-    for image in ("figures/data.png", "figures/phase.png", "figures/front_simple.png"):
-        assert image in page
-        assert image in files
+    for image in ("data", "phase", "front_simple"):
+        assert f'id="figure-{image}"' in page
+        assert f"figures/{image}.png" in files
+
+
+@pytest.mark.parametrize("width_px", [1280, 390])
+def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px: int) -> None:
+    page = breathing_run / "report.html"
+    questions = {
+        "hovers": "document.querySelectorAll('figure svg title').length",
+        "first": "document.querySelector('figure svg title').textContent",
+        "equations": "document.querySelectorAll('math').length",
+        "flat": "[...document.querySelectorAll('math')].filter(m => !m.clientHeight && "
+        "!m.getBoundingClientRect().height).length",
+    }
+    found = seen(page, width_px, questions=questions)
+    assert [url for url in found.asked if not url.startswith("data:")] == [page.as_uri()]
+    assert found.console == []
+    assert (found.figures, found.empty) == (11, 0)
+    assert found.scroll_px <= width_px  # what is wider scrolls in itself
+    assert found.answers["hovers"] > 20
+    assert found.answers["first"].startswith("n_i' of 0 terms: none\n1 - R2 = ")
+    assert found.answers["equations"] > 20
+    assert found.answers["flat"] == 0
+
+
+def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) -> None:
+    page = (breathing_run / "report.html").read_text()
+    for words in (
+        "Discover a model with every library",  # the study's own words
+        "1200 samples of 1.5 µs",
+        "BestSubset (max terms 4",
+        "How to reproduce",
+        "max_terms: 4",  # the whole config
+    ):
+        assert words in page
+    summary = summary_of(breathing_run)
+    assert summary["headline"]["simple/f_kHz"] == summary["models"]["simple"]["trajectory"]["f_kHz"]
 
 
 def test_a_fixed_seed_gives_the_same_summary(

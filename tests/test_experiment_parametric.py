@@ -148,7 +148,7 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
     for name in ("points", "laws", "coefficients"):
         assert len(pd.read_csv(folder / "tables" / f"{name}.csv"))
     assert (folder / "figures" / "trends.png").is_file()
-    assert "figures/trends.png" in (folder / "report.html").read_text()
+    assert 'id="figure-trends"' in (folder / "report.html").read_text()
     assert list((folder / "tensorboard").iterdir())
     page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
     assert "<h3>free (thesis)</h3>" in page

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from tokenize import TokenError
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class Clock:
 
         try:
             seconds = float(registry().Quantity(1.0, unit).to("s").magnitude)
-        except (pint.PintError, AttributeError, TypeError) as error:
+        except (pint.PintError, AttributeError, TypeError, TokenError) as error:
             raise ValueError(
                 f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"
             ) from error

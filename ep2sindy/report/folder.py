@@ -66,8 +66,8 @@ class RunFolder:
     def write_table(self, name: str, table: pd.DataFrame) -> None:
         self.write_text(f"tables/{name}.csv", table.to_csv(index=False))
 
-    def write_figure(self, name: str, figure: Figure) -> Path:
-        """As PNG and PDF of one layout, which the figure keeps; returns where the PNG lies."""
+    def write_figure(self, name: str, figure: Figure) -> bytes:
+        """As PDF and PNG of one layout, which the figure keeps; returns what is in the PNG."""
         _freeze_layout(figure)
         for suffix in ("pdf", "png"):
             # Without a date the same run gives the same file.
@@ -75,18 +75,18 @@ class RunFolder:
             path = self.path / "figures" / f"{name}.{suffix}"
             with replacing(path) as temporary:
                 figure.savefig(temporary, dpi=DPI, metadata=dated)
-        return path
+        return path.read_bytes()
 
-    def write_provenance(self, *, seed: int, command: Sequence[str]) -> None:
-        self.write_json(
-            "provenance.json",
-            {
-                "commit": commit(Path(__file__).parent),
-                "seed": seed,
-                "command": list(command),
-                "versions": {"python": platform.python_version(), **versions()},
-            },
-        )
+    def write_provenance(self, *, seed: int, command: Sequence[str]) -> dict[str, Any]:
+        """Which code a run is made by, in provenance.json; returned as well."""
+        found = {
+            "commit": commit(Path(__file__).parent),
+            "seed": seed,
+            "command": list(command),
+            "versions": {"python": platform.python_version(), **versions()},
+        }
+        self.write_json("provenance.json", found)
+        return found
 
 
 def _freeze_layout(figure: Figure) -> None:

@@ -13,7 +13,6 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from ep2sindy.library.equations import equation_text
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
@@ -58,12 +57,11 @@ def renderables(block: Block) -> Iterator[RenderableType]:
             text = escape(block.text)
             yield f"[bold red]{text}[/bold red]" if block.warning else text
         case Equation(on_screen=True):
-            lead = f"{block.lead}: " if block.lead else ""
-            text = escape(f"{lead}{equation_text(block.state, block.terms)}")
+            text = escape(block.text)
             yield f"[italic]{text}[/italic]" if block.aside else text
-        case Table():
+        case Table(page_only=False):
             yield rich_table(block)
-        case Picture() | Text() | Equation():
+        case Picture() | Text() | Equation() | Table():
             pass
 
 

@@ -103,7 +103,7 @@ class Outcome:
         shown = pictures([*CAPTIONS, *FIGURES, *self.more_figures])
         return [
             Section("Equations", [*relations, *intervals]),
-            *equation_sections(models, page_only=True),
+            *equation_sections(models, self.held.clock, page_only=True),
             Section("Held-out time", [self._table(), *shown]),
             *self.more_sections,
         ]

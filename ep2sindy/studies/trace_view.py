@@ -26,7 +26,6 @@ from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import (
     Block,
     Captioned,
-    Equation,
     Section,
     Table,
     Text,
@@ -37,7 +36,14 @@ from ep2sindy.selection.rule import selected
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen
 from ep2sindy.signals.trace import Trace
-from ep2sindy.studies.shown import coefficients, intervals, model_summary, rollout_tables
+from ep2sindy.studies.shown import (
+    coefficients,
+    interval_table,
+    intervals,
+    model_summary,
+    rollout_tables,
+    shown_equation,
+)
 from ep2sindy.studies.source import data_summary
 from ep2sindy.studies.trace_judged import paths_off
 
@@ -179,14 +185,12 @@ class Outcome:
         return Section("Search", [*blocks, *pictures(["front"])])
 
     def _living_section(self) -> Section:
-        known = intervals(self.model) or {}
+        model, clock = self.model, self.states.clock
         blocks: list[Block] = [Text(self.found.note)] if self.found.note else []
-        for state in self.model.states:
+        for state in model.states:
             exact = "known" if state not in self.searched else ""
-            blocks.append(Equation(state, self.model.terms(state), lead=exact, on_screen=True))
-            ends = [f"{term}: {a:.4g} to {b:.4g}" for term, (a, b) in known.get(state, {}).items()]
-            if ends and not exact:
-                blocks.append(Text(f"95 %: {'; '.join(ends)}"))
+            blocks.append(shown_equation(model, state, clock, lead=exact))
+        blocks += interval_table(model, self.searched, clock)
         where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
         blocks.append(Table(self._table(), title=f"run freely from one sample over the {where}"))
         blocks += [Text(text, warning=warn) for text, warn in self._stability()]

@@ -11,7 +11,6 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.equations import equation_text
-from ep2sindy.library.units import prefixed
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures, places
@@ -120,7 +119,7 @@ class Outcome:
         models = {name: fitted.integrated.model for name, fitted in self.labelled.items()}
         return [
             Section("Equations", [*published, Text(INTERVALS, page_only=True)]),
-            *equation_sections(models),
+            *equation_sections(models, self.data.clock),
             Section("Integrated", [self._table(), *pictures(FIGURES)]),
         ]
 
@@ -156,10 +155,9 @@ class Outcome:
         if not steps:
             return dict.fromkeys(("samples", "length", "periods"), "-")
         length_s = steps * self.data.dt_s
-        factor, prefix = prefixed(length_s)
         return {
             "samples": str(steps + 1),
-            "length": f"{length_s * factor:.3g} {prefix}s",
+            "length": self.data.clock.duration_text(length_s),
             "periods": f"{length_s * self.f_data_Hz:.2f}",
         }
 
