@@ -38,7 +38,7 @@ def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_cell_is_counted(toy_run: Path) -> None:
     summary = json.loads((toy_run / "summary.json").read_text())
-    assert list(summary) == ["experiment", "seed", "cells"]
+    assert list(summary) == ["experiment", "seed", "cells", "headline"]
     assert (summary["experiment"], summary["seed"]) == ("benchmark", 0)
     places = [(c["system"], c["noise"], c["variant"]) for c in summary["cells"]]
     assert places == [
@@ -86,7 +86,7 @@ def test_terminal_and_page_show_both(toy_run: Path) -> None:
         assert title in page
     assert max(map(len, log.splitlines())) <= 120
     assert log.count("ALASSO, thesis") == 3
-    italic = next(row for row in page.split("<tr ") if "<td>100/92</td>" in row)
+    italic = next(row for row in page.split("<tr ") if ">100/92</td>" in row)
     assert italic.startswith('class="italic"><td>ALASSO, thesis</td>')
     assert "EBIC(gamma=1.0, coarsening=60.0)" in page
     assert 'id="figure-benchmark"' in page

@@ -32,7 +32,7 @@ def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
 def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:
     folder = run_config(constrained(predator_prey, tmp_path, "~models.ionization")).folder
     summary = json.loads((folder / "summary.json").read_text())
-    assert list(summary) == ["experiment", "seed", "data", "models"]
+    assert list(summary) == ["experiment", "seed", "data", "models", "headline"]
     assert (summary["data"]["n_samples"], summary["data"]["n_held_out"]) == (1200, 300)
     models = summary["models"]
     assert list(models) == ["predator_prey", "velocity"]

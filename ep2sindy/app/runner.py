@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
-from ep2sindy.report.about import ASIDE, About, asked_of
+from ep2sindy.report.about import ASIDE, About, asked_of, by_place
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import drawn
@@ -163,20 +163,5 @@ def hparams_of(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, 
     """The settings by which runs are told apart: each by its dotted place, groups by their name."""
     found: dict[str, Any] = {"seed": settings["seed"]}
     for key in sorted({*keys} & {*settings} - {*ASIDE}):
-        found |= _by_place(key, settings[key])
+        found |= by_place(key, settings[key])
     return found
-
-
-def _by_place(place: str, value: Any) -> dict[str, Any]:
-    """`search: BestSubset, search.max_terms: 4`; what is not set is left out."""
-    if isinstance(value, Mapping):
-        if "name" in value and value["name"] is None:  # a variable that a file has not
-            return {}
-        name = str(value.get("_target_", "")).rpartition(".")[2]
-        found = {place: name} if name else {}
-        for key, each in value.items():
-            found |= _by_place(f"{place}.{key}", each) if key != "_target_" else {}
-        return found
-    if isinstance(value, list):
-        return {place: str(value)} if value else {}
-    return {place: value} if isinstance(value, int | float | str | bool) else {}

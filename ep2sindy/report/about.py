@@ -80,3 +80,18 @@ def setting_text(value: Any) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return ", ".join(map(setting_text, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def by_place(place: str, value: Any) -> dict[str, Any]:
+    """`search: BestSubset, search.max_terms: 4`; what is not set is left out."""
+    if isinstance(value, Mapping):
+        if "name" in value and value["name"] is None:  # a variable that a file has not
+            return {}
+        name = str(value.get("_target_", "")).rpartition(".")[2]
+        found = {place: name} if name else {}
+        for key, each in value.items():
+            found |= by_place(f"{place}.{key}", each) if key != "_target_" else {}
+        return found
+    if isinstance(value, list):
+        return {place: str(value)} if value else {}
+    return {place: value} if isinstance(value, int | float | str | bool) else {}

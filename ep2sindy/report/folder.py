@@ -17,12 +17,11 @@ import pandas as pd
 
 from ep2sindy.machine.files import replacing, write_json, write_text
 from ep2sindy.model.model import SparseModel
+from ep2sindy.report.picture import DPI
 from ep2sindy.report.provenance import commit, versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-DPI = 150
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class RunFolder:
 
     def write_figure(self, name: str, figure: Figure) -> bytes:
         """As PDF and PNG of one layout, which the figure keeps; returns what is in the PNG."""
-        _freeze_layout(figure)
+        freeze_layout(figure)
         for suffix in ("pdf", "png"):
             # Without a date the same run gives the same file.
             dated = {"CreationDate": None} if suffix == "pdf" else {}
@@ -89,7 +88,7 @@ class RunFolder:
         return found
 
 
-def _freeze_layout(figure: Figure) -> None:
+def freeze_layout(figure: Figure) -> None:
     """Solve the layout once: every saving would solve it again, and draw twice."""
     engine: Any = figure.get_layout_engine()
     if engine is not None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import struct
 from base64 import b64encode
 from dataclasses import dataclass
 from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
 
 SVG = "http://www.w3.org/2000/svg"
 PX_PER_INCH = 96  # of a page: one size of letters in all figures, whatever their own
+DPI = 150  # of figures in a run folder
 HOVER = "hover: "  # begins the id of an artist that says more, see `figures.style.hover`
 
 
@@ -36,6 +39,13 @@ def drawn(figure: Figure, png: bytes, caption: str) -> Drawn:
     if speaks:
         return Drawn(svg_html(figure), f"{caption} Marks say more under a mouse.", width)
     return Drawn(png_html(png), caption, width)
+
+
+def read_png(path: Path, caption: str) -> Drawn:
+    """A figure that an earlier run wrote."""
+    png = path.read_bytes()
+    width = struct.unpack(">I", png[16:20])[0]  # of the header, which comes first
+    return Drawn(png_html(png), caption, round(width / DPI * PX_PER_INCH))
 
 
 def png_html(png: bytes) -> str:
