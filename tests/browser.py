@@ -61,7 +61,7 @@ def seen(
 ) -> Seen:
     """Open a page at this width. questions: expressions of JavaScript, by name."""
     pytest.importorskip("tornado", reason="talks to Chromium; comes with `distributed`")
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [
                 browser(), "--headless", "--no-sandbox", "--disable-gpu",

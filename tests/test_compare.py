@@ -154,7 +154,7 @@ def test_a_sweep_has_a_page_that_leads_to_its_jobs(tmp_path: Path) -> None:
         '<a href="../run0/report.html">0</a>',
         "In all jobs: +exp=toy.",
         "Job 1: &lt;b&gt;no&lt;/b&gt;",
-        "<th>one: R2</th>",
+        '<th class="number">one: R2</th>',
         "job 2: degree=3\none: R2: 0.2</title>",
     ):
         assert words in text

@@ -62,7 +62,7 @@ def _environment(template: Path) -> Environment:
         lstrip_blocks=True,
     )
     environment.globals.update(equation=equation_html, cell=cell_html, classes=_classes)
-    environment.filters.update(is_number=_is_number, raised=raised_html)
+    environment.filters.update(numeric=numeric_columns, raised=raised_html)
     return environment
 
 
@@ -99,8 +99,15 @@ def raised_html(text: str) -> Markup:
     return Markup(re.sub(r"(?<=\w)\^([\d.−]+)", r"<sup>\1</sup>", minus))
 
 
+def numeric_columns(table: Table) -> list[bool]:
+    """Whether the cells of each column are set to the right: all of them numbers, or empty."""
+    columns = (table.rows.iloc[:, k] for k in range(table.rows.shape[1]))
+    texts = ([each for each in column if cell_text(each)] for column in columns)
+    return [bool(column) and all(map(_is_number, column)) for column in texts]
+
+
 def _is_number(value: Any) -> bool:
-    """Whether a cell is set to the right: a number, perhaps with a unit, or the dash for none."""
+    """A number, perhaps with a unit, or the dash for none."""
     return bool(re.fullmatch(r"-|[+-]?\d[\d.e+-]*( ?[%µ\w/^-]{1,5})?", cell_text(value)))
 
 

@@ -26,6 +26,7 @@ from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import (
     Block,
     Captioned,
+    Equation,
     Section,
     Table,
     Text,
@@ -154,24 +155,25 @@ class Outcome:
             ),
             *(Text(each) for each in signal.done),
         ]
-        return Section(signal.name, blocks)
+        return Section(f"The signal {signal.name}", blocks)
 
     def _search_section(self) -> Section:
         blocks: list[Block] = []
         for state in self.searched:
             table = self._front(state)
+            pairs = zip(self.found.fronts[state].candidates, table["selected"], strict=True)
+            equations: list[Any] = [
+                Equation(state, each.coef_by_term, mark="  <- selected" if chosen else "")
+                for each, chosen in pairs
+            ]
             rows = table.assign(
                 r2=[places(r, 3) for r in table["r2"]],
                 score=[places(s, 3) for s in table["score"]],
-                text=[
-                    text + ("  <- selected" if chosen else "")
-                    for text, chosen in zip(table["text"], table["selected"], strict=True)
-                ],
+                text=equations,
             )
             shown = _best_of_sizes(table)
-            rows = (
-                rows.iloc[shown].drop(columns="selected").rename(columns={"r2": "R2", "text": ""})
-            )
+            rows = rows.iloc[shown].drop(columns="selected")
+            rows = rows.rename(columns={"r2": "R2", "text": "model"})
             bold = np.flatnonzero(table["selected"].to_numpy()[shown]).tolist()
             blocks.append(
                 Table(
