@@ -234,6 +234,7 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
     said = " ".join(years.log.split())
     assert "The model explains the samples as far as their noise" in said
     assert "share" not in said  # there are no bootstraps
+    assert "95 % from" in years.page
 
 
 @pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])

@@ -40,6 +40,7 @@ from ep2sindy.studies.living_view import (
 from ep2sindy.studies.shown import (
     INTEGRATED,
     Shown,
+    interval_table,
     rollout_tables,
     run_figures,
     shown_equation,
@@ -154,6 +155,8 @@ class Outcome:
             blocks.append(Text(text, page_only=True))
             for state in run.model.states:
                 blocks.append(shown_equation(run.model, state, clock, on_screen=False))
+            if living is None:
+                blocks += interval_table(run.model, clock=clock, page_only=True)
         return Section("What was found", blocks)
 
     def _comparison_table(self) -> Table:
