@@ -138,7 +138,7 @@ def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) 
     for words in (
         "Discover a model with every library",  # the study's own words
         "1200 samples of 1.5 µs",
-        "BestSubset (max terms 4",
+        "BestSubset (max_terms 4",
         "How to reproduce",
         "max_terms: 4",  # the whole config
     ):

@@ -189,7 +189,7 @@ def test_settings_read_in_words() -> None:
     assert asked_of(settings, set(settings) - {"other"}) == {
         "data": "path a.csv, variables (x (name X, unit 1))",
         "time series": "ZoneAverage (states x)",
-        "search": "BestSubset (max terms 4)",
+        "search": "BestSubset (max_terms 4)",
         "rollout s": "0.004",
     }
 

@@ -51,14 +51,15 @@ def asked_of(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, st
     shown = [key for key in settings if key in keys and key not in ASIDE]
     rank = {key: k for k, key in enumerate(ASKED)}
     ordered = sorted(shown, key=lambda key: rank.get(key, len(rank)))
-    texts = {key: setting_text(settings[key]) for key in ordered}
-    found = {ASKED.get(key, key.replace("_", " ")): _bare(text) for key, text in texts.items()}
+    found = {ASKED.get(key, key.replace("_", " ")): _bare(settings[key]) for key in ordered}
     return {name: text for name, text in found.items() if text}
 
 
-def _bare(text: str) -> str:
+def _bare(value: Any) -> str:
     """Without the brackets around all of it, which a mapping has inside another."""
-    return text[1:-1] if text.startswith("(") else text
+    text = setting_text(value)
+    nameless = isinstance(value, Mapping) and "_target_" not in value
+    return text[1:-1] if nameless else text
 
 
 def setting_text(value: Any) -> str:
@@ -70,7 +71,7 @@ def setting_text(value: Any) -> str:
         return ""
     if isinstance(value, Mapping):
         parts = {str(k): setting_text(v) for k, v in value.items() if k != "_target_"}
-        inner = ", ".join(f"{k.replace('_', ' ')} {text}" for k, text in parts.items() if text)
+        inner = ", ".join(f"{k} {text}" for k, text in parts.items() if text)
         if target := value.get("_target_"):
             name = str(target).rpartition(".")[2]
             if not inner and parts:  # nothing of it is set
