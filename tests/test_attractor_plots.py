@@ -9,6 +9,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.attractors import attractor_figure
 from ep2sindy.figures.frames import OFF_SCALE
 from ep2sindy.model.rollout import Rollout
+from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.studies.identified import FirstRealizations, first_realizations
 from ep2sindy.studies.variants import Variant
@@ -19,7 +20,10 @@ SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]
 
 @pytest.fixture(scope="module")
 def first() -> FirstRealizations:
-    variants: dict[str, Variant] = {"bagged": Recipe(bootstraps=Bootstraps(n=2)), "ours": Recipe()}
+    variants: dict[str, Variant] = {
+        "bagged": Recipe(bootstraps=Bootstraps(n=2)),
+        "ours": Recipe(WeightedWeak()),
+    }
     found = first_realizations(variants, SYSTEMS, NOISES, n_trajectories=1, seed=0)
     assert found is not None
     return found

@@ -9,12 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
+from benchmarks.known_systems import noisy
 from ep2sindy.constraints.relations import parse_relation
 from ep2sindy.estimation.kernels import departures, eliminated
-from ep2sindy.estimation.likelihood import Fit, Level, fitted, gram, squares
+from ep2sindy.estimation.likelihood import Fit, Gram, Level, fitted, gram, squares
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import Problem, scaled_problem
-from ep2sindy.estimation.supports import best_support, priced, term_prices
+from ep2sindy.estimation.supports import alternatives, best_support, priced, term_prices
 
 
 @pytest.fixture
@@ -215,6 +216,30 @@ def test_block_by_block_finds_the_best_support_of_all() -> None:
         assert priced(pair, changed, prices).score >= full.score - 1e-6
 
 
+def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alone() -> None:
+    problem, _ = lorenz_problem()
+    n = len(problem.block)
+    first, other = 0, int(np.flatnonzero(problem.block == 1)[0])
+    columns = np.eye(n + 1, n)
+    columns[:, first], columns[:, other] = 0.0, 0.0
+    columns[first, first] = 1.0
+    columns[[first, other], other] = np.sqrt([0.99, 0.01])  # nearly the other equation's term
+    target = 10.0 * columns[:, other]
+    pair = Gram(columns.T @ columns, columns.T @ target, float(target @ target))
+    prices = np.full(n, 3.0)
+    chosen, true = np.arange(n) == first, np.arange(n) == other
+    assert np.array_equal(best_support(problem, pair, prices, chosen, max_terms=7).support, chosen)
+    found = alternatives(problem, pair, prices, chosen, within=3.0, max_terms=7)
+    assert np.array_equal(found[0].support, true)
+    assert found[0].score == pytest.approx(3.0)
+    assert all(each.score <= 4.0 + 3.0 for each in found)
+
+
+def test_a_near_miss_of_the_search_is_polished() -> None:
+    system, run = noisy("van_der_pol", 0.4, 45)  # annealed only, y^3 and x^2*y stand for x
+    assert is_right(ep.estimate([run], system.model.library).model, system)
+
+
 def test_prices_count_what_a_term_is_told_from() -> None:
     problem, _ = lorenz_problem()
     names = [problem.library.names[c] for c in problem.column[:10]]
@@ -388,7 +413,7 @@ def test_a_switched_input_is_exact_and_its_multiples_are_no_terms() -> None:
 
 def test_a_joint_discovery_has_fronts_scores_and_a_model() -> None:
     system = ep.lorenz()
-    found = ep.discover(system.trajectory(noise=0.2, rng=0), recipe=ep.Recipe(search=ep.Joint()))
+    found = ep.discover(system.trajectory(noise=0.2, rng=0))
     assert is_right(found.model, system)
     assert found.estimate is not None
     for state, front in found.fronts.items():
@@ -426,10 +451,24 @@ def test_a_rule_of_rows_is_refused_for_trajectories(recipe: dict, message: str) 
         ep.Recipe(search=ep.Joint(), **recipe)
 
 
+def test_a_recipe_is_a_regression_where_something_of_one_is_asked_for() -> None:
+    assert ep.Recipe() == ep.Recipe(search=ep.Joint(), selection=ep.Evidence())
+    for asked in (
+        {"formulation": ep.WeightedWeak()},
+        {"bootstraps": ep.Bootstraps(n=0)},
+        {"selection": ep.EBIC()},
+        {"search": ep.BestSubset()},
+    ):
+        recipe = ep.Recipe(**asked)
+        assert recipe.search == ep.BestSubset()
+        assert recipe.selection == ep.EBIC()
+    assert isinstance(ep.Recipe(selection=ep.FreeRunScore()).search, ep.BestSubset)
+
+
 def test_evidence_is_refused_for_fronts_of_rows() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     with pytest.raises(ValueError, match="Evidence weighs what a joint search found"):
-        ep.discover(run, recipe=ep.Recipe(selection=ep.Evidence()))
+        ep.discover(run, recipe=ep.Recipe(search=ep.BestSubset(), selection=ep.Evidence()))
 
 
 def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:

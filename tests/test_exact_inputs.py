@@ -6,11 +6,13 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import polynomial
 from ep2sindy.regression.exact_inputs import is_switched
 from ep2sindy.regression.rows import NoisyRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
+from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.front import fit_support
 from ep2sindy.signals.smoothers import SavitzkyGolay
 
@@ -85,7 +87,7 @@ def test_only_inputs_can_be_exact() -> None:
 @pytest.mark.parametrize("degree", [2, 3])
 def test_a_switched_input_is_found_in_noise_and_what_repeats_it_named(degree: int) -> None:
     run = driven(SWITCH, noise=0.05)
-    found = discover(run, polynomial(run.names, degree=degree))
+    found = discover(run, polynomial(run.names, degree=degree), Recipe(WeightedWeak()))
     assert set(found.model.terms("x")) == {"x", "u"}
     for term, truth in (("x", -1.0), ("u", 2.0)):
         # The trapezoidal rule takes a jump for half a step late or early: 5 ms in some 1 s.

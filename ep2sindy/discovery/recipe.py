@@ -98,26 +98,39 @@ def check_asked(asked: Asked, library: Library, states: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class Recipe:
-    """Rows, search, bootstraps, the rule that selects, and how many candidates it sees per size.
+    """How equations are searched for: with nothing asked, the route that finds known systems most
+    often in noise (docs/estimation.md), `Recipe(search=Joint())`.
 
-    The defaults are the route that finds known systems most often in noise (docs/benchmark.md);
-    the thesis's is Recipe(Differential(), AdaptiveLasso(), Bootstraps(), Knee()).
-    search: a `Joint` one fits whole trajectories; the formulation's rows then serve tables alone.
-    selection: None means EBIC(), or Evidence() after a joint search.
+    A `Joint` search fits whole trajectories; the formulation's rows then serve tables alone.
+    Whoever names a formulation, bootstraps or a rule that judges rows asks for a regression. Its
+    best route is Recipe(WeightedWeak()), the thesis's
+    Recipe(Differential(), AdaptiveLasso(), Bootstraps(), Knee()).
+    formulation: None means WeightedWeak(). search: None means Joint(), or BestSubset() for a
+    regression. bootstraps: None means none. selection: None means Evidence(), or EBIC() for one.
     depth: candidates kept per size: 3 lets a true support win that noise has put second or third.
+    Raises ValueError for a rule that does not go with the search.
     """
 
-    formulation: Formulation = field(default_factory=WeightedWeak)
-    search: Joint | Search = field(default_factory=BestSubset)
-    bootstraps: Bootstraps = field(default_factory=lambda: Bootstraps(n=0))
-    selection: Selection = None  # type: ignore[assignment]  # __post_init__ sets it
+    formulation: Formulation = None  # type: ignore[assignment]  # __post_init__ sets all of them
+    search: Joint | Search = None  # type: ignore[assignment]
+    bootstraps: Bootstraps = None  # type: ignore[assignment]
+    selection: Selection = None  # type: ignore[assignment]
     depth: int = 1
 
     def __post_init__(self) -> None:
-        check_kind("formulation", self.formulation, Formulation, "ep.WeightedWeak()")
+        rows_asked = self.formulation is not None or self.bootstraps is not None
+        if self.search is None:
+            joint = not rows_asked and isinstance(self.selection, Evidence | None)
+            object.__setattr__(self, "search", Joint() if joint else BestSubset())
         joint = isinstance(self.search, Joint)
-        if self.selection is None:
-            object.__setattr__(self, "selection", Evidence() if joint else EBIC())
+        for name, value in {
+            "formulation": WeightedWeak(),
+            "bootstraps": Bootstraps(n=0),
+            "selection": Evidence() if joint else EBIC(),
+        }.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+        check_kind("formulation", self.formulation, Formulation, "ep.WeightedWeak()")
         if not joint:
             check_kind("search", self.search, Search, "ep.BestSubset()")
         check_kind("bootstraps", self.bootstraps, Bootstraps, "ep.Bootstraps(n=0)")
@@ -126,7 +139,8 @@ class Recipe:
             raise ValueError(
                 "a joint search weighs models by the likelihood of trajectories: selection must "
                 "be Evidence() (selection=evidence), or a rule that runs models, such as "
-                f"FreeRunScore(): {self.selection!r} came"
+                f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, "
+                "such as BestSubset() (search=best_subset)"
             )
         if type(self.depth) is not int or self.depth < 1:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")

@@ -16,6 +16,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
 from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.front import ParetoFront, errors_of, fit_supports, front_order
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
@@ -67,12 +68,12 @@ def discover_jointly(
     BIC and EBIC that is the criterion of the joint likelihood, the count of supports paid once. A
     term may vanish at some points, if it shows at others. One point gives what `discover` does.
     points: name -> trajectories. Points are assembled in the order of their names.
-    recipe: None means Recipe(). Raises ValueError for a search that cannot serve several points,
-    bootstraps, which a joint search has none of, no point, or points whose states, variables or
-    units differ.
+    recipe: None means Recipe(WeightedWeak()). Raises ValueError for a search that cannot serve
+    several points, bootstraps, which a joint search has none of, no point, or points whose states,
+    variables or units differ.
     Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
     """
-    recipe = recipe or Recipe()
+    recipe = recipe or Recipe(WeightedWeak())
     search = _joint_search(recipe)
     _check_points(points, library)
     rng = np.random.default_rng(seed)

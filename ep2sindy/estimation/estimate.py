@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.joint import Joint, Solution, solve
+from ep2sindy.estimation.joint import SAMPLES_PER_TERM, Joint, Solution, enough_samples, solve
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.problem import Problem, scaled_problem
 from ep2sindy.estimation.supports import priced, supports_by_size
@@ -18,7 +18,6 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 
 MOST_RIVALS = 5
-SAMPLES_PER_TERM = 5
 LEAST_ODDS = 1e-3  # of a rival that is worth a word
 
 
@@ -113,7 +112,7 @@ def estimate(
         memory=found.noise.memory,
         flow_error=found.flow_error,
         misfit=_misfit(problem, found),
-        few=_few(problem),
+        few=_few(problem, search.terms_for(problem)),
         weighed=weighed,
         rivals=_rivals(problem, found, weighed),
     )
@@ -205,13 +204,14 @@ def _rivals(
     return tuple(sorted(rivals, key=lambda r: -r.odds)[:MOST_RIVALS])
 
 
-def _few(problem: Problem) -> str:
-    n, n_terms = problem.n_samples, len(problem.library)
-    if n >= SAMPLES_PER_TERM * n_terms:
+def _few(problem: Problem, max_terms: int) -> str:
+    if enough_samples(problem):
         return ""
+    n_terms = len(problem.library)
     return (
-        f"{n} samples do not tell which of {n_terms} terms: {SAMPLES_PER_TERM * n_terms} and more "
-        "would; name the terms that you know (terms=...), or take a smaller library"
+        f"{problem.n_samples} samples do not tell which of {n_terms} terms "
+        f"({SAMPLES_PER_TERM * n_terms} would): {max_terms} an equation at most were tried; "
+        "name the terms that you know (terms=...), or take a smaller library"
     )
 
 

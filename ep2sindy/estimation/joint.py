@@ -8,13 +8,14 @@ from math import inf
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed
+from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed, polished
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import Problem
 from ep2sindy.estimation.start import smoothed_start
 from ep2sindy.estimation.supports import term_prices
 
-FEWEST_SAMPLES = 3  # a term
+SAMPLES_PER_TERM = 5  # of the library: fewer do not tell which
+SAMPLES_PER_COEFFICIENT = 10  # of an equation, where they do not: more terms follow the noise
 LET_GO = 0.5  # of a state's spread: what is left of a state that the model does not follow
 ENOUGH_SAMPLES = 300  # to trust the first start: fewer are quickly tried from all
 MOST_PASSES = 4  # until noise and support agree: two are the rule
@@ -39,8 +40,15 @@ class Joint:
             raise ValueError(f"max_terms must be at least 1: {self.max_terms} came")
 
     def terms_for(self, problem: Problem) -> int:
-        """Terms of one equation that these samples can tell: three samples each."""
-        return max(1, min(self.max_terms, problem.n_samples // FEWEST_SAMPLES))
+        """Terms that one equation may have: fewer where the samples are few."""
+        if enough_samples(problem):
+            return self.max_terms
+        return max(1, min(self.max_terms, problem.n_samples // SAMPLES_PER_COEFFICIENT))
+
+
+def enough_samples(problem: Problem) -> bool:
+    """Whether they can tell which terms of the library there are."""
+    return problem.n_samples >= SAMPLES_PER_TERM * len(problem.library)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +102,7 @@ def _from_start(problem: Problem, log10_ratio: float | None, max_terms: int) -> 
         found = annealed(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
         if np.array_equal(before, found.fit.support):
             break
+    found = polished(problem, found, prices, max_terms=max_terms)
     noise = noise_beside(problem, found.fit)
     error = 0.0
     if np.isfinite(found.score) and (noise.std > FLOOR).any():

@@ -20,6 +20,8 @@ from ep2sindy.estimation.problem import Flow, Problem
 FREE_START = 100.0  # variance of the first state before any sample: ten times its RMS
 MOST_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
 SETTLED = 1e-2  # a step that lowers the squares by less is the last: a term costs ten
+# Squares so many times their number, falling by less than this share a step, come to nothing.
+FAR, CRAWLS = 10.0, 0.02
 RIDGE = 1e-12  # of a Hessian of unit diagonal
 # What samples that resolve the motion never need: then it is coefficients that run away, and each
 # substep costs as much as the first.
@@ -116,7 +118,8 @@ def fitted(problem: Problem, fit: Fit, level: Level) -> Fit:
         else:
             return fit
         gain, fit = fit.total - tried.total, tried
-        if share == 1.0 and gain < SETTLED:
+        crawls = fit.total > FAR * problem.n_squares and gain < CRAWLS * fit.total
+        if crawls or (share == 1.0 and gain < SETTLED):
             return fit
     return fit
 

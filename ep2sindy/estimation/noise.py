@@ -139,7 +139,7 @@ def _deviance(problem: Problem, fit: Fit, level: Level) -> float:
             flow.slopes, misses, residuals, variance, process, FREE_START
         )
         least, spread = least + squares, spread + logs
-    n = problem.n_samples * len(problem.states)
+    n = problem.n_squares
     return spread + n * np.log(max(least, TINY) / n)
 
 

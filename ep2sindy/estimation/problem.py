@@ -88,6 +88,11 @@ class Problem:
         return sum(len(record.samples) for record in self.records)
 
     @property
+    def n_squares(self) -> int:
+        """Samples times states: about what the squares are where a model fits."""
+        return self.n_samples * len(self.states)
+
+    @property
     def related(self) -> bool:
         """Whether relations hold between coefficients."""
         return self.C.shape[0] != self.C.shape[1] or not np.array_equal(self.C, np.eye(len(self.C)))

@@ -14,6 +14,7 @@ from ep2sindy.search.searches import BestSubset
 
 MOST_SWEEPS = 10  # over the equations: two or three are the rule
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
+MOST_ALTERNATIVES = 24  # of one equation, about which the others' are sought again
 CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which terms are dependent
 
 
@@ -46,10 +47,11 @@ def best_support(
     start: Bool[np.ndarray, " free"],
     *,
     max_terms: int,
+    held: int | None = None,
 ) -> Priced:
     """The support of least score: every equation's exactly, given the others', until none changes.
 
-    max_terms: of one equation. Those required are always in.
+    max_terms: of one equation. Those required are always in. held: an equation left as it is.
     """
 
     def rank(each: Priced) -> tuple[int, float]:
@@ -60,7 +62,7 @@ def best_support(
         before = best
         for block in np.unique(problem.block):
             own = problem.block == block
-            if problem.required[own].all():
+            if block == held or problem.required[own].all():
                 continue
             offered = _offered(problem, gram, best.support, own, max_terms)
             best = min([best, *(priced(gram, s, prices) for s in offered)], key=rank)
@@ -80,6 +82,36 @@ def supports_by_size(
 ) -> list[Bool[np.ndarray, " free"]]:
     """The best few supports of every size of one equation, the others as chosen."""
     return _offered(problem, gram, chosen, problem.block == block, max_terms)
+
+
+def alternatives(
+    problem: Problem,
+    gram: Gram,
+    prices: Float[np.ndarray, " free"],
+    chosen: Bool[np.ndarray, " free"],
+    *,
+    within: float,
+    max_terms: int,
+) -> list[Priced]:
+    """Supports whose score lies no further than `within` above the chosen one's, best first.
+
+    Each is an equation's own, with what is then best for the others: exchanges in two equations
+    of which neither pays alone are among them.
+    """
+    limit = priced(gram, chosen, prices).score + within
+    found: dict[bytes, Priced] = {}
+    for block in np.unique(problem.block).tolist():
+        masks = supports_by_size(problem, gram, chosen, block, max_terms=max_terms)
+        seeds = [priced(gram, m, prices) for m in masks if not np.array_equal(m, chosen)]
+        seeds = [each for each in seeds if each.score <= limit + within]
+        for seed in sorted(seeds, key=lambda each: each.score)[:MOST_ALTERNATIVES]:
+            each = best_support(
+                problem, gram, prices, seed.support, max_terms=max_terms, held=block
+            )
+            if each.score <= limit and excess(problem, each.support, max_terms) == 0:
+                found[each.support.tobytes()] = each
+    found.pop(chosen.tobytes(), None)
+    return sorted(found.values(), key=lambda each: each.score)
 
 
 def priced(
