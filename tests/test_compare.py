@@ -64,7 +64,7 @@ def test_two_runs_are_set_side_by_side(
     for row in (
         "search.max_terms 3 4",
         "numpy 2.3 2.4",
-        "one: frequency (kHz) 1.5 2 +0.5",
+        "one: frequency 1.5 kHz 2 kHz +33 %",
         "one: R2 0.5 - -",
         "x' x -2 ±0.1 -3 ±0.1 apart",
         "y' y 1 ±0.1 1 ±0.1 overlap",
@@ -181,3 +181,18 @@ def test_what_was_varied_is_parted_from_the_rest(tmp_path: Path) -> None:
 )
 def test_headline_figures_read_in_words(name: str, words: str) -> None:
     assert in_words(name) == words
+
+
+def test_runs_in_years_are_compared_in_years(
+    runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    year = ep.Clock.of("year").seconds
+    for folder in runs:
+        summary = json.loads((folder / "summary.json").read_text())
+        summary |= {"data": {"time_unit": "year"}, "headline": {"one/f_kHz": 0.1e-3 / year}}
+        (folder / "summary.json").write_text(json.dumps(summary))
+    compare([*map(str, runs), "--page", str(tmp_path / "page.html")])
+    said = capsys.readouterr().out
+    assert "0.1 per year" in said
+    assert f"A: x' = -{2.0 * year:.3g} x [m year^-1]" in said
+    assert f"-{2.0 * year:.4g} ±{0.1 * year:.2g}" in said

@@ -10,10 +10,11 @@ from typing import Any
 import pandas as pd
 
 from ep2sindy.app.read_run import ReadRun, link_to
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
 from ep2sindy.report.picture import Drawn, read_png
-from ep2sindy.report.words import in_words
+from ep2sindy.report.words import in_words, value_text
 from ep2sindy.studies.shown import shown_equation
 
 NOTE = (
@@ -77,39 +78,46 @@ def _headlines(runs: Sequence[ReadRun]) -> Table:
     for name in names:
         found = [run.headline.get(name, float("nan")) for run in runs]
         row: dict[str, Any] = {"figure": in_words(name)}
-        row |= {run.label: cell_text(value) for run, value in zip(runs, found, strict=True)}
-        rows.append(row | ({"change": _change(*found)} if len(found) == 2 else {}))
+        texts = [value_text(name, v, run.clock) for run, v in zip(runs, found, strict=True)]
+        row |= dict(zip((run.label for run in runs), texts, strict=True))
+        if any(value == value for value in found):
+            rows.append(row | ({"change": _change(*found)} if len(found) == 2 else {}))
     return Table(pd.DataFrame(rows))
 
 
 def _change(before: float, after: float) -> str:
-    """`+0.021`; a dash where either is not known."""
+    """`+2.1 %`, or the difference of what is small or changes sign; a dash for what is unknown."""
     change = after - before
-    return "-" if change != change else f"{change:+.3g}" if change else "0"
+    if change != change:
+        return "-"
+    if before * after > 0.0 and abs(change) < abs(before):
+        return f"{100.0 * change / before:+.2g} %"
+    return f"{change:+.3g}"
 
 
 def _models(runs: Sequence[ReadRun]) -> list[Section]:
     """Of every name, the equations of all runs, and their coefficients beside each other."""
-    found = []
+    found, clocks = [], {run.clock for run in runs}
+    clock = clocks.pop() if len(clocks) == 1 else SECONDS
     for name in dict.fromkeys(name for run in runs for name in run.models):
         models = {run.label: run.models[name] for run in runs if name in run.models}
         blocks: list[Block] = [
-            shown_equation(model, state, lead=label)
+            shown_equation(model, state, clock, lead=label)
             for label, model in models.items()
             for state in model.states
         ]
         if len(models) < len(runs):
             blocks.append(Text(f"Only in {', '.join(models)}."))
         else:
-            table = _coefficients(models)
+            table = _coefficients(models, clock)
             known = not table["intervals"].eq("-").all()
             blocks.append(Table(table, note=NOTE) if known else Table(table.iloc[:, :-1]))
         found.append(Section(f"Model: {name.replace('_', ' ')}", blocks))
     return found
 
 
-def _coefficients(models: Mapping[str, SparseModel]) -> pd.DataFrame:
-    """A row per state and term that any of the models has."""
+def _coefficients(models: Mapping[str, SparseModel], clock: Clock) -> pd.DataFrame:
+    """A row per state and term that any of the models has, per unit of the clock."""
     rows = []
     for state in dict.fromkeys(s for model in models.values() for s in model.states):
         own = {n: m.terms(state) if state in m.states else {} for n, m in models.items()}
@@ -118,8 +126,10 @@ def _coefficients(models: Mapping[str, SparseModel]) -> pd.DataFrame:
             row = {"equation": f"{state}'", "term": term.replace("*", " ")}
             for label in models:
                 value, known = own[label].get(term), ends[label].get(term)
-                text = "-" if value is None else f"{value:.4g}"
-                reach = "" if known is None else f" ±{0.5 * (known[1] - known[0]):.2g}"
+                text = "-" if value is None else f"{clock.seconds * value:.4g}"
+                reach = (
+                    "" if known is None else f" ±{0.5 * clock.seconds * (known[1] - known[0]):.2g}"
+                )
                 row[label] = text + reach
             rows.append(row | {"intervals": _overlap([ends[n].get(term) for n in models])})
     return pd.DataFrame(rows)

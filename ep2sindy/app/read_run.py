@@ -10,6 +10,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
 
@@ -24,6 +25,11 @@ class ReadRun:
     provenance: dict[str, Any]
     settings: dict[str, Any]
     models: dict[str, SparseModel]
+
+    @property
+    def clock(self) -> Clock:
+        """The unit that its times are read in."""
+        return Clock.of(self.summary.get("data", {}).get("time_unit", "s"))
 
     @property
     def headline(self) -> dict[str, float]:

@@ -16,7 +16,7 @@ from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
 from ep2sindy.report.folder import freeze_layout
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import DPI, Drawn, drawn
-from ep2sindy.report.words import in_words
+from ep2sindy.report.words import in_words, value_text
 
 MOST_PANELS = 12
 CAPTION = "Headline figures of the jobs that came to their end."
@@ -60,7 +60,7 @@ def _jobs(sweep: Path, records: Records, varied: Mapping[str, Sequence[str]]) ->
         name = str(record["job"])
         link = Link(name, os.path.relpath(page, sweep)) if "folder" in record else name
         found = record.get("headline", {})
-        values = {in_words(each): found.get(each, float("nan")) for each in figures}
+        values = {in_words(n): value_text(n, _number(found.get(n))) for n in figures}
         given = {key: texts[k] for key, texts in varied.items()}
         rows.append({"job": link, **given, "status": record["status"], **values})
     return pd.DataFrame(rows)
@@ -75,7 +75,7 @@ def _figures(records: Records, varied: Mapping[str, Sequence[str]]) -> dict[str,
     from ep2sindy.figures.sweeps import sweep_figure
 
     values = {
-        in_words(name): np.array(
+        in_words(name) + (" (kHz)" if name.endswith("f_kHz") else ""): np.array(
             [_number(record.get("headline", {}).get(name)) for record in records]
         )
         for name in _headlines(records)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.report.document import cell_text
+
 WORDS = {
-    "f_kHz": "frequency (kHz)",
+    "f_kHz": "frequency",
     "f_error": "error of the frequency (relative)",
     "nrmse": "error of the trajectory (standard deviations)",
     "waveform_error": "error of the waveform (standard deviations)",
@@ -31,3 +34,10 @@ def in_words(name: str) -> str:
     *where, what = name.split("/")
     text = WORDS.get(what, what.replace("_", " "))
     return f"{', '.join(WORDS.get(part, part) for part in where)}: {text}" if where else text
+
+
+def value_text(name: str, value: float, clock: Clock = SECONDS) -> str:
+    """A headline figure as a cell; a frequency with its unit, in people's time."""
+    if name.split("/")[-1] == "f_kHz":
+        return clock.frequency_text(1e3 * value)
+    return cell_text(value)

@@ -96,6 +96,7 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
     return {
         "n_samples": data.n_samples,
         "dt_s": data.dt_s,
+        "time_unit": data.clock.unit,  # that people read; numbers are in seconds
         "f_kHz": 1e-3 * dominant_frequency(data.t, data.states[:, 0]),
         "variables": list(data.names),
         "units": dict(data.units),
