@@ -88,8 +88,8 @@ def _headlines(runs: Sequence[ReadRun]) -> Table:
 def _change(before: float, after: float) -> str:
     """`+2.1 %`, or the difference of what is small or changes sign; a dash for what is unknown."""
     change = after - before
-    if change != change:
-        return "-"
+    if change != change or change == 0.0:
+        return "0" if change == 0.0 else "-"
     if before * after > 0.0 and abs(change) < abs(before):
         return f"{100.0 * change / before:+.2g} %"
     return f"{change:+.3g}"
