@@ -62,6 +62,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.library.library import Library as Library
     from ep2sindy.library.library import named_terms as named_terms
     from ep2sindy.library.library import polynomial as polynomial
+    from ep2sindy.library.units import Clock as Clock
     from ep2sindy.machine.parallel import Dask as Dask
     from ep2sindy.machine.parallel import Loky as Loky
     from ep2sindy.machine.parallel import Serial as Serial
@@ -221,6 +222,7 @@ _FACE = {
     "library.equations": "equation_text",
     "library.library": "Library polynomial named_terms",
     "machine.parallel": "Serial Loky Dask",
+    "library.units": "Clock",
     "model.free_run": "Bounds FreeRun Verdict free_run",
     "model.model": "SparseModel coef_matrix",
     "model.rollout": "Rollout",

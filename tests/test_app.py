@@ -200,8 +200,10 @@ def test_runs_are_compared_by_plain_settings() -> None:
     found = hparams_of(settings, keys_of(Toy))
     assert found["n"] == 3
     assert found["names"] == "['a', 'b']"
-    assert found["search"] == "_target_=ep2sindy.BestSubset"
-    assert "many" not in found
+    assert found["search"] == "BestSubset"
+    assert (found["rule"], found["rule.gamma"]) == ("EBIC", 0.5)
+    assert found["many.one.width"] == 2.0
+    assert "span" not in found  # it is not set
 
 
 @pytest.mark.parametrize("value", [True, -1, "a"])

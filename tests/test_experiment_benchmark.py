@@ -38,7 +38,7 @@ def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_cell_is_counted(toy_run: Path) -> None:
     summary = json.loads((toy_run / "summary.json").read_text())
-    assert list(summary) == ["experiment", "seed", "cells"]
+    assert list(summary) == ["experiment", "seed", "cells", "headline"]
     assert (summary["experiment"], summary["seed"]) == ("benchmark", 0)
     places = [(c["system"], c["noise"], c["variant"]) for c in summary["cells"]]
     assert places == [
@@ -79,17 +79,17 @@ def test_terminal_and_page_show_both(toy_run: Path) -> None:
     log = (toy_run / "run.log").read_text()
     page = (toy_run / "report.html").read_text()
     for name in ("benchmark", "attractors", "trajectories"):
-        assert f"figures/{name}.png" in page
+        assert f'id="figure-{name}"' in page
     assert "Identified by ours" in page
     for title in ("True equations on the front, %", "True equations selected, %", "True terms"):
         assert title in log
         assert title in page
     assert max(map(len, log.splitlines())) <= 120
     assert log.count("ALASSO, thesis") == 3
-    italic = next(row for row in page.split("<tr ") if "<td>100/92</td>" in row)
+    italic = next(row for row in page.split("<tr ") if ">100/92</td>" in row)
     assert italic.startswith('class="italic"><td>ALASSO, thesis</td>')
     assert "EBIC(gamma=1.0, coarsening=60.0)" in page
-    assert 'src="figures/benchmark.png"' in page
+    assert 'id="figure-benchmark"' in page
     for name in ("benchmark.png", "benchmark.pdf"):
         assert (toy_run / "figures" / name).stat().st_size > 0
     assert list((toy_run / "tensorboard").glob("events*"))

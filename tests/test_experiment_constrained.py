@@ -32,7 +32,7 @@ def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
 def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:
     folder = run_config(constrained(predator_prey, tmp_path, "~models.ionization")).folder
     summary = json.loads((folder / "summary.json").read_text())
-    assert list(summary) == ["experiment", "seed", "data", "models"]
+    assert list(summary) == ["experiment", "seed", "data", "models", "headline"]
     assert (summary["data"]["n_samples"], summary["data"]["n_held_out"]) == (1200, 300)
     models = summary["models"]
     assert list(models) == ["predator_prey", "velocity"]
@@ -50,7 +50,7 @@ def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_pat
     assert exact["n_n"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
     assert len(pd.read_csv(folder / "tables" / "methods.csv")) == 8
     page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
-    assert "figures/trajectories.png" in page
+    assert 'id="figure-trajectories"' in page
     for words in ("relation: n_i: n_i*n_n == -1 * n_n: n_i*n_n", "predator prey, constrained"):
         assert words in page
         assert words in log

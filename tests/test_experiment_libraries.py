@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.machine.files import write_json
-from ep2sindy.model.model import SparseModel
+from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.studies.libraries import Study
-from tests.programs import EXPERIMENTS, ROOT, composed, computed
+from tests.browser import seen
+from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -79,7 +81,7 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert shared["verdict"] == "lives"
     page = (breathing_run / "report.html").read_text()
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
-        assert f"figures/{figure}.png" in page
+        assert f'id="figure-{figure}"' in page
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
     names = {path.name for path in (breathing_run / "tables").iterdir()}
     assert {"living.csv", "coefficients_living.csv", "roles_simple.csv"} <= names
@@ -105,9 +107,44 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
     model = SparseModel.load(folder / "models" / "simple.json")
     assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]["terms"]
     page = (folder / "report.html").read_text()
-    for image in ("figures/data.png", "figures/phase.png", "figures/front_simple.png"):
-        assert image in page
-        assert image in files
+    for image in ("data", "phase", "front_simple"):
+        assert f'id="figure-{image}"' in page
+        assert f"figures/{image}.png" in files
+
+
+@pytest.mark.parametrize("width_px", [1280, 390])
+def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px: int) -> None:
+    page = breathing_run / "report.html"
+    questions = {
+        "hovers": "document.querySelectorAll('figure svg title').length",
+        "first": "document.querySelector('figure svg title').textContent",
+        "equations": "document.querySelectorAll('math').length",
+        "flat": "[...document.querySelectorAll('math')].filter(m => !m.clientHeight && "
+        "!m.getBoundingClientRect().height).length",
+    }
+    found = seen(page, width_px, questions=questions)
+    assert [url for url in found.asked if not url.startswith("data:")] == [page.as_uri()]
+    assert found.console == []
+    assert (found.figures, found.empty) == (11, 0)
+    assert found.scroll_px <= width_px  # what is wider scrolls in itself
+    assert found.answers["hovers"] > 20
+    assert found.answers["first"].startswith("n_i' of 0 terms: none\n1 - R2 = ")
+    assert found.answers["equations"] > 20
+    assert found.answers["flat"] == 0
+
+
+def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) -> None:
+    page = (breathing_run / "report.html").read_text()
+    for words in (
+        "Discover a model with every library",  # the study's own words
+        "1200 samples of 1.5 µs",
+        "BestSubset (max_terms 4",
+        "How to reproduce",
+        "max_terms: 4",  # the whole config
+    ):
+        assert words in page
+    summary = summary_of(breathing_run)
+    assert summary["headline"]["simple/f_kHz"] == summary["models"]["simple"]["trajectory"]["f_kHz"]
 
 
 def test_a_fixed_seed_gives_the_same_summary(
@@ -145,6 +182,59 @@ def test_discover_runs_on_a_csv_of_any_system(tmp_path: Path) -> None:
     found = computed(config).summary["models"]["model"]["equations"]
     assert found["x"]["terms"] == pytest.approx({"v": 1.0}, rel=0.01)
     assert found["v"]["terms"]["x"] == pytest.approx(-9.0, rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
+    """Predator and prey over thirty years, counted three times a year with 2 % of noise."""
+    library = polynomial(["hare", "lynx"], degree=2)
+    terms = [{"hare": 0.6, "hare*lynx": -0.03}, {"lynx": -0.9, "hare*lynx": 0.03}]
+    model = SparseModel(library, ["hare", "lynx"], coef_matrix(library, terms))
+    t = np.linspace(0.0, 30.0, 91)
+    states = model.simulate(t, [20.0, 10.0]).states
+    states = states + 0.02 * states.std(axis=0) * np.random.default_rng(0).normal(size=states.shape)
+    folder = tmp_path_factory.mktemp("years")
+    table = np.column_stack([1900.0 + t, states])
+    np.savetxt(folder / "run.csv", table, delimiter=",", header="time,hare,lynx", comments="")
+    config = composed(
+        "+exp=discover", "data=file", f"data.path={folder / 'run.csv'}", "data.z.name=null",
+        "data.time.unit=year", "data.variables.n_i.name=null", "data.variables.n_n.name=null",
+        "+data.variables.hare.name=hare", "+data.variables.hare.unit=1",
+        "+data.variables.lynx.name=lynx", "+data.variables.lynx.unit=1",
+        "trajectory.states=[hare,lynx]", "search=joint", f"output={folder}",
+    )  # fmt: skip
+    return computed(config)
+
+
+def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed) -> None:
+    year = 365.25 * 86400.0
+    found = years.summary["models"]["model"]["equations"]["hare"]["terms"]
+    # The estimator's own standard error at this noise is about one per cent.
+    assert found == pytest.approx({"hare": 0.6 / year, "hare*lynx": -0.03 / year}, rel=0.05)
+    assert years.summary["data"]["dt_s"] == pytest.approx(year / 3.0)
+    for words in ("91 samples of 0.3333 years", " per year", "candidates for hare' [year^-1]"):
+        assert words in years.log
+    assert "Hz" not in years.log
+    mine = re.search(r"hare' = (\S+) hare - (\S+) hare lynx  <- selected", years.log)
+    assert mine is not None
+    assert [float(number) for number in mine.groups()] == pytest.approx([0.6, 0.03], rel=0.05)
+    assert "year<sup>−1</sup>" in years.page
+
+
+def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
+    found = years.summary["models"]["model"]["estimate"]
+    spread = years.outcome.data.states.std(axis=0)
+    # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
+    noise = [found["noise_std"][name] / s for name, s in zip(("hare", "lynx"), spread, strict=True)]
+    assert noise == pytest.approx([0.02, 0.02], rel=0.25)
+    assert (found["flow_error"], found["misfit"], found["few"]) == (0.0, None, None)
+    for text in (years.log, years.page):
+        for words in ("what the samples say", "noise of the samples", "memory"):
+            assert words in text
+    said = " ".join(years.log.split())
+    assert "The model explains the samples as far as their noise" in said
+    assert "share" not in said  # there are no bootstraps
+    assert "95 % from" in years.page
 
 
 @pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])

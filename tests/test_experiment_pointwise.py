@@ -102,7 +102,7 @@ def test_tables_figures_and_page_are_there(toy_run: Path) -> None:
     page = (toy_run / "report.html").read_text()
     for name in ("coefficients", "regimes", "quality"):
         assert (toy_run / "figures" / f"{name}.png").stat().st_size > 1e4
-        assert f"figures/{name}.png" in page
+        assert f'id="figure-{name}"' in page
     events = EventAccumulator(str(toy_run / "tensorboard")).Reload()
     assert [e.value for e in events.Scalars("points/done")][-1] == 30.0
     assert {"coefficients", "regimes", "quality"} <= set(events.Tags()["images"])

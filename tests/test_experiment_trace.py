@@ -59,7 +59,7 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     page = (folder / "report.html").read_text()
     for name in ("free_run", "plane", "waveform", "front"):
         assert (folder / "figures" / f"{name}.png").exists()
-        assert f"figures/{name}.png" in page
+        assert f'id="figure-{name}"' in page
 
 
 @pytest.mark.parametrize("embedding", ["rate", "delays"])

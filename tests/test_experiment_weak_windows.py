@@ -27,7 +27,7 @@ def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
     for cell in found:
         assert cell["n"] == 2
         assert {"n_windows", "noise", "error_mean", "error_std"} <= set(cell)
-    assert "figures/errors.png" in (folder / "report.html").read_text()
+    assert 'id="figure-errors"' in (folder / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

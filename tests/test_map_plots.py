@@ -192,7 +192,7 @@ def test_terms_that_no_point_selected_have_no_column() -> None:
     result = study()
     result["coef"].loc[{"term": "n_n"}] *= 0.0
     titles = {ax.get_title() for ax, _ in maps(coefficient_maps(result))}
-    assert titles == {"", "$1$", "$n_{i} u_{iz}$"}
+    assert titles == {"", "$1$", r"$n_{i} \, u_{iz}$"}
 
 
 def test_coefficients_of_no_term_at_all_are_refused() -> None:
@@ -239,7 +239,7 @@ def test_a_regime_map_gives_every_regime_its_equations(regime: Figure) -> None:
         "regime 0: 8 points, ",
         "regime 1: 8 points, ",
     }
-    assert all(r"$\dot{n}_{i} = - 40 \, n_{i} u_{iz}$" in entry for entry in entries)
+    assert all(r"$\dot{n}_{i} = - 40 \, n_{i} \, u_{iz}$" in entry for entry in entries)
     assert any(r"$\dot{n}_{n} = 3 \cdot 10^{4} \, n_{n}$" in entry for entry in entries)
 
 

@@ -52,9 +52,10 @@ def test_an_empty_equation_prints_as_zero() -> None:
 def test_latex_has_powers_of_ten_and_subscripts() -> None:
     latex = breathing().latex()
     assert (
-        r"\dot{n}_{i} &= - 2.62 \cdot 10^{5} \, n_{i} + 5.48 \cdot 10^{-14} \, n_{i} n_{n}" in latex
+        r"\dot{n}_{i} &= - 2.62 \cdot 10^{5} \, n_{i} + 5.48 \cdot 10^{-14} \, n_{i} \, n_{n}"
+        in latex
     )
-    assert r"- 0.77 \, n_{i} n_{n} R_{ion}" in latex
+    assert r"- 0.77 \, n_{i} \, n_{n} \, R_{ion}" in latex
 
 
 def test_sympy_evaluates_like_the_model() -> None:

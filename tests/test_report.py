@@ -1,5 +1,6 @@
 """What a study says, on the terminal, the page and in TensorBoard."""
 
+from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
 
@@ -10,8 +11,11 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ep2sindy.report.document import Captioned, Equation, Picture, Section, Table, Text
+from ep2sindy.figures.style import hover
+from ep2sindy.report.about import About, asked_of
+from ep2sindy.report.document import Equation, Link, Picture, Section, Table, Text
 from ep2sindy.report.page import page_html
+from ep2sindy.report.picture import drawn
 from ep2sindy.report.screen import WIDTH, Screen, rich_table
 from ep2sindy.report.tensorboard import Board
 
@@ -32,7 +36,8 @@ SECTIONS = [
     ),
     Section("Only a picture", [Picture("front")], level=3),
 ]
-FIGURES = {"front": Captioned(Figure, "Error against size <&>.")}
+PIXEL = b"any bytes: a page embeds what it is given"
+FIGURES = {"front": drawn(Figure(figsize=(4.0, 3.0)), PIXEL, "Error against size <&>.")}
 
 
 @pytest.fixture
@@ -56,7 +61,7 @@ def test_a_screen_shows_what_fits_a_screen(log: str) -> None:
 def test_numbers_read_alike_on_screen_and_page(log: str) -> None:
     page = page_html("a study", SECTIONS, FIGURES)
     for cells in (("2", "-"), ("1", "0.5")):
-        assert all(f"<td>{cell}</td>" in page for cell in cells)
+        assert all(f'<td class="number">{cell}</td>' in page for cell in cells)
         assert any(all(cell in line for cell in cells) for line in log.splitlines())
 
 
@@ -86,16 +91,113 @@ def test_text_too_long_for_a_line_breaks_between_words() -> None:
 def test_a_page_marks_rows_and_escapes_text() -> None:
     page = page_html("a <study>", SECTIONS, FIGURES)
     assert "<h1>a &lt;study&gt;</h1>" in page
-    assert '<tr class="bold"><td>2</td><td>-</td><td>[c]</td></tr>' in page
-    assert '<tr class="italic"><td>1</td><td>0.5</td><td>a &lt; b</td></tr>' in page
+    number = '<td class="number">{}</td>'
+    bold = "".join([*map(number.format, ("2", "-")), "<td>[c]</td>"])
+    italic = "".join([*map(number.format, ("1", "0.5")), "<td>a &lt; b</td>"])
+    assert f'<tr class="bold">{bold}</tr>' in page
+    assert f'<tr class="italic">{italic}</tr>' in page
     assert "<p>long</p>" in page
     assert '<p class="warning">amiss</p>' in page
-    assert "thesis: d<i>n</i><sub>i</sub>/dt = &minus; 2 <i>n</i><sub>i</sub>" in page
+    assert '<p class="equation aside">thesis: <span class="math"><math' in page
+
+
+class Parsed(HTMLParser):
+    """The elements of a page, and what is said in it."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[str] = []
+        self.said = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append(tag)
+        assert not any(name.startswith("on") for name, _ in attrs)
+
+    def handle_data(self, data: str) -> None:
+        self.said += data
+
+
+@pytest.mark.parametrize(
+    "name", ["<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a&b"]
+)
+def test_names_from_data_never_become_markup(name: str) -> None:
+    equation = Equation(name, {name: 1.0, f"{name}*y": 2.0}, lead=name, mark=name, unit=name)
+    table = Table(pd.DataFrame({name: [name, equation, Link(name, "x.html")]}), name, note=name)
+    provenance = {"command": [name], "commit": name, "seed": 0, "versions": {name: name}}
+    about = About(name, {name: name}, [name], [name], provenance, name)
+    figures = {"front": drawn(_hovering(name), PIXEL, name)}
+    section = Section(name, [Text(name), equation, table, Picture("front")])
+    page = Parsed(page_html(name, [section], figures, about))
+    assert not {"script", "img"} & set(page.elements)
+    assert page.elements.count("svg") == 1
+    assert page.said.count(name) >= 20
+
+
+def _hovering(text: str) -> Figure:
+    figure = Figure(figsize=(4.0, 3.0))
+    (line,) = figure.subplots().plot([0.0, 1.0], "o")
+    hover(line, f"{text} | second line")
+    return figure
+
+
+def test_marks_of_a_figure_say_more_under_the_mouse() -> None:
+    html = drawn(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
+    assert "<title>n_i' of 2 terms\nsecond line</title>" in html
+    assert "hover" not in html
+    assert html == drawn(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "a template must be a file of HTML for Jinja2: .* is none; leave it out"),
+        ("{{ nothing }}", "cannot be filled: 'nothing' is undefined"),
+        ("{% if %}", "cannot be filled: Expected an expression"),
+    ],
+)
+def test_a_template_that_cannot_be_filled_is_refused(
+    text: str | None, message: str, tmp_path: Path
+) -> None:
+    template = tmp_path / "own.html"
+    if text is not None:
+        template.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        page_html("a study", SECTIONS, FIGURES, template=template)
+
+
+def test_a_template_of_ones_own_is_given_all(tmp_path: Path) -> None:
+    template = tmp_path / "own.html"
+    template.write_text("{% for part in parts.values() %}{{ part.title }};{% endfor %}")
+    assert page_html("a study", SECTIONS, FIGURES, template=template) == (
+        "Fronts &amp; models;Only a picture;"
+    )
+
+
+def test_settings_read_in_words() -> None:
+    zone = {"_target_": "ep2sindy.Zone", "z": None, "r": None}
+    variables = {"x": {"name": "X", "unit": "1"}, "y": {"name": None, "unit": "m"}}
+    settings = {
+        "search": {"_target_": "ep2sindy.BestSubset", "max_terms": 4, "n_best": None},
+        "data": {"path": "a.csv", "variables": variables},
+        "trajectory": {"_target_": "ep2sindy.ZoneAverage", "zone": zone, "states": ["x"]},
+        "rollout_s": 4.0e-3,
+        "thesis": {"x": 1.0},
+        "depth": None,
+        "other": 3,
+    }
+    assert asked_of(settings, set(settings) - {"other"}) == {
+        "data": "path a.csv, variables (x (name X, unit 1))",
+        "time series": "ZoneAverage (states x)",
+        "search": "BestSubset (max_terms 4)",
+        "rollout s": "0.004",
+    }
 
 
 def test_a_page_shows_the_figures_there_are() -> None:
     page = page_html("a study", SECTIONS, FIGURES)
-    assert page.count('<img src="figures/front.png"') == 2
+    assert page.count('src="data:image/png;base64,') == 2
+    assert "--width: 384px" in page  # four inches
     assert "Error against size &lt;&amp;&gt;." in page
     assert "absent" not in page
 
@@ -108,8 +210,8 @@ def test_tensorboard_reads_what_a_run_tells_it(tmp_path: Path) -> None:
     board = Board(tmp_path / "run" / "tensorboard")
     board.scalars({"loss": 0.5}, step=1)
     board.scalars({"loss": 0.25}, step=2)
-    board.image("front", png)
-    board.text("model", "x' = y\ny' = -x")
+    board.image("front", png.read_bytes())
+    board.equations({"one": "x' = y\ny' = -x", "two": "x' = 1"})
     board.settings({"seed": 3, "search": "BestSubset"}, {"r2": 0.75})
     board.close()
     events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
@@ -118,10 +220,12 @@ def test_tensorboard_reads_what_a_run_tells_it(tmp_path: Path) -> None:
     (image,) = events.Images("front")
     assert (image.width, image.height) == (300, 200)
     assert image.encoded_image_string == png.read_bytes()
-    (text,) = events.Tensors("model")
-    assert b"    y' = -x" in text.tensor_proto.string_val[0]
+    (text,) = events.Tensors("equations")
+    lines = text.tensor_proto.string_val[0].decode().splitlines()
+    assert [line[:4].strip() for line in lines] == [""] * 6  # one block of code
+    assert "      y' = -x" in lines
     plugins = events.PluginTagToContent("hparams")
-    assert {"_hparams_/experiment", "_hparams_/session_start_info"} <= set(plugins)
+    assert set(plugins) == {"_hparams_/session_start_info"}
     assert b"BestSubset" in plugins["_hparams_/session_start_info"]
 
 

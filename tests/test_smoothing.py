@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from ep2sindy.library.units import Clock
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay, difference
-from ep2sindy.signals.spectrum import dominant_frequency, frequency_text, power_spectrum
+from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 EQUAL = np.linspace(0.0, 2.0, 41)
 UNEQUAL = EQUAL + 0.02 * np.sin(9.0 * EQUAL)
@@ -77,5 +78,18 @@ def test_spectrum_integrates_to_the_variance() -> None:
 
 
 def test_frequencies_read_in_their_own_prefix() -> None:
-    texts = [frequency_text(f) for f in (14103.0, 0.0531, 2.5e6, 3.0, 0.0, float("nan"))]
+    texts = [Clock().frequency_text(f) for f in (14103.0, 0.0531, 2.5e6, 3.0, 0.0, float("nan"))]
     assert texts == ["14.1 kHz", "53.1 mHz", "2.5 MHz", "3 Hz", "0 Hz", "-"]
+
+
+def test_times_read_in_the_unit_that_a_file_counts_them_in() -> None:
+    year = Clock.of("year")
+    assert year.frequency_text(1.0 / (10.0 * year.seconds)) == "0.1 per year"
+    assert year.duration_text(21.0 * year.seconds) == "21 years"
+    assert year.rate_unit("1") == "year^-1"
+    assert Clock.of("ms") == Clock()  # the second's parts go by prefixes
+    assert Clock().duration_text(182e-6) == "182 µs"
+    assert Clock().rate_unit("m^-3") == "m^-3 s^-1"
+    for unit in ("m", "1", "yaer"):
+        with pytest.raises(ValueError, match="a unit of time must be such as"):
+            Clock.of(unit)

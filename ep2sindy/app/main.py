@@ -1,5 +1,7 @@
 """The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
+`ep2sindy compare RUN RUN` sets run folders side by side instead.
+
 Only Hydra is imported here: `--help` must not wait for the numerics.
 """
 
@@ -29,6 +31,11 @@ def main() -> None:
     failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
     try:
         conf = conf_folder()
+        if sys.argv[1:2] == ["compare"]:
+            from ep2sindy.app.compare import main as compare_runs
+
+            compare_runs(sys.argv[2:])
+            return
         prepare_arguments(conf)
 
         @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")

@@ -18,9 +18,10 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
-from ep2sindy.report.document import Section, Text
+from ep2sindy.report.about import ASIDE, About, asked_of, by_place
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.page import page_html
+from ep2sindy.report.picture import drawn
 from ep2sindy.report.run import Run
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
@@ -46,7 +47,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
     with started_run(config) as run:
         outcome = study.compute(run)
-        headline = write(run, outcome, hparams_of(run.settings, keys_of(kind)))
+        headline = write(run, outcome, study)
     return Finished(run.folder.path, headline)
 
 
@@ -107,12 +108,12 @@ def started_run(config: DictConfig) -> Iterator[Run]:
     """A new run folder that already holds its config and provenance."""
     folder = RunFolder.create(Path(config.output), config.experiment, now=datetime.now())
     folder.write_text("config.yaml", OmegaConf.to_yaml(config, resolve=True))
-    folder.write_provenance(seed=config.seed, command=["ep2sindy", *sys.argv[1:]])
+    provenance = folder.write_provenance(seed=config.seed, command=["ep2sindy", *sys.argv[1:]])
     screen = Screen(folder.path / "run.log")
     board = Board(folder.path / "tensorboard")
     settings: Any = OmegaConf.to_container(config, resolve=True)
     try:
-        yield Run(config.experiment, config.seed, folder, screen, board, settings)
+        yield Run(config.experiment, config.seed, folder, screen, board, settings, provenance)
     except BaseException as error:
         screen.log(f"ended early: {type(error).__name__}: {error}\n{format_exc()}")
         raise
@@ -121,41 +122,46 @@ def started_run(config: DictConfig) -> Iterator[Run]:
         screen.close()
 
 
-def write(run: Run, outcome: Outcome, hparams: Mapping[str, Any]) -> dict[str, float]:
+def write(run: Run, outcome: Outcome, study: Experiment) -> dict[str, float]:
     """Everything of an outcome into the run folder; what no view may lose comes first."""
-    folder, board = run.folder, run.board
-    models = outcome.models()
+    folder, models = run.folder, outcome.models()
     for name, model in models.items():
         folder.write_model(name, model)
     for name, table in outcome.tables().items():
         folder.write_table(name, table)
-    sections = outcome.sections()
+    sections, headline = outcome.sections(), dict(outcome.headline())
     run.screen.show(sections)
-    figures = outcome.figures()
-    for name, figure in figures.items():
-        board.image(name, folder.write_figure(name, figure.draw()))
-    for name, model in models.items():
-        board.text(name, model.text())
-    headline = dict(outcome.headline())
-    board.settings(hparams, headline)
-    warned = [Section("Warnings", [Text(text, warning=True) for text in run.warnings])]
-    page = [*(warned if run.warnings else []), *sections]
-    folder.write_text("report.html", page_html(run.title, page, figures))
+    figures = {}
+    for name, captioned in outcome.figures().items():
+        figure = captioned.draw()
+        png = folder.write_figure(name, figure)
+        run.board.image(name, png)
+        figures[name] = drawn(figure, png, captioned.caption)
+    run.board.equations({name: model.text() for name, model in models.items()})
+    run.board.settings(hparams_of(run.settings, keys_of(type(study))), headline)
+    folder.write_text("report.html", page_html(run.title, sections, figures, about(run, study)))
     named = {"experiment": run.title, "seed": run.seed}
     named |= {"warnings": run.warnings} if run.warnings else {}
-    folder.write_json("summary.json", named | outcome.summary())
+    folder.write_json("summary.json", named | outcome.summary() | {"headline": headline})
     return headline
 
 
-def hparams_of(settings: Mapping[str, Any], keys: set[str]) -> dict[str, Any]:
-    """The settings by which runs are compared: numbers, names and lists of them, and groups."""
+def about(run: Run, study: Experiment) -> About:
+    """What its page says of a run beside its results."""
+    purpose = (type(study).__doc__ or "").split("\n\n")[0].replace("\n", " ")
+    return About(
+        purpose=" ".join(purpose.split()),
+        asked=asked_of(run.settings, keys_of(type(study))),
+        said=run.said,
+        warnings=run.warnings,
+        provenance=run.provenance,
+        config=(run.folder.path / "config.yaml").read_text("utf-8"),
+    )
+
+
+def hparams_of(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
+    """The settings by which runs are told apart: each by its dotted place, groups by their name."""
     found: dict[str, Any] = {"seed": settings["seed"]}
-    for key in sorted(keys & set(settings)):
-        value = settings[key]
-        if isinstance(value, dict) and "_target_" in value:
-            value = ", ".join(f"{k}={each}" for k, each in value.items())
-        if isinstance(value, list) and not any(isinstance(each, dict) for each in value):
-            value = str(value)
-        if isinstance(value, int | float | str | bool):
-            found[key] = value
+    for key in sorted({*keys} & {*settings} - {*ASIDE}):
+        found |= by_place(key, settings[key])
     return found

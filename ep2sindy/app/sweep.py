@@ -61,14 +61,17 @@ def records_of(sweep: Path) -> list[dict[str, Any]]:
 
 
 def write_index(sweep: Path) -> None:
-    """`index.csv` of a sweep's folder: a row per job, a column per headline figure.
+    """`index.csv` of a sweep's folder: a row per job, a column per headline figure; `index.html`.
 
     Written again if another job has noted its end meanwhile: the last to write knows them all.
     """
+    from ep2sindy.app.sweep_page import write_sweep_page  # pandas and more, when a job has ended
+
     records: list[dict[str, Any]] = []
     while len(now := records_of(sweep)) > len(records):
         records = now
         write_text(sweep / "index.csv", _index(records))
+        write_sweep_page(sweep, records)
 
 
 def _index(records: Sequence[Mapping[str, Any]]) -> str:
@@ -114,4 +117,4 @@ def index_text(sweep: Path, *, n_figures: int = 4) -> str:
     console = Console(width=120)
     with console.capture() as captured:
         console.print(table, markup=False)
-    return f"{captured.get()}{sweep / 'index.csv'}"
+    return f"{captured.get()}{sweep / 'index.html'}\n{sweep / 'index.csv'}"

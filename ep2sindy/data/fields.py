@@ -14,10 +14,13 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import check_time
+from ep2sindy.library.units import Clock
 
 DIMS = ("time", "z", "r")
 
 SPACE = ("z", "r")
+
+CLOCK = "read_in"  # attribute of the time: the unit that people read it in
 
 COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 
@@ -47,6 +50,11 @@ def check_field(field: xr.Dataset) -> None:
             raise ValueError(f"{name} must hold real numbers: its type is {variable.dtype}")
         if "units" not in variable.attrs:
             raise ValueError(f"{name} must name its unit in the attribute 'units' ('1' for none)")
+
+
+def clock_of(field: xr.Dataset) -> Clock:
+    """The unit that people read the field's times in: the one that its file counts them in."""
+    return Clock.of(str(field["time"].attrs.get(CLOCK, "s")))
 
 
 def _check_axis(axis: str, points: Float[np.ndarray, " points"]) -> None:

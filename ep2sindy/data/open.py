@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.conversion import to_si
-from ep2sindy.data.fields import DIMS, check_field, mask_outside
+from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.readers.source import UNDECODED, Source, damage_named
@@ -76,6 +76,8 @@ def open_field(
     axes = _in_file({"time": time, "z": z, "r": r})
     points = _read_axes(source, axes, dt_s, _n_samples(arrays, wanted))
     file_dims = {str(p.dims[0]): axis for axis, p in points.items()} if source.dims_named else {}
+    if dt_s is None:
+        points["time"].attrs[CLOCK] = axes["time"].unit
     lengths = {axis: points[axis].size for axis in DIMS if axis in points}
     field = xr.Dataset(coords={axis: (axis, p.values, p.attrs) for axis, p in points.items()})
     for ours, array in arrays.items():

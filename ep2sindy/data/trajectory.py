@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.machine.screen import html_table, one_screen, text_table
 
 
@@ -32,6 +33,7 @@ class Trajectory:
     t: (samples,) in s, increasing; steps may be unequal.
     states: (samples, n_states). inputs: (samples, n_inputs), by default none.
     units: name -> unit for any of the variables; a missing one reads "1".
+    clock: the unit that people read its times in; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are
     not finite, repeated names, fewer than two samples, or a state that never changes.
     """
@@ -44,6 +46,7 @@ class Trajectory:
     input_names: Sequence[str] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     label: str = ""
+    clock: Clock = SECONDS
 
     def __post_init__(self) -> None:
         inputs = self.inputs if self.input_names or self.inputs.size else np.empty((len(self.t), 0))
@@ -111,6 +114,7 @@ class Trajectory:
             input_names=self.input_names,
             units=self.units,
             label=self.label,
+            clock=self.clock,
         )
 
     def __repr__(self) -> str:

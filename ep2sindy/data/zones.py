@@ -17,6 +17,7 @@ from ep2sindy.data.fields import (
     cell_sizes,
     check_field,
     check_samples,
+    clock_of,
     grid_points,
     grid_values,
     masked_cells,
@@ -124,6 +125,7 @@ def zone_average(
             for column, factors in columns.items()
         },
         label=label,
+        clock=clock_of(field),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.figures.frames import Limits, framing
-from ep2sindy.library.units import prefixed
+from ep2sindy.library.units import Clock
 from ep2sindy.model.rollout import Rollout
 
 
@@ -25,11 +25,12 @@ def first_part(
     t: Float[np.ndarray, " samples"],
     values: Float[np.ndarray, "samples n_states"],
     duration_s: float,
+    clock: Clock,
 ) -> Curves:
-    """What lies in the first `duration_s`."""
+    """What lies in the first `duration_s`, over a time that the clock shows."""
     since = t - t[:1]
     shown = since <= duration_s
-    return Curves(time_unit(duration_s)[0] * since[shown], values[shown])
+    return Curves(clock.scale(duration_s)[0] * since[shown], values[shown])
 
 
 def limits_of(data: Curves, models: Mapping[str, Curves], rare: float = 0.0) -> list[Limits]:
@@ -39,8 +40,7 @@ def limits_of(data: Curves, models: Mapping[str, Curves], rare: float = 0.0) -> 
 
 def diverged_within(rollouts: Mapping[str, Rollout], duration_s: float) -> set[str]:
     """Names of the runs that stop before the end of what is shown."""
-    lasted = {name: r.t[-1] - r.t[0] if len(r.t) else 0.0 for name, r in rollouts.items()}
-    return {name for name, r in rollouts.items() if r.diverged and lasted[name] <= duration_s}
+    return {name for name, r in rollouts.items() if r.diverged and r.lasted_s <= duration_s}
 
 
 def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> dict[str, str]:
@@ -57,12 +57,4 @@ def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> 
 
 def when_it_diverges(rollout: Rollout) -> str:
     """`diverges at 182 µs`, counted from its start."""
-    lasted_s = float(rollout.t[-1] - rollout.t[0]) if len(rollout.t) else 0.0
-    factor, unit = time_unit(lasted_s)
-    return f"diverges at {factor * lasted_s:.3g} {unit}" if lasted_s else "diverges at once"
-
-
-def time_unit(duration_s: float) -> tuple[float, str]:
-    """Factor and unit that bring a duration between 1 and 1000: (1e6, "µs")."""
-    factor, prefix = prefixed(duration_s)
-    return factor, f"{prefix.replace('u', 'µ')}s"
+    return f"diverges at {rollout.lasted_text or 'once'}"

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS, GREY, legend_above, panel_grid
+from ep2sindy.figures.style import COLOURS, GREY, hover, legend_above, panel_grid
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.search.front import Candidate, Cloud, ParetoFront
 from ep2sindy.selection.rule import selected
@@ -42,6 +42,7 @@ def front_figure(
         chosen = selected(front, scores[state])
         index = front.candidates.index(chosen)
         _front(ax, front, index)
+        _hovers(ax, front, scores[state], label)
         score = f"{_score_label(label)} = {scores[state][index]:.4g}"
         ax.set_title(f"${latex_derivative(state)}$: {_terms(chosen)}\n{score}", fontsize=9)
     entries = {line.get_label(): line for ax in axes for line in ax.lines if _labelled(line)}
@@ -85,6 +86,16 @@ def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
             rf"$10^{{{np.log10(FLOOR):.0f}}}$ or less", (0.02, FLOOR), (0, 3), fontsize=8,
             xycoords=("axes fraction", "data"), textcoords="offset points", color="#666666",
         )  # fmt: skip
+
+
+def _hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
+    """Over every candidate something that cannot be seen, and says which it is."""
+    errors = np.clip(front.errors, FLOOR, TOP)
+    for each, error, score in zip(front.candidates, errors, scores, strict=True):
+        (spot,) = ax.plot(each.n_terms, error, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
+        terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
+        text = f"{front.equation}' of {each.n_terms} terms: {terms}"
+        hover(spot, f"{text} | 1 - R2 = {error:.3g} | {label} = {score:.4g}")
 
 
 def _cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:

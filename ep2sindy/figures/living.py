@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.curves import time_unit
 from ep2sindy.figures.frames import framing
 from ep2sindy.figures.style import COLOURS, DATA, GREY, axis_label, legend_above, panel_grid
 from ep2sindy.model.free_run import LONG
@@ -28,7 +27,7 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
     run: the record, whose first sample the model started from.
     """
     shown = min(PERIODS * period_s, 0.5 * float(run.t[-1] - run.t[0]))
-    factor, unit = time_unit(shown)
+    factor, unit = run.clock.scale(shown)
     n = len(run.state_names)
     figure = Figure(figsize=(9.0, 2.2 * n + 0.8), layout="constrained")
     axes = figure.subplots(n, 2, squeeze=False, sharex="col", sharey="row")

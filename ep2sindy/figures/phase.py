@@ -29,8 +29,10 @@ def phase_figure(
     The dot is where it starts; other marks and verdicts as in `series.trajectory_figure`.
     """
     pair = [run.state_names.index(name) for name in plane]
-    data = first_part(run.t, run.states[:, pair], duration_s)
-    models = {n: first_part(r.t, r.states[:, pair], duration_s) for n, r in rollouts.items()}
+    data = first_part(run.t, run.states[:, pair], duration_s, run.clock)
+    models = {
+        n: first_part(r.t, r.states[:, pair], duration_s, run.clock) for n, r in rollouts.items()
+    }
     diverged, labels = diverged_within(rollouts, duration_s), run_labels(rollouts, verdicts)
     figure, axes = panel_grid(len(models), width=2.75, height=2.75, extra=0.7, shared=True)
     limits = dict(enumerate(limits_of(data, models)))

@@ -17,7 +17,6 @@ from ep2sindy.figures.curves import (
     first_part,
     limits_of,
     run_labels,
-    time_unit,
 )
 from ep2sindy.figures.frames import legend_marks, mark_exits
 from ep2sindy.figures.style import (
@@ -27,15 +26,14 @@ from ep2sindy.figures.style import (
     MORE_COLOURS,
     axis_label,
     legend_above,
-    power_unit,
     slope_label,
     unit_text,
 )
-from ep2sindy.library.units import prefixed
+from ep2sindy.library.units import Clock, unit_product
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.signals.spectrum import dominant_frequency, frequency_text, power_spectrum
+from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 SINCE_START = "time since start of integration"
 
@@ -47,19 +45,20 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figur
     n = len(run.state_names)
     figure = Figure(figsize=(9.0, 2.2 * n + 0.6), layout="constrained")
     axes = figure.subplots(n, 2, squeeze=False, sharex="col", width_ratios=[3, 2])
-    states = first_part(run.t, run.states, duration_s)
-    spectra = _spectra(run.t, run.states, f_max_Hz)
+    states = first_part(run.t, run.states, duration_s, run.clock)
+    spectra = _spectra(run.t, run.states, f_max_Hz, run.clock)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
         row[0].plot(states.x, states.y[:, k], color=DATA, lw=1)
         row[0].set_ylabel(axis_label(name, run.units[name]))
         row[1].semilogy(spectra.x, spectra.y[:, k], color=COLOURS[0], lw=0.8)
         peak_Hz = dominant_frequency(run.t, run.states[:, k])
-        peak = prefixed(f_max_Hz)[0] * peak_Hz
-        row[1].axvline(peak, color=COLOURS[1], lw=1, ls="--", label=frequency_text(peak_Hz))
+        peak = run.clock.frequency_scale(f_max_Hz)[0] * peak_Hz
+        text = run.clock.frequency_text(peak_Hz)
+        row[1].axvline(peak, color=COLOURS[1], lw=1, ls="--", label=text)
         row[1].legend(loc="upper right", frameon=False)
-        row[1].set_ylabel(f"power ({unit_text(power_unit(run.units[name]))})")
-    axes[-1, 0].set_xlabel(_time_label(duration_s))
-    axes[-1, 1].set_xlabel(_frequency_label(f_max_Hz))
+        row[1].set_ylabel(f"power ({unit_text(_power_unit(run, name))})")
+    axes[-1, 0].set_xlabel(_time_label(run.clock, duration_s))
+    axes[-1, 1].set_xlabel(_frequency_label(run.clock, f_max_Hz))
     return figure
 
 
@@ -76,11 +75,11 @@ def trajectory_figure(
     Carets mark where a run leaves the panel, a cross where one that diverged stops inside it.
     verdicts: by name, what becomes of the run. since: what the time is counted from.
     """
-    data = first_part(run.t, run.states, duration_s)
-    models = {name: first_part(r.t, r.states, duration_s) for name, r in rollouts.items()}
+    data = first_part(run.t, run.states, duration_s, run.clock)
+    models = {n: first_part(r.t, r.states, duration_s, run.clock) for n, r in rollouts.items()}
     titles = [axis_label(name, run.units[name]) for name in run.state_names]
     figure, axes = _rows(
-        data, models, titles=titles, x_label=_time_label(duration_s, since),
+        data, models, titles=titles, x_label=_time_label(run.clock, duration_s, since),
         labels=run_labels(rollouts, verdicts),
     )  # fmt: skip
     _frame(figure, axes, data, models, diverged=diverged_within(rollouts, duration_s))
@@ -94,14 +93,18 @@ def derivative_figure(
 
     Spikes of the derivative set no scale: carets mark where a curve leaves the panel.
     """
-    data = first_part(run.t, smoother.derivative(run.t, run.states), duration_s)
+    clock = run.clock
+    slopes = clock.seconds * smoother.derivative(run.t, run.states)
+    data = first_part(run.t, slopes, duration_s, clock)
     sides = {}
     for name, model in models.items():
-        slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
+        slopes = clock.seconds * model.derivative(
+            run.columns(model.states), run.columns(model.inputs)
+        )
         order = [model.states.index(state) for state in run.state_names]
-        sides[name] = first_part(run.t, slopes[:, order], duration_s)
-    titles = [slope_label(name, run.units[name]) for name in run.state_names]
-    figure, axes = _rows(data, sides, titles=titles, x_label=_time_label(duration_s))
+        sides[name] = first_part(run.t, slopes[:, order], duration_s, clock)
+    titles = [slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
+    figure, axes = _rows(data, sides, titles=titles, x_label=_time_label(run.clock, duration_s))
     _frame(figure, axes, data, sides, rare=RARE)
     return figure
 
@@ -119,24 +122,22 @@ def spectrum_figure(
     verdicts: by name, what becomes of the run.
     """
     n_samples = max(len(rollout.t) for rollout in rollouts.values())
-    data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz)
-    models = {name: _spectra(r.t, r.states, f_max_Hz) for name, r in rollouts.items()}
-    titles = [
-        f"power of {axis_label(name, power_unit(run.units[name]))}" for name in run.state_names
-    ]
+    data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz, run.clock)
+    models = {name: _spectra(r.t, r.states, f_max_Hz, run.clock) for name, r in rollouts.items()}
+    titles = [f"power of {axis_label(name, _power_unit(run, name))}" for name in run.state_names]
     figure, axes = _rows(
-        data, models, titles=titles, x_label=_frequency_label(f_max_Hz),
+        data, models, titles=titles, x_label=_frequency_label(run.clock, f_max_Hz),
         labels=run_labels(rollouts, verdicts),
     )  # fmt: skip
     for k, column in enumerate(axes.T):
-        peak = prefixed(f_max_Hz)[0] * dominant_frequency(run.t, run.states[:, k])
+        peak = run.clock.frequency_scale(f_max_Hz)[0] * dominant_frequency(run.t, run.states[:, k])
         column[0].set_yscale("log")
         power = data.y[:, k]
         column[0].set_ylim(0.3 * np.percentile(power, 2), 10.0 * power.max())
         for ax, rollout in zip(column, rollouts.values(), strict=True):
             ax.axvline(peak, color=DATA, lw=0.8, ls="--")
             if not rollout.diverged:
-                text = frequency_text(dominant_frequency(rollout.t, rollout.states[:, k]))
+                text = run.clock.frequency_text(dominant_frequency(rollout.t, rollout.states[:, k]))
                 ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=8)
     legend_above(figure, axes[0, 0].lines[:1], size=9.0)
     return figure
@@ -202,6 +203,7 @@ def _spectra(
     t: Float[np.ndarray, " samples"],
     states: Float[np.ndarray, "samples n_states"],
     f_max_Hz: float,
+    clock: Clock,
 ) -> Curves:
     """Power of every state up to `f_max_Hz`; none for a run that stopped at once."""
     if len(t) < 8:
@@ -211,12 +213,19 @@ def _spectra(
     power = np.stack([power for _, power in pairs], axis=1)
     shown = (frequency > 0.0) & (frequency <= f_max_Hz)
     drawable = np.maximum(power[shown], np.finfo(float).tiny)  # on a log scale
-    return Curves(prefixed(f_max_Hz)[0] * frequency[shown], drawable)
+    return Curves(clock.frequency_scale(f_max_Hz)[0] * frequency[shown], drawable / clock.seconds)
 
 
-def _time_label(duration_s: float, what: str = "time") -> str:
-    return f"{what} ({time_unit(duration_s)[1]})"
+def _time_label(clock: Clock, duration_s: float, what: str = "time") -> str:
+    return f"{what} ({clock.scale(duration_s)[1]})"
 
 
-def _frequency_label(f_max_Hz: float) -> str:
-    return f"frequency ({prefixed(f_max_Hz)[1]}Hz)"
+def _frequency_label(clock: Clock, f_max_Hz: float) -> str:
+    return f"frequency ({clock.frequency_scale(f_max_Hz)[1]})"
+
+
+def _power_unit(run: Trajectory, name: str) -> str:
+    """Of a state's power density."""
+    if run.clock.unit == "s":
+        return unit_product([(run.units[name], 2), ("Hz", -1)])
+    return f"{unit_product([(run.units[name], 2)])} {run.clock.unit}".removeprefix("1 ")

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.library.equations import latex_derivative, latex_name
-from ep2sindy.library.units import unit_product
 
 DATA, GREY = "#222222", "#aaaaaa"
 
@@ -54,6 +53,11 @@ def legend_above(
     )
 
 
+def hover(artist: Artist, text: str) -> None:
+    """Let an artist say more where a page is read with a mouse; a bar parts the lines."""
+    artist.set_gid(f"hover: {text}")
+
+
 def axis_label(name: str, unit: str) -> str:
     return f"${latex_name(name)}$ ({unit_text(unit)})"
 
@@ -65,13 +69,8 @@ def equals_label(label: str, value: float) -> str:
 
 
 def slope_label(name: str, unit: str) -> str:
-    """Of the derivative in time; unit: of the variable."""
-    return f"${latex_derivative(name)}$ ({unit_text(unit_product([(unit, 1), ('s', -1)]))})"
-
-
-def power_unit(unit: str) -> str:
-    """Of the power density; unit: of the variable."""
-    return unit_product([(unit, 2), ("Hz", -1)])
+    """Of the derivative in time, in its unit."""
+    return f"${latex_derivative(name)}$ ({unit_text(unit)})"
 
 
 def unit_text(unit: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -16,23 +17,29 @@ NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 def latex_name(variable: str) -> str:
-    """`n_i` -> `n_{i}`, `T_e_eV` -> `T_{e,eV}`, `<n_i*n_n>` -> the average in angle brackets."""
+    """`n_i` -> `n_{i}`, `T_e_eV` -> `T_{e,eV}`, `<n_i*n_n>` -> the average in angle brackets.
+
+    Words stand upright: in italics they would read as products of their letters.
+    """
     if variable.startswith("<"):
         return rf"\langle {latex_term_name(variable[1:-1])} \rangle"
-    stem, _, index = variable.partition("_")
+    stem, _, index = re.sub(r"([#$%&{}])", r"\\\1", re.sub(r"[\\^~]", " ", variable)).partition("_")
+    stem = stem if len(stem) < 2 else rf"\mathrm{{{stem}}}"
     return rf"{stem}_{{{index.replace('_', ',')}}}" if index else stem
 
 
 def latex_derivative(state: str) -> str:
-    r"""`n_i` -> `\dot{n}_{i}`: the dot belongs on the stem."""
+    r"""`n_i` -> `\dot{n}_{i}`: the dot belongs on the stem; over a word it would be lost: `x'`."""
     stem, index, rest = latex_name(state).partition("_")
+    if stem.startswith(r"\mathrm"):
+        return f"{latex_name(state)}'"
     return rf"\dot{{{stem}}}{index}{rest}"
 
 
 def latex_term_name(name: str) -> str:
-    """`n_i^2*n_n` -> `n_{i}^{2} n_{n}`."""
+    r"""`n_i^2*n_n` -> `n_{i}^{2} \, n_{n}`."""
     return (
-        " ".join(
+        r" \, ".join(
             latex_name(factor) + (f"^{{{power}}}" if power > 1 else "")
             for factor, power in _factors(name)
         )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cache
+from tokenize import TokenError
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -55,3 +57,66 @@ def prefixed(value: float) -> tuple[float, str]:
     power = 3 * math.floor(math.log10(value) / 3) if value > 0 else 0
     power = min(max(power, -9), 9)
     return 10.0**-power, prefixes[power]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The unit that people read times in, such as years; all values and files stay in seconds.
+
+    The second goes by SI prefixes, to 71 µs and 14.1 kHz. seconds: how many the unit has.
+    """
+
+    unit: str = "s"
+    seconds: float = 1.0
+
+    @staticmethod
+    def of(unit: str) -> Clock:
+        """Of the unit that a file counts its time in; the second for its decimal parts.
+
+        Raises ValueError for what is no unit of time.
+        """
+        import pint
+
+        try:
+            seconds = float(registry().Quantity(1.0, unit).to("s").magnitude)
+        except (pint.PintError, AttributeError, TypeError, TokenError) as error:
+            raise ValueError(
+                f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"
+            ) from error
+        return SECONDS if seconds <= 1.0 else Clock(unit, seconds)
+
+    def scale(self, duration_s: float) -> tuple[float, str]:
+        """What a duration is multiplied by to be read, and its unit: (1e6, "µs")."""
+        if self.unit != "s":
+            return 1.0 / self.seconds, self.unit
+        factor, prefix = prefixed(duration_s)
+        return factor, f"{prefix.replace('u', 'µ')}s"
+
+    def frequency_scale(self, frequency_Hz: float) -> tuple[float, str]:
+        """The same of a frequency: (1e-3, "kHz"), (3.2e7, "1/year")."""
+        if self.unit != "s":
+            return self.seconds, f"1/{self.unit}"
+        factor, prefix = prefixed(frequency_Hz)
+        return factor, f"{prefix.replace('u', 'µ')}Hz"
+
+    def duration_text(self, duration_s: float, *, digits: int = 3) -> str:
+        """`182 µs`, `21 years`; a dash for none."""
+        factor, unit = self.scale(duration_s)
+        count = f"{duration_s * factor:.{digits}g}"
+        many = "s" if count != "1" and self.unit in ("day", "week", "month", "year") else ""
+        return f"{count} {unit}{many}" if math.isfinite(duration_s) else "-"
+
+    def frequency_text(self, frequency_Hz: float) -> str:
+        """`14.1 kHz`, `0.1 per year`; a dash for none."""
+        factor, unit = self.frequency_scale(frequency_Hz)
+        text = f"{frequency_Hz * factor:.4g} {unit.replace('1/', 'per ')}"
+        return text if math.isfinite(frequency_Hz) else "-"
+
+    def rate_unit(self, unit: str) -> str:
+        """Of a derivative in time; unit: of the variable."""
+        if self.unit == "s":
+            return unit_product([(unit, 1), ("s", -1)])
+        return f"{'' if unit == '1' else unit} {self.unit}^-1".strip()
+
+
+SECONDS = Clock()

@@ -92,9 +92,8 @@ class FreeRun:
     @property
     def text(self) -> str:
         """The verdict, and how long after its start it diverged."""
-        if not (self.rollout.diverged and len(self.rollout.t)):
-            return str(self.verdict)
-        return f"{self.verdict} after {self.rollout.t[-1] - self.rollout.t[0]:.3g} s"
+        lasted = self.rollout.lasted_text if self.rollout.diverged else ""
+        return f"{self.verdict} after {lasted}" if lasted else str(self.verdict)
 
 
 def free_run(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.inputs import Drive, driven, spline
 
 # Evaluations of the right-hand side that a run may take: a hundred times what an oscillation
@@ -45,7 +46,7 @@ class Rollout:
     """A model integrated along data or freely, and how that ended.
 
     t: (samples,) in s, states: (samples, n_states), inputs: (samples, n_inputs), all cut where
-    a diverged run stopped. units: by name, of states and inputs.
+    a diverged run stopped. units: by name, of states and inputs. clock: how people read t.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -56,6 +57,16 @@ class Rollout:
     inputs: Float[np.ndarray, "samples n_inputs"]
     input_names: tuple[str, ...]
     units: Mapping[str, str]
+    clock: Clock = SECONDS
+
+    @property
+    def lasted_s(self) -> float:
+        return float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
+
+    @property
+    def lasted_text(self) -> str:
+        """`182 µs`; empty where nothing was integrated."""
+        return self.clock.duration_text(self.lasted_s) if self.lasted_s else ""
 
     def trajectory(self, *, label: str = "") -> Trajectory:
         """The samples as data, as far as they go.
@@ -70,6 +81,7 @@ class Rollout:
             input_names=self.input_names,
             units=self.units,
             label=label,
+            clock=self.clock,
         )
 
 
@@ -88,7 +100,7 @@ def rollout(
     window = trajectory.window(start, stop)
     data = window.columns(model.states)
     inputs = window.columns(model.inputs)
-    return _integrated(
+    found = _integrated(
         model,
         window.t,
         data[0] if initial is None else initial,
@@ -99,6 +111,7 @@ def rollout(
         bound="the data's largest value",
         rtol=rtol,
     )
+    return replace(found, clock=trajectory.clock)
 
 
 def simulate(

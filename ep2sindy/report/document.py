@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import pandas as pd
 
+from ep2sindy.library.equations import equation_text
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -23,23 +25,34 @@ class Text:
 
 @dataclass(frozen=True)
 class Equation:
-    """One equation: state -> terms in SI. lead: words before it. aside: beside the point.
+    """One equation: state -> terms. lead: words before it, mark: behind. aside: beside the point.
 
-    On the page alone, unless on_screen: tables of fronts and methods show equations as text.
+    unit: of the derivative, as the terms are written; where they stand in SI it may be left out.
+    On the page alone, unless on_screen. As a cell of a table it is always shown.
     """
 
     state: str
     terms: Mapping[str, float]
     lead: str = ""
+    mark: str = ""
+    unit: str = ""
     aside: bool = False
     on_screen: bool = False
+
+    @property
+    def text(self) -> str:
+        """`thesis: n_i' = -2 n_i [m^-3 s^-1]`."""
+        lead = f"{self.lead}: " if self.lead else ""
+        unit = f" [{self.unit}]" if self.unit else ""
+        return f"{lead}{equation_text(self.state, self.terms)}{unit}{self.mark}"
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows to read: text as it is, numbers to three digits, NaN as a dash.
+    """Rows to read: text as it is, numbers to three digits, NaN as a dash, an `Equation` written.
 
-    bold, italic: numbers of the rows so set. breaks: numbers of the rows that a rule follows.
+    page_only: too long for a screen. bold, italic: numbers of the rows so set. breaks: of those
+    that a rule follows.
     """
 
     rows: pd.DataFrame
@@ -48,6 +61,7 @@ class Table:
     italic: Sequence[int] = ()
     breaks: Sequence[int] = ()
     note: str = ""
+    page_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -55,6 +69,14 @@ class Picture:
     """A figure of the outcome, by its name; on the page alone."""
 
     name: str
+
+
+@dataclass(frozen=True)
+class Link:
+    """A cell that leads to another page. to: a relative address."""
+
+    text: str
+    to: str
 
 
 Block: TypeAlias = Text | Equation | Table | Picture
@@ -79,8 +101,12 @@ class Captioned:
 
 def cell_text(value: object) -> str:
     """A cell as text: numbers to three digits, NaN and None as a dash."""
+    if isinstance(value, Equation):
+        return value.text
     if value is None or (isinstance(value, float) and value != value):
         return "-"
+    if isinstance(value, Link):
+        return value.text
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 

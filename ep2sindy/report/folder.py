@@ -17,12 +17,11 @@ import pandas as pd
 
 from ep2sindy.machine.files import replacing, write_json, write_text
 from ep2sindy.model.model import SparseModel
+from ep2sindy.report.picture import DPI
 from ep2sindy.report.provenance import commit, versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-DPI = 150
 
 
 @dataclass(frozen=True)
@@ -66,30 +65,30 @@ class RunFolder:
     def write_table(self, name: str, table: pd.DataFrame) -> None:
         self.write_text(f"tables/{name}.csv", table.to_csv(index=False))
 
-    def write_figure(self, name: str, figure: Figure) -> Path:
-        """As PNG and PDF of one layout, which the figure keeps; returns where the PNG lies."""
-        _freeze_layout(figure)
+    def write_figure(self, name: str, figure: Figure) -> bytes:
+        """As PDF and PNG of one layout, which the figure keeps; returns what is in the PNG."""
+        freeze_layout(figure)
         for suffix in ("pdf", "png"):
             # Without a date the same run gives the same file.
             dated = {"CreationDate": None} if suffix == "pdf" else {}
             path = self.path / "figures" / f"{name}.{suffix}"
             with replacing(path) as temporary:
                 figure.savefig(temporary, dpi=DPI, metadata=dated)
-        return path
+        return path.read_bytes()
 
-    def write_provenance(self, *, seed: int, command: Sequence[str]) -> None:
-        self.write_json(
-            "provenance.json",
-            {
-                "commit": commit(Path(__file__).parent),
-                "seed": seed,
-                "command": list(command),
-                "versions": {"python": platform.python_version(), **versions()},
-            },
-        )
+    def write_provenance(self, *, seed: int, command: Sequence[str]) -> dict[str, Any]:
+        """Which code a run is made by, in provenance.json; returned as well."""
+        found = {
+            "commit": commit(Path(__file__).parent),
+            "seed": seed,
+            "command": list(command),
+            "versions": {"python": platform.python_version(), **versions()},
+        }
+        self.write_json("provenance.json", found)
+        return found
 
 
-def _freeze_layout(figure: Figure) -> None:
+def freeze_layout(figure: Figure) -> None:
     """Solve the layout once: every saving would solve it again, and draw twice."""
     engine: Any = figure.get_layout_engine()
     if engine is not None:

@@ -1,40 +1,114 @@
-"""The page of a run, in HTML that needs no network: figures lie beside it in figures/."""
+"""A page of results in one file of HTML that needs no other, and no network: it can be mailed."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ep2sindy.library.equations import equation_html
-from ep2sindy.report.document import Captioned, Equation, Section, Table, cell_text
+from ep2sindy.report.about import About
+from ep2sindy.report.document import Equation, Link, Section, Table, cell_text
+from ep2sindy.report.mathml import equation_mathml
+from ep2sindy.report.picture import Drawn
 
-FOOTER = "All values in SI units. Config, models and tables lie beside."
-
-
-def page_html(title: str, sections: Sequence[Section], figures: Mapping[str, Captioned]) -> str:
-    """Every section with its equations, tables and figures; text is escaped by the template."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # only when a page is written
+if TYPE_CHECKING:
+    from jinja2 import Environment
     from markupsafe import Markup
 
-    template = Environment(
-        loader=PackageLoader("ep2sindy.report"),
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+def page_html(
+    title: str,
+    sections: Sequence[Section],
+    figures: Mapping[str, Drawn],
+    about: About | None = None,
+    *,
+    template: Path = TEMPLATES / "page.html",
+) -> str:
+    """Every section with its equations, tables and figures; text is escaped by the template.
+
+    template: a Jinja2 file that is given all of these, see the package's own.
+    Raises ValueError for one that is missing, or that is no template.
+    """
+    from jinja2 import TemplateError
+
+    if not template.is_file():
+        raise ValueError(
+            f"a template must be a file of HTML for Jinja2: {template} is none; leave it out for "
+            "the package's own"
+        )
+    named = {f"part-{k}": each for k, each in enumerate(sections)}
+    try:
+        return (
+            _environment(template)
+            .get_template(template.name)
+            .render(title=title, parts=named, figures=figures, about=about)
+        )
+    except TemplateError as error:
+        raise ValueError(f"the template {template} cannot be filled: {error}") from error
+
+
+def _environment(template: Path) -> Environment:
+    """Templates beside this one, then the package's; functions for what HTML does not know."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader([template.parent, TEMPLATES]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-    ).get_template("page.html")
-
-    def equation(block: Equation) -> str:
-        return Markup(equation_html(block.state, block.terms))  # it escapes names itself
-
-    return template.render(
-        title=title,
-        sections=sections,
-        figures=figures,
-        equation=equation,
-        cell=cell_text,
-        classes=_classes,
-        footer=FOOTER,
     )
+    environment.globals.update(equation=equation_html, cell=cell_html, classes=_classes)
+    environment.filters.update(numeric=numeric_columns, raised=raised_html)
+    return environment
+
+
+def equation_html(block: Equation) -> Markup:
+    """An equation with its words and unit; what is in it is escaped here."""
+    from markupsafe import Markup, escape
+
+    lead = escape(f"{block.lead}: ") if block.lead else ""
+    unit = f' <span class="unit">{raised_html(block.unit)}</span>' if block.unit else ""
+    mark = escape(block.mark.replace("<-", "←"))
+    return Markup(f'{lead}<span class="math">{equation_mathml(block)}</span>{unit}{mark}')
+
+
+def cell_html(value: object) -> Markup:
+    """A cell of a table, escaped here."""
+    from markupsafe import Markup
+
+    if isinstance(value, Equation):
+        return equation_html(value)
+    if isinstance(value, Link):
+        return Markup('<a href="{}">{}</a>').format(value.to, value.text)
+    if _is_number(value):
+        text = re.sub(r"e([+-])0*(\d+)", r"·10^\1\2", cell_text(value))
+        return raised_html(text.replace("^+", "^"))
+    return raised_html(cell_text(value))
+
+
+def raised_html(text: str) -> Markup:
+    """Text with its powers raised, `m^-3 s^-1`, and all else escaped."""
+    from markupsafe import Markup, escape
+
+    escaped = str(escape(text))
+    minus = re.sub(r"(?<![\w.)])-(?=\d)", "−", escaped)
+    return Markup(re.sub(r"(?<=\w)\^([\d.−]+)", r"<sup>\1</sup>", minus))
+
+
+def numeric_columns(table: Table) -> list[bool]:
+    """Whether the cells of each column are set to the right: all of them numbers, or empty."""
+    columns = (table.rows.iloc[:, k] for k in range(table.rows.shape[1]))
+    texts = ([each for each in column if cell_text(each)] for column in columns)
+    return [bool(column) and all(map(_is_number, column)) for column in texts]
+
+
+def _is_number(value: Any) -> bool:
+    """A number, perhaps with a unit, or the dash for none."""
+    return bool(re.fullmatch(r"-|[+-]?\d[\d.e+-]*( ?[%µ\w/^-]{1,5})?", cell_text(value)))
 
 
 def _classes(table: Table, row: int) -> str:

@@ -19,7 +19,8 @@ from ep2sindy.report.tensorboard import Board
 class Run:
     """One run of a study: its name and seed, where it writes and what it says on the way.
 
-    settings: the whole config as plain values. warnings: what the page and the summary repeat.
+    settings: the whole config as plain values. said: what the page repeats; warnings: that is
+    amiss, the summary too. provenance: which code this is, and the command.
     """
 
     title: str
@@ -28,10 +29,14 @@ class Run:
     screen: Screen
     board: Board
     settings: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     def say(self, text: str, *, warning: bool = False) -> None:
-        """A line for those who watch, at once: on the screen and in run.log."""
+        """A line for those who watch, at once: on the screen and in run.log, later on the page."""
+        if not warning:
+            self.said.append(text)
         self.screen.print(*renderables(Text(text, warning=warning)))
 
     def warn(self, text: str) -> None:

@@ -13,30 +13,33 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from ep2sindy.library.equations import equation_text
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
 
 
 class Screen:
-    """Prints to the terminal and, without colours, to run.log."""
+    """Prints to the terminal and, without colours, to run.log where there is one."""
 
-    def __init__(self, log: Path) -> None:
-        self._log = log.open("a", encoding="utf-8")
+    def __init__(self, log: Path | None = None) -> None:
+        self._log = None if log is None else log.open("a", encoding="utf-8")
         terminal = Console()
         if not terminal.is_terminal:
             terminal.width = WIDTH
-        self._consoles = (terminal, Console(file=self._log, width=WIDTH, no_color=True))
+        self._consoles = [terminal]
+        if self._log is not None:
+            self._consoles.append(Console(file=self._log, width=WIDTH, no_color=True))
 
     def print(self, *renderables: RenderableType) -> None:
         for console in self._consoles:
             console.print(*renderables, highlight=False)
-        self._log.flush()
+        if self._log is not None:
+            self._log.flush()
 
     def log(self, text: str) -> None:
         """Into run.log alone."""
-        self._consoles[1].print(text, highlight=False, markup=False)
+        for console in self._consoles[1:]:
+            console.print(text, highlight=False, markup=False)
 
     def show(self, sections: Sequence[Section]) -> None:
         """Every section that has something for the screen."""
@@ -48,7 +51,8 @@ class Screen:
                     self.print(each)
 
     def close(self) -> None:
-        self._log.close()
+        if self._log is not None:
+            self._log.close()
 
 
 def renderables(block: Block) -> Iterator[RenderableType]:
@@ -58,12 +62,11 @@ def renderables(block: Block) -> Iterator[RenderableType]:
             text = escape(block.text)
             yield f"[bold red]{text}[/bold red]" if block.warning else text
         case Equation(on_screen=True):
-            lead = f"{block.lead}: " if block.lead else ""
-            text = escape(f"{lead}{equation_text(block.state, block.terms)}")
+            text = escape(block.text)
             yield f"[italic]{text}[/italic]" if block.aside else text
-        case Table():
+        case Table(page_only=False):
             yield rich_table(block)
-        case Picture() | Text() | Equation():
+        case Picture() | Text() | Equation() | Table():
             pass
 
 

@@ -6,6 +6,7 @@ import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 
@@ -24,35 +25,38 @@ class Board:
         self._add(Summary(value=values), step=step)
         self._writer.flush()
 
+    def equations(self, texts: Mapping[str, str]) -> None:
+        """The equations of all models, by name: one block of lines as they are, in a fixed font."""
+        parts = (f"{name}\n{indent(text, '  ')}" for name, text in texts.items())
+        if texts:
+            self.text("equations", "\n\n".join(parts))
+
     def text(self, name: str, text: str) -> None:
         """Lines as they are, in a fixed font."""
         from tensorboard.compat.proto.summary_pb2 import Summary
         from tensorboard.compat.proto.tensor_pb2 import TensorProto
         from tensorboard.plugins.text.metadata import create_summary_metadata
 
-        lines = "\n".join(f"    {line}" for line in text.splitlines())
+        lines = "\n".join(f"    {line}" for line in text.splitlines())  # a block of code
         tensor = TensorProto(dtype="DT_STRING", string_val=[lines.encode()])
         kind = create_summary_metadata(display_name=name, description="")
         self._add(Summary(value=[Summary.Value(tag=name, metadata=kind, tensor=tensor)]))
 
-    def image(self, name: str, png: Path) -> None:
+    def image(self, name: str, png: bytes) -> None:
         """A figure as it was drawn for the folder."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
-        content = png.read_bytes()
-        width, height = struct.unpack(">II", content[16:24])  # of the header, which comes first
-        image = Summary.Image(
-            height=height, width=width, colorspace=4, encoded_image_string=content
-        )
+        width, height = struct.unpack(">II", png[16:24])  # of the header, which comes first
+        image = Summary.Image(height=height, width=width, colorspace=4, encoded_image_string=png)
         self._add(Summary(value=[Summary.Value(tag=name, image=image)]))
 
     def settings(self, hparams: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
-        """The metrics beside the settings that led to them; runs are compared by their keys."""
+        """The metrics beside the settings that led to them; runs are compared by their keys.
+
+        No list of keys is written: of all runs TensorBoard would believe the first one's.
+        """
         from tensorboard.plugins.hparams import summary_v2 as hp
 
-        known = [hp.HParam(name) for name in hparams]
-        columns = [hp.Metric(name) for name in metrics]
-        self._add(hp.hparams_config_pb(known, columns))
         self._add(hp.hparams_pb(dict(hparams), trial_id=self._folder.parent.name))
         self.scalars(metrics, step=0)
 

@@ -199,7 +199,14 @@ def _finest_s(signal: Trace, harmonics: float) -> float:
 def _trajectory(
     signal: Trace, t: np.ndarray, states: np.ndarray, units: Mapping[str, str]
 ) -> Trajectory:
-    return Trajectory(t=t, states=states, state_names=tuple(units), units=units, label=signal.name)
+    return Trajectory(
+        t=t,
+        states=states,
+        state_names=tuple(units),
+        units=units,
+        label=signal.name,
+        clock=signal.clock,
+    )
 
 
 def _other(signal: str, name: str) -> str:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.library.units import prefixed
-
 STEP_TOLERANCE = 1e-6  # relative spread of steps below which sampling counts as uniform
 
 
@@ -50,11 +48,3 @@ def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
     curvature = left - 2 * centre + right
     shift = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
     return float(frequency[k] + np.clip(shift, -0.5, 0.5) * frequency[1])
-
-
-def frequency_text(frequency_Hz: float) -> str:
-    """`14.1 kHz`, `53.1 mHz`; a dash for none."""
-    if np.isnan(frequency_Hz):
-        return "-"
-    factor, prefix = prefixed(frequency_Hz)
-    return f"{frequency_Hz * factor:.4g} {prefix}Hz"

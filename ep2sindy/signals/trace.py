@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
 from ep2sindy.signals.spectrum import dominant_frequency
 
@@ -41,6 +42,7 @@ class Trace:
     cycle: Cycle
     done: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
+    clock: Clock = SECONDS
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", read_only(self.t))
@@ -100,7 +102,7 @@ def trace(
             f"{name} drifts by {drift:.1f} standard deviations over the record: detrend=true takes "
             "a straight line out"
         )
-    return Trace(t, x, name, run.units[name], cycle, tuple(done), tuple(advice))
+    return Trace(t, x, name, run.units[name], cycle, tuple(done), tuple(advice), run.clock)
 
 
 def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> bool:

@@ -14,7 +14,7 @@ from ep2sindy.library.equations import equation_text
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
-from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.held_out import Judged
 from ep2sindy.studies.shown import (
     MARKS,
@@ -103,7 +103,7 @@ class Outcome:
         shown = pictures([*CAPTIONS, *FIGURES, *self.more_figures])
         return [
             Section("Equations", [*relations, *intervals]),
-            *equation_sections(models, page_only=True),
+            *equation_sections(models, self.held.clock, page_only=True),
             Section("Held-out time", [self._table(), *shown]),
             *self.more_sections,
         ]
@@ -118,9 +118,9 @@ class Outcome:
         return Table(
             rows,
             title=TITLE,
-            note=f"Data, held out: {frequency_text(self.f_data_Hz)}. Amplitude: standard deviation "
-            "against the data's. Start fitted: frequency error and nrmse from a start fitted to "
-            "the first one and a half periods.",
+            note=f"Data, held out: {self.held.clock.frequency_text(self.f_data_Hz)}. Amplitude: "
+            "standard deviation against the data's. Start fitted: frequency error and nrmse from "
+            "a start fitted to the first one and a half periods.",
         )
 
     def summary(self) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def _rows(name: str, judged: Judged) -> list[dict[str, Any]]:
 
 def _readable(label: str, judged: Judged, f_data_Hz: float) -> dict[str, Any]:
     sample, fit = judged.from_sample, judged.from_fit
-    frequency = frequency_text(f_data_Hz * (1.0 + sample.f_error))
+    frequency = sample.rollout.clock.frequency_text(f_data_Hz * (1.0 + sample.f_error))
     return {
         "method": label,
         "f": _or_verdict(sample, f"{frequency} ({100 * sample.f_error:+.1f} %)"),

@@ -7,18 +7,17 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
+from ep2sindy.library.units import Clock
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import (
     Block,
     Captioned,
-    Equation,
     Picture,
     Section,
     Table,
@@ -26,9 +25,9 @@ from ep2sindy.report.document import (
     pictures,
     places,
 )
-from ep2sindy.search.front import Candidate
-from ep2sindy.selection.rule import selected
-from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.estimate_view import estimate_section, estimate_summary
+from ep2sindy.studies.front_view import candidate_text, column_note, front_table, readable_front
 from ep2sindy.studies.library_result import LibraryResult
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.living_view import (
@@ -38,7 +37,15 @@ from ep2sindy.studies.living_view import (
     living_summary,
     living_tables,
 )
-from ep2sindy.studies.shown import INTEGRATED, Shown, rollout_tables, run_figures, trajectories
+from ep2sindy.studies.shown import (
+    INTEGRATED,
+    Shown,
+    interval_table,
+    rollout_tables,
+    run_figures,
+    shown_equation,
+    trajectories,
+)
 from ep2sindy.studies.source import data_summary
 from ep2sindy.studies.term_roles import roles_section, roles_summary, roles_table
 
@@ -79,7 +86,7 @@ class Outcome:
     def tables(self) -> dict[str, pd.DataFrame]:
         found = {}
         for name, result in self.results.items():
-            fronts = [_front_table(result, state) for state in result.discovery.fronts]
+            fronts = [front_table(result, state) for state in result.discovery.fronts]
             found[f"front_{name}"] = pd.concat(fronts)
             found[f"ambiguities_{name}"] = pd.DataFrame(
                 [(a.exact, " ".join(a.terms), a.message) for a in result.discovery.ambiguities],
@@ -120,25 +127,50 @@ class Outcome:
         return drawn
 
     def sections(self) -> list[Section]:
-        found = [_library_section(name, result) for name, result in self.results.items()]
+        found = [self._in_short()]
+        for name, result in self.results.items():
+            found.append(_library_section(name, result, self.data.clock))
+            if (estimate := result.discovery.estimate) is not None:
+                found.append(estimate_section(name, estimate, self.data))
         lives = []
         for name, living in self.living.items():
             lives.append(living_section(name, living, living_figures(name, living)))
             if (roles := self.results[name].roles) is not None:
                 lives.append(roles_section(name, roles))
-        shown = Section("Integrated", [self._comparison_table(), *pictures(FIGURES)])
+        shown = Section(
+            "Run freely from the first sample", [self._comparison_table(), *pictures(FIGURES)]
+        )
         return [*found, *lives, shown]
 
+    def _in_short(self) -> Section:
+        """The equations that were found and how they run; a screen ends with them anyway."""
+        blocks: list[Block] = []
+        for name, result in self.results.items():
+            living, clock = result.living, self.data.clock
+            run = result.selected if living is None else living.run
+            how = "selected by their derivatives" if living is None else "selected by free runs"
+            if result.discovery.estimate is not None and living is None:
+                how = "estimated together with the states"
+            text = f"{name}: equations {how}; run freely: {run.text}"
+            blocks.append(Text(text, page_only=True))
+            for state in run.model.states:
+                blocks.append(shown_equation(run.model, state, clock, on_screen=False))
+            if living is None:
+                blocks += interval_table(run.model, clock=clock, page_only=True)
+        return Section("What was found", blocks)
+
     def _comparison_table(self) -> Table:
-        rows = []
+        rows, text = [], self.data.clock.frequency_text
         for row in self.comparison().to_dict("records"):
             for k, state in enumerate(self.data.state_names):
                 rows.append(
                     {
                         "model": "" if k else row["model"],
                         "state": state,
-                        "f data": frequency_text(row[f"f_data_{state}_Hz"]),
-                        "f model": frequency_text(row[f"f_model_{state}_Hz"]),
+                        "frequency of the data": self.data.clock.frequency_text(
+                            row[f"f_data_{state}_Hz"]
+                        ),
+                        "of the model": text(row[f"f_model_{state}_Hz"]),
                         "nrmse": "" if k else places(row["nrmse"], 3),
                         "verdict": "" if k else row["verdict"],
                     }
@@ -155,6 +187,7 @@ class Outcome:
                 "living": living_summary(result.living),
                 "roles": roles_summary(result.roles),
             }
+            | _estimate(result)
             for name, result in self.results.items()
         }
         return {"data": data_summary(self.data), "models": models}
@@ -176,30 +209,12 @@ class Outcome:
         return scalars
 
 
-def candidate_text(candidate: Candidate) -> str:
-    """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
-    return equation_text(candidate.equation, candidate.coef_by_term)
+def _estimate(result: LibraryResult) -> dict[str, Any]:
+    found = result.discovery.estimate
+    return {} if found is None else {"estimate": estimate_summary(found)}
 
 
-def _front_table(result: LibraryResult, state: str) -> pd.DataFrame:
-    """A front as in the thesis's Tables I-III: one row per candidate, with its equation."""
-    front, scores = result.discovery.fronts[state], result.discovery.scores[state]
-    chosen = selected(front, scores)
-    return pd.DataFrame(
-        {
-            "equation": front.equation,
-            "n_terms": [c.n_terms for c in front.candidates],
-            "r2_test": [c.r2_test for c in front.candidates],
-            "r2_train": [c.r2_train for c in front.candidates],
-            result.recipe.selection.label: scores,
-            "share": [c.share for c in front.candidates],
-            "selected": [c is chosen for c in front.candidates],
-            "text": [candidate_text(c) for c in front.candidates],
-        }
-    )
-
-
-def _library_section(name: str, result: LibraryResult) -> Section:
+def _library_section(name: str, result: LibraryResult, clock: Clock) -> Section:
     library, found = result.discovery.model.library, result.discovery
     blocks: list[Block] = [
         Text(
@@ -214,39 +229,9 @@ def _library_section(name: str, result: LibraryResult) -> Section:
             Text(f"note: nearly proportional terms: {n_alike}, see tables/ambiguities_{name}.csv")
         )
     for state in found.fronts:
-        blocks.append(Equation(state, found.model.terms(state)))
-        if state in result.refitted:
-            blocks.append(Equation(state, result.given[state], lead="thesis", aside=True))
-        blocks.append(_readable_front(result, state))
-    return Section(name, [*blocks, Picture(f"front_{name}")])
-
-
-def _readable_front(result: LibraryResult, state: str) -> Table:
-    """Candidates, the selected one bold; below them the last fit, and what was published."""
-    label = result.recipe.selection.label
-    front, scores = result.discovery.fronts[state], result.discovery.scores[state]
-    held_out = front.problem.test.any()
-    r2, header = ("r2_test", "R2 test") if held_out else ("r2_train", "R2 train")
-    columns = ["terms", header, label, "share", "model"]
-    table = _front_table(result, state)
-    rows = []
-    for row in table.to_dict("records"):
-        numbers = places(row[r2], 3), places(row[label], 3), places(row["share"], 2)
-        mark = "  <- selected" if row["selected"] else ""
-        rows.append((str(row["n_terms"]), *numbers, row["text"] + mark))
-    terms = result.discovery.model.terms(state)
-    if terms != selected(front, scores).coef_by_term:
-        rows.append(("", "", "", "", f"weighted: {equation_text(state, terms)}"))
-    italic = []
-    if state in result.refitted:
-        here = result.refitted[state]
-        score = here.r2_test if held_out else here.r2_train
-        italic = [len(rows), len(rows) + 1]
-        rows.append(("", "", "", "", f"thesis: {equation_text(state, result.given[state])}"))
-        text = f"its terms here: {candidate_text(here)}"
-        rows.append((str(here.n_terms), places(score, 3), "", "", text))
-    bold = np.flatnonzero(table["selected"]).tolist()
-    return Table(pd.DataFrame(rows, columns=columns), bold=bold, italic=italic)
+        blocks.append(readable_front(result, state, clock))
+    blocks.append(Text(column_note(result.recipe.selection.label), page_only=True))
+    return Section(f"{name}: candidates", [*blocks, Picture(f"front_{name}")])
 
 
 def _trajectory_summary(integrated: FreeRun, state: str) -> dict[str, Any]:

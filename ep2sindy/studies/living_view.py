@@ -15,16 +15,20 @@ from ep2sindy.model.rollout import Rollout
 from ep2sindy.report.document import (
     Block,
     Captioned,
-    Equation,
     Section,
     Table,
     Text,
     pictures,
     places,
 )
-from ep2sindy.signals.spectrum import frequency_text
 from ep2sindy.studies.living import Living
-from ep2sindy.studies.shown import coefficients, intervals, rollout_tables
+from ep2sindy.studies.shown import (
+    coefficients,
+    interval_table,
+    intervals,
+    rollout_tables,
+    shown_equation,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,22 +81,18 @@ def _row(name: str, living: Living) -> dict[str, Any]:
 def living_section(name: str, living: Living, figure_names: Iterable[str]) -> Section:
     """Equations with intervals, how they run, and what the derivatives' choice does instead."""
     model, run = living.model, living.run
-    known = intervals(model) or {}
-    blocks: list[Block] = []
-    for state in model.states:
-        blocks.append(Equation(state, model.terms(state), on_screen=True))
-        ends = [f"{term}: {a:.4g} to {b:.4g}" for term, (a, b) in known.get(state, {}).items()]
-        if ends:
-            blocks.append(Text(f"95 %: {'; '.join(ends)}"))
+    clock = run.rollout.clock
+    blocks: list[Block] = [shown_equation(model, state, clock) for state in model.states]
+    blocks += interval_table(model, clock=clock)
     first = model.states[0]
     rows = pd.DataFrame(
         [
             {
                 "state": state,
-                "frequency": "" if k else frequency_text(run.frequency_Hz[first]),
-                "error": "" if k else f"{places(100 * run.f_error, 2)} %",
-                "amplitude": places(run.amplitude_ratio[state], 3),
-                "waveform": places(run.waveform_error[state], 3),
+                "frequency": "" if k else clock.frequency_text(run.frequency_Hz[first]),
+                "its error": "" if k else f"{places(100 * run.f_error, 2)} %",
+                "amplitude (times the data's)": places(run.amplitude_ratio[state], 3),
+                "waveform error": places(run.waveform_error[state], 3),
                 "verdict": "" if k else run.text,
             }
             for k, state in enumerate(model.states)
@@ -122,8 +122,8 @@ def _note(living: Living) -> str:
             f"{100 * living.share:.0f} % of starts around reach it."
         )
     found.append(
-        "Amplitude: standard deviation against the data's; waveform: RMS difference in standard "
-        "deviations."
+        "Amplitude: ratio of standard deviations; waveform error: RMS difference in standard "
+        "deviations of the data."
     )
     return " ".join(found)
 

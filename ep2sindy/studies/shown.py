@@ -12,9 +12,10 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import phase, series
+from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Captioned, Equation, Section, Text
+from ep2sindy.report.document import Block, Captioned, Equation, Section, Table
 from ep2sindy.studies.kinds import PositiveOrAll
 
 if TYPE_CHECKING:
@@ -144,18 +145,58 @@ def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataF
     return pd.DataFrame(rows)
 
 
+def shown_equation(
+    model: SparseModel,
+    state: str,
+    clock: Clock = SECONDS,
+    *,
+    lead: str = "",
+    on_screen: bool = True,
+) -> Equation:
+    """One equation of a model with its unit, per unit of the clock."""
+    terms = {name: clock.seconds * coef for name, coef in model.terms(state).items()}
+    unit = clock.rate_unit(model.units[state])
+    return Equation(state, terms, lead=lead, unit=unit, on_screen=on_screen)
+
+
+def interval_table(
+    model: SparseModel,
+    states: Sequence[str] | None = None,
+    clock: Clock = SECONDS,
+    *,
+    page_only: bool = False,
+) -> list[Block]:
+    """Coefficients of some equations, by default of all, with 95 % intervals; none if unknown."""
+    if model.covariance is None:
+        return []
+    units = {term.name: term.unit(model.units) for term in model.library.terms}
+    rows = []
+    for state in model.states if states is None else states:
+        for term, ends in model.intervals(state).items():
+            numbers = [model.terms(state)[term], *ends]
+            unit = unit_product([(model.units[state], 1), (units[term], -1)])
+            row = [f"{state}'", term.replace("*", " ")]
+            row += [f"{clock.seconds * number:.4g}" for number in numbers]
+            rows.append([*row, clock.rate_unit(unit)])
+    columns = ["equation", "term", "coefficient", "95 % from", "to", "unit"]
+    return [Table(pd.DataFrame(rows, columns=columns), page_only=page_only)] if rows else []
+
+
 def equation_sections(
-    models: Mapping[str, SparseModel], *, page_only: bool = False
+    models: Mapping[str, SparseModel], clock: Clock = SECONDS, *, page_only: bool = False
 ) -> list[Section]:
-    """Under the name of each model its equations, with intervals where they are known."""
-    found = []
-    for name, model in models.items():
-        known = intervals(model) or {}
-        blocks: list[Block] = []
-        for state in model.states:
-            blocks.append(Equation(state, model.terms(state), on_screen=True))
-            ends = [f"{term}: {a:.4g} to {b:.4g}" for term, (a, b) in known.get(state, {}).items()]
-            if ends:
-                blocks.append(Text(f"95 %: {'; '.join(ends)}", page_only=page_only))
-        found.append(Section(name, blocks, level=3))
-    return found
+    """Under the name of each model its equations, with intervals where they are known.
+
+    page_only: of the intervals.
+    """
+    return [
+        Section(
+            name,
+            [
+                *(shown_equation(model, state, clock) for state in model.states),
+                *interval_table(model, clock=clock, page_only=page_only),
+            ],
+            level=3,
+        )
+        for name, model in models.items()
+    ]

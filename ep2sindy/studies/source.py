@@ -11,7 +11,7 @@ import xarray as xr
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.report.run import Run
-from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.simulated import check_recorded, say_simulation
 
@@ -82,11 +82,12 @@ def zone_length_m(source: Source) -> float | None:
 
 def say_data(run: Run, data: Trajectory) -> None:
     frequencies = ", ".join(
-        f"{name} {frequency_text(dominant_frequency(data.t, column))}"
+        f"{name} {data.clock.frequency_text(dominant_frequency(data.t, column))}"
         for name, column in zip(data.state_names, data.states.T, strict=True)
     )
     run.say(
-        f"data: {data.n_samples} samples of {data.dt_s:.4g} s; dominant frequency {frequencies}"
+        f"data: {data.n_samples} samples of {data.clock.duration_text(data.dt_s, digits=4)}; "
+        f"dominant frequency {frequencies}"
     )
 
 
@@ -95,6 +96,7 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
     return {
         "n_samples": data.n_samples,
         "dt_s": data.dt_s,
+        "time_unit": data.clock.unit,  # that people read; numbers are in seconds
         "f_kHz": 1e-3 * dominant_frequency(data.t, data.states[:, 0]),
         "variables": list(data.names),
         "units": dict(data.units),

@@ -36,9 +36,15 @@ from ep2sindy.report.document import (
 from ep2sindy.selection.rule import selected
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen
-from ep2sindy.signals.spectrum import frequency_text
 from ep2sindy.signals.trace import Trace
-from ep2sindy.studies.shown import coefficients, intervals, model_summary, rollout_tables
+from ep2sindy.studies.shown import (
+    coefficients,
+    interval_table,
+    intervals,
+    model_summary,
+    rollout_tables,
+    shown_equation,
+)
 from ep2sindy.studies.source import data_summary
 from ep2sindy.studies.trace_judged import paths_off
 
@@ -138,8 +144,8 @@ class Outcome:
         per_period = signal.period_s / self.states.dt_s
         blocks: list[Block] = [
             Text(
-                f"{frequency_text(1.0 / signal.period_s)}, {signal.cycle.n_periods:.0f} periods of "
-                f"{per_period:.0f} samples"
+                f"{signal.clock.frequency_text(1.0 / signal.period_s)}, "
+                f"{signal.cycle.n_periods:.0f} periods of {per_period:.0f} samples"
             ),
             Text(f"states: {made} ({self.chosen.reason})"),
             Text(
@@ -149,24 +155,25 @@ class Outcome:
             ),
             *(Text(each) for each in signal.done),
         ]
-        return Section(signal.name, blocks)
+        return Section(f"The signal {signal.name}", blocks)
 
     def _search_section(self) -> Section:
         blocks: list[Block] = []
         for state in self.searched:
             table = self._front(state)
+            pairs = zip(self.found.fronts[state].candidates, table["selected"], strict=True)
+            equations: list[Any] = [
+                Equation(state, each.coef_by_term, mark="  <- selected" if chosen else "")
+                for each, chosen in pairs
+            ]
             rows = table.assign(
                 r2=[places(r, 3) for r in table["r2"]],
                 score=[places(s, 3) for s in table["score"]],
-                text=[
-                    text + ("  <- selected" if chosen else "")
-                    for text, chosen in zip(table["text"], table["selected"], strict=True)
-                ],
+                text=equations,
             )
             shown = _best_of_sizes(table)
-            rows = (
-                rows.iloc[shown].drop(columns="selected").rename(columns={"r2": "R2", "text": ""})
-            )
+            rows = rows.iloc[shown].drop(columns="selected")
+            rows = rows.rename(columns={"r2": "R2", "text": "model"})
             bold = np.flatnonzero(table["selected"].to_numpy()[shown]).tolist()
             blocks.append(
                 Table(
@@ -180,14 +187,12 @@ class Outcome:
         return Section("Search", [*blocks, *pictures(["front"])])
 
     def _living_section(self) -> Section:
-        known = intervals(self.model) or {}
+        model, clock = self.model, self.states.clock
         blocks: list[Block] = [Text(self.found.note)] if self.found.note else []
-        for state in self.model.states:
+        for state in model.states:
             exact = "known" if state not in self.searched else ""
-            blocks.append(Equation(state, self.model.terms(state), lead=exact, on_screen=True))
-            ends = [f"{term}: {a:.4g} to {b:.4g}" for term, (a, b) in known.get(state, {}).items()]
-            if ends and not exact:
-                blocks.append(Text(f"95 %: {'; '.join(ends)}"))
+            blocks.append(shown_equation(model, state, clock, lead=exact))
+        blocks += interval_table(model, self.searched, clock)
         where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
         blocks.append(Table(self._table(), title=f"run freely from one sample over the {where}"))
         blocks += [Text(text, warning=warn) for text, warn in self._stability()]
@@ -198,7 +203,9 @@ class Outcome:
         measured = find_cycle(self.measured.t, self.measured.states[:, :1])
         rows = {
             "verdict": run.text,
-            "frequency of the data": frequency_text(measured.frequency_Hz) if measured else "-",
+            "frequency of the data": run.rollout.clock.frequency_text(
+                measured.frequency_Hz if measured else np.nan
+            ),
             "frequency error": _percent(run.f_error),
             f"amplitude error of {name}": _percent(run.amplitude_ratio[name] - 1.0),
             f"waveform error of {name}": f"{places(run.waveform_error[name], 3)} std",

@@ -11,12 +11,11 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.equations import equation_text
-from ep2sindy.library.units import prefixed
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures, places
 from ep2sindy.report.run import Run
-from ep2sindy.signals.spectrum import dominant_frequency, frequency_text
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.kinds import Coefficients, Count, Counts, Deferred, PositiveOrAll
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.shown import (
@@ -120,7 +119,7 @@ class Outcome:
         models = {name: fitted.integrated.model for name, fitted in self.labelled.items()}
         return [
             Section("Equations", [*published, Text(INTERVALS, page_only=True)]),
-            *equation_sections(models),
+            *equation_sections(models, self.data.clock),
             Section("Integrated", [self._table(), *pictures(FIGURES)]),
         ]
 
@@ -128,7 +127,7 @@ class Outcome:
         rows = []
         for name, fitted in self.labelled.items():
             integrated, states = fitted.integrated, self.data.state_names
-            f_text = frequency_text(integrated.frequency_Hz[states[0]])
+            f_text = self.data.clock.frequency_text(integrated.frequency_Hz[states[0]])
             steady = not np.isnan(fitted.f_error)
             of_model = {
                 "f": f"{f_text} ({100 * fitted.f_error:+.0f} %)" if steady else "-",
@@ -144,8 +143,9 @@ class Outcome:
             pd.DataFrame(rows).fillna(""),
             title=f"Models {INTEGRATED}",
             breaks=range(n - 1, len(rows), n),
-            note=f"The data's first state has {frequency_text(self.f_data_Hz)}. R2 is on each "
-            "setting's own rows: windows average, so it is not comparable between settings.",
+            note=f"The data's first state has {self.data.clock.frequency_text(self.f_data_Hz)}. "
+            "R2 is on each setting's own rows: windows average, so it is not comparable between "
+            "settings.",
         )
 
     def _windows(self, fitted: Fitted, state: str) -> dict[str, str]:
@@ -155,10 +155,9 @@ class Outcome:
         if not steps:
             return dict.fromkeys(("samples", "length", "periods"), "-")
         length_s = steps * self.data.dt_s
-        factor, prefix = prefixed(length_s)
         return {
             "samples": str(steps + 1),
-            "length": f"{length_s * factor:.3g} {prefix}s",
+            "length": self.data.clock.duration_text(length_s),
             "periods": f"{length_s * self.f_data_Hz:.2f}",
         }
 

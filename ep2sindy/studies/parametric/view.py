@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.figures.trends import rows_at, trends_figure
+from ep2sindy.library.units import SECONDS
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
-from ep2sindy.signals.spectrum import frequency_text
 from ep2sindy.studies.parametric import summary, tables
 from ep2sindy.studies.parametric.all_points import JointResult
 from ep2sindy.studies.parametric.oscillation import point_label
@@ -199,9 +199,9 @@ def _point_line(result: PointResult) -> str:
     """`V_D_V=300, mdot_mg_s=5: oscillating, 14.1 kHz; 12001 samples of 1.5e-06 s`."""
     text = f"{point_label(result.parameters)}: {result.status}"
     if result.fits:
-        text += f", {frequency_text(result.f_Hz)}"
+        text += f", {SECONDS.frequency_text(result.f_Hz)}"
     if result.n_samples:
-        text += f"; {result.n_samples} samples of {result.dt_s:.4g} s"
+        text += f"; {result.n_samples} samples of {SECONDS.duration_text(result.dt_s, digits=4)}"
     return text if result.fits else f"{text}; left out of trends"
 
 

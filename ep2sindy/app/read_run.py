@@ -1,0 +1,87 @@
+"""A run folder, read again."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from ep2sindy.library.units import Clock
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.about import by_place
+
+
+@dataclass(frozen=True, eq=False)
+class ReadRun:
+    """A run folder, read. settings: by dotted place. label: what tables call it."""
+
+    folder: Path
+    label: str
+    summary: dict[str, Any]
+    provenance: dict[str, Any]
+    settings: dict[str, Any]
+    models: dict[str, SparseModel]
+
+    @property
+    def clock(self) -> Clock:
+        """The unit that its times are read in."""
+        return Clock.of(self.summary.get("data", {}).get("time_unit", "s"))
+
+    @property
+    def headline(self) -> dict[str, float]:
+        """A figure that was not a number stands as null in the file."""
+        found = self.summary.get("headline", {})
+        return {name: float("nan") if v is None else float(v) for name, v in found.items()}
+
+
+def read_run(folder: Path, number: int) -> ReadRun:
+    """A run that came to its end. number: from zero; its label is A, B, ...
+
+    Raises ValueError for a folder that is none, or a run that ended early.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"a run is a folder: {folder} is not there; {_nearby(folder)}")
+    if (folder / "index.csv").is_file():
+        raise ValueError(
+            f"{folder} is a sweep, and compares its jobs in index.html; name the folders of two "
+            "of its jobs, see index.csv"
+        )
+    if not (folder / "summary.json").is_file():
+        said = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
+        raise ValueError(f"{folder} has no summary.json: {said}; {_nearby(folder)}")
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    paths = sorted((folder / "models").glob("[!.]*.json"))
+    return ReadRun(
+        folder=folder,
+        label=chr(ord("A") + number),
+        summary=_json(folder / "summary.json"),
+        provenance=_json(folder / "provenance.json"),
+        settings={k: v for key, each in config.items() for k, v in by_place(key, each).items()},
+        models={path.stem: SparseModel.load(path) for path in paths},
+    )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read ({error}): the run's folder is damaged") from error
+    return found
+
+
+def _nearby(folder: Path) -> str:
+    """Runs that there are: below the folder itself, beside it, or where outputs go."""
+    for place in (folder, folder.parent, Path("outputs")):
+        found = sorted(path.parent for path in place.glob("**/summary.json"))[-3:]
+        if found:
+            return f"runs there are, for example {', '.join(map(str, found))}"
+    return "a run's folder is the one that it prints last"
+
+
+def link_to(run: ReadRun, beside: Path) -> str:
+    """The run's page, as a page in this folder reaches it."""
+    return os.path.relpath(run.folder / "report.html", beside)

@@ -1,0 +1,108 @@
+"""The page of a sweep: every job with what was varied and what it found."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.machine.files import write_text
+from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
+from ep2sindy.report.folder import freeze_layout
+from ep2sindy.report.page import page_html
+from ep2sindy.report.picture import DPI, Drawn, drawn
+from ep2sindy.report.words import in_words, value_text
+
+MOST_PANELS = 12
+CAPTION = "Headline figures of the jobs that came to their end."
+
+Records = Sequence[Mapping[str, Any]]
+
+
+def write_sweep_page(sweep: Path, records: Records) -> None:
+    """`index.html` beside `index.csv`; links go to the pages of the jobs, and are relative."""
+    varied, shared = parted(records)
+    jobs = [Table(_jobs(sweep, records, varied), note=f"In all jobs: {' '.join(shared) or '-'}.")]
+    figures = _figures(records, varied)
+    errors: list[Block] = [
+        Text(f"Job {record['job']}: {record['error']}", warning=True)
+        for record in records
+        if record.get("error")
+    ]
+    sections = [Section("Jobs", [*jobs, *errors])]
+    if figures:
+        sections.append(Section("What they found", [Picture(name) for name in figures]))
+    write_text(sweep / "index.html", page_html(f"Sweep of {len(records)} jobs", sections, figures))
+
+
+def parted(records: Records) -> tuple[dict[str, list[str]], list[str]]:
+    """What differs between jobs, as values by key, one per job; and what all have in common."""
+    everywhere = set.intersection(*(set(record["overrides"]) for record in records))
+    keys = dict.fromkeys(
+        text.partition("=")[0] for r in records for text in r["overrides"] if text not in everywhere
+    )
+    values = [dict(text.partition("=")[::2] for text in record["overrides"]) for record in records]
+    shared = [text for text in records[0]["overrides"] if text in everywhere]
+    return {key: [value.get(key, "") for value in values] for key in keys}, shared
+
+
+def _jobs(sweep: Path, records: Records, varied: Mapping[str, Sequence[str]]) -> pd.DataFrame:
+    """A row per job. Figures are headed by words."""
+    figures = _headlines(records)
+    rows = []
+    for k, record in enumerate(records):
+        page = Path(record.get("folder", "")) / "report.html"
+        name = str(record["job"])
+        link = Link(name, os.path.relpath(page, sweep)) if "folder" in record else name
+        found = record.get("headline", {})
+        values = {in_words(n): value_text(n, _number(found.get(n))) for n in figures}
+        given = {key: texts[k] for key, texts in varied.items()}
+        rows.append({"job": link, **given, "status": record["status"], **values})
+    return pd.DataFrame(rows)
+
+
+def _headlines(records: Records) -> list[str]:
+    return list(dict.fromkeys(name for record in records for name in record.get("headline", {})))
+
+
+def _figures(records: Records, varied: Mapping[str, Sequence[str]]) -> dict[str, Drawn]:
+    """Over the one number that was varied, or over the jobs."""
+    from ep2sindy.figures.sweeps import sweep_figure
+
+    values = {
+        in_words(name) + (" (kHz)" if name.endswith("f_kHz") else ""): np.array(
+            [_number(record.get("headline", {}).get(name)) for record in records]
+        )
+        for name in _headlines(records)
+    }
+    shown = {name: v for name, v in values.items() if np.isfinite(v).sum() > 1}
+    if not shown:
+        return {}
+    label, x = "job", np.array([float(record["job"]) for record in records])
+    if len(varied) == 1:
+        ((key, texts),) = varied.items()
+        numbers = np.array([_number(text) for text in texts])
+        if np.isfinite(numbers).all():
+            label, x = key, numbers
+    jobs = [
+        f"job {record['job']}: {', '.join(f'{key}={v[k]}' for key, v in varied.items())}"
+        for k, record in enumerate(records)
+    ]
+    chosen = dict(list(shown.items())[:MOST_PANELS])
+    figure = sweep_figure(x, chosen, x_label=label, jobs=jobs)
+    freeze_layout(figure)
+    png = BytesIO()
+    figure.savefig(png, format="png", dpi=DPI)
+    return {"headline": drawn(figure, png.getvalue(), CAPTION)}
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")

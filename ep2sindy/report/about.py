@@ -1,0 +1,98 @@
+"""What a reader must know of a run beside its results: what was asked, and how to do it again."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+ASKED = {  # keys of a config in the order and the words of a page
+    "data": "data",
+    "prepare": "preparation",
+    "trajectory": "time series",
+    "signal": "signal",
+    "libraries": "libraries",
+    "model": "model",
+    "formulation": "form of the regression",
+    "search": "search",
+    "bootstraps": "bootstraps",
+    "selection": "selection",
+    "depth": "candidates kept per size",
+}
+ASIDE = ("experiment", "study", "output", "figures", "thesis", "parallel")
+
+
+@dataclass(frozen=True)
+class About:
+    """A run, for its page.
+
+    purpose: of the experiment, in a sentence. asked: settings in words, by name. said: lines on
+    the data and on what was done on the way.
+    provenance: as in provenance.json. config: the resolved one, as text.
+    """
+
+    purpose: str
+    asked: Mapping[str, str]
+    said: Sequence[str]
+    warnings: Sequence[str]
+    provenance: Mapping[str, Any]
+    config: str
+
+    @property
+    def command(self) -> str:
+        """As it is typed: arguments that a shell would change stand in quotes."""
+        from shlex import join
+
+        return join(self.provenance["command"])
+
+
+def asked_of(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, str]:
+    """The settings that a study uses, in words; those that are not set are left out."""
+    shown = [key for key in settings if key in keys and key not in ASIDE]
+    rank = {key: k for k, key in enumerate(ASKED)}
+    ordered = sorted(shown, key=lambda key: rank.get(key, len(rank)))
+    found = {ASKED.get(key, key.replace("_", " ")): _bare(settings[key]) for key in ordered}
+    return {name: text for name, text in found.items() if text}
+
+
+def _bare(value: Any) -> str:
+    """Without the brackets around all of it, which a mapping has inside another."""
+    text = setting_text(value)
+    nameless = isinstance(value, Mapping) and "_target_" not in value
+    return text[1:-1] if nameless else text
+
+
+def setting_text(value: Any) -> str:
+    """`BestSubset (max_terms 4, n_best 2)`; empty for what is not set.
+
+    A variable of a file that bears no name there is not set.
+    """
+    if value is None or (isinstance(value, Mapping) and "name" in value and value["name"] is None):
+        return ""
+    if isinstance(value, Mapping):
+        parts = {str(k): setting_text(v) for k, v in value.items() if k != "_target_"}
+        inner = ", ".join(f"{k} {text}" for k, text in parts.items() if text)
+        if target := value.get("_target_"):
+            name = str(target).rpartition(".")[2]
+            if not inner and parts:  # nothing of it is set
+                return ""
+            return f"{name} ({inner})" if inner else name
+        return f"({inner})" if inner else ""
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(map(setting_text, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def by_place(place: str, value: Any) -> dict[str, Any]:
+    """`search: BestSubset, search.max_terms: 4`; what is not set is left out."""
+    if isinstance(value, Mapping):
+        if "name" in value and value["name"] is None:  # a variable that a file has not
+            return {}
+        name = str(value.get("_target_", "")).rpartition(".")[2]
+        found = {place: name} if name else {}
+        for key, each in value.items():
+            found |= by_place(f"{place}.{key}", each) if key != "_target_" else {}
+        return found
+    if isinstance(value, list):
+        return {place: str(value)} if value else {}
+    return {place: value} if isinstance(value, int | float | str | bool) else {}

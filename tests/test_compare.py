@@ -1,0 +1,198 @@
+"""Run folders side by side, and the page of a sweep."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.app.compare import main as compare
+from ep2sindy.app.sweep import write_index
+from ep2sindy.app.sweep_page import parted
+from ep2sindy.report.words import WORDS, in_words
+from tests.browser import seen
+
+CONFIG = "experiment: discover\nseed: 0\nsearch: {_target_: ep2sindy.Joint, max_terms: MOST}\n"
+
+
+def model(slope: float, width: float, *more: str) -> ep.SparseModel:
+    """x' = slope x, known to within `width`, and 1 for every other term."""
+    library = ep.polynomial(["x", "y"], degree=2)
+    coef = np.zeros((len(library), 2))
+    coef[library.index("x"), 0] = slope
+    for name in more:
+        coef[library.index(name), 1] = 1.0
+    n = int(np.count_nonzero(coef))
+    covariance = np.diag(np.full(n, (width / 1.96) ** 2))
+    return ep.SparseModel(library, ["x", "y"], coef, {"x": "m", "y": "1"}, {}, covariance)
+
+
+def run_folder(
+    folder: Path, found: Mapping[str, ep.SparseModel], *, most: int, headline: Mapping[str, float]
+) -> Path:
+    (folder / "figures").mkdir(parents=True)
+    for name, each in found.items():
+        each.save(folder / "models" / f"{name}.json")
+    (folder / "config.yaml").write_text(CONFIG.replace("MOST", str(most)))
+    summary = {"experiment": "discover", "seed": 0, "headline": headline}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    provenance = {"commit": "c" * 40, "versions": {"numpy": f"2.{most}"}}
+    (folder / "provenance.json").write_text(json.dumps(provenance))
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> tuple[Path, Path]:
+    close, apart = model(-2.0, 0.1, "y"), model(-3.0, 0.1, "y", "x*y")
+    first, second = {"one": close, "same": close}, {"one": apart, "same": close, "extra": apart}
+    return (
+        run_folder(tmp_path / "first", first, most=3, headline={"one/f_kHz": 1.5, "one/r2": 0.5}),
+        run_folder(tmp_path / "second", second, most=4, headline={"one/f_kHz": 2.0}),
+    )
+
+
+def test_two_runs_are_set_side_by_side(
+    runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    page = tmp_path / "pages" / "both.html"
+    compare([*map(str, runs), "--page", str(page)])
+    said = capsys.readouterr().out
+    rows = [" ".join(line.replace("│", " ").split()) for line in said.splitlines()]
+    for row in (
+        "search.max_terms 3 4",
+        "numpy 2.3 2.4",
+        "one: frequency 1.5 kHz 2 kHz +33 %",
+        "one: R2 0.5 - -",
+        "x' x -2 ±0.1 -3 ±0.1 apart",
+        "y' y 1 ±0.1 1 ±0.1 overlap",
+        "y' x y - 1 ±0.1 -",
+        "x' x -2 ±0.1 -2 ±0.1 overlap",
+        "Only in B.",
+    ):
+        assert row in rows
+    assert rows[-1] == str(page)
+    assert 'href="../first/report.html"' in page.read_text()
+
+
+def test_runs_of_one_setting_say_so(
+    runs: tuple[Path, Path],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    again = shutil.copytree(runs[0], tmp_path / "again")
+    monkeypatch.chdir(tmp_path)
+    compare([str(runs[0]), str(again)])
+    assert "None: they are the same." in capsys.readouterr().out
+    assert (tmp_path / "compare.html").is_file()
+
+
+def test_a_template_of_ones_own_makes_the_page(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    template, page = tmp_path / "own.html", tmp_path / "page.html"
+    template.write_text("{{ title }}: {{ parts | length }}")
+    compare([*map(str, runs), "--page", str(page), "--template", str(template)])
+    assert page.read_text() == "Runs compared: 6"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nowhere", "a run is a folder: .*nowhere is not there; runs there are, for example"),
+        ("sweep", "sweep is a sweep, and compares its jobs in index.html"),
+        ("early", "early has no summary.json: it ended early, see its run.log; runs there"),
+        ("empty", "empty has no summary.json: no run; runs there are, for example"),
+        ("damaged", "summary.json cannot be read .*: the run's folder is damaged"),
+    ],
+)
+def test_what_is_no_run_is_named_with_the_way_out(
+    name: str, message: str, runs: tuple[Path, Path], tmp_path: Path
+) -> None:
+    for folder, file in (("sweep", "index.csv"), ("early", "run.log"), ("empty", "x")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / file).write_text("")
+    damaged = shutil.copytree(runs[0], tmp_path / "damaged")
+    (damaged / "summary.json").write_text("{")
+    with pytest.raises(ValueError, match=message):
+        compare([str(runs[0]), str(tmp_path / name)])
+
+
+def test_a_missing_template_leaves_no_page(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    with pytest.raises(ValueError, match=r"a template must be a file of HTML for Jinja2: no\.html"):
+        compare([*map(str, runs), "--page", str(page), "--template", "no.html"])
+    assert not page.exists()
+
+
+def test_one_run_cannot_be_compared(runs: tuple[Path, Path]) -> None:
+    with pytest.raises(ValueError, match="to compare takes two runs or more"):
+        compare([str(runs[0])])
+
+
+def sweep_of(folder: Path) -> list[dict]:
+    made = []
+    for job, degree in enumerate((1, 2, 3)):
+        record = {"job": job, "overrides": ["+exp=toy", f"degree={degree}"], "status": "done"}
+        record |= {"folder": str(folder.parent / f"run{job}"), "headline": {"one/r2": 0.1 * job}}
+        made.append(record)
+    made[1] = {**made[1], "status": "failed", "error": "<b>no</b>", "headline": {}}
+    (folder / "jobs").mkdir(parents=True)
+    for record in made:
+        (folder / "jobs" / f"{record['job']}.json").write_text(json.dumps(record))
+    return made
+
+
+def test_a_sweep_has_a_page_that_leads_to_its_jobs(tmp_path: Path) -> None:
+    folder = tmp_path / "sweep"
+    sweep_of(folder)
+    write_index(folder)
+    text = (folder / "index.html").read_text()
+    for words in (
+        "Sweep of 3 jobs",
+        '<a href="../run0/report.html">0</a>',
+        "In all jobs: +exp=toy.",
+        "Job 1: &lt;b&gt;no&lt;/b&gt;",
+        '<th class="number">one: R2</th>',
+        "job 2: degree=3\none: R2: 0.2</title>",
+    ):
+        assert words in text
+    for width_px in (1280, 390):
+        found = seen(folder / "index.html", width_px)
+        assert (found.figures, found.empty, found.console) == (1, 0, [])
+        assert found.scroll_px <= width_px
+
+
+def test_what_was_varied_is_parted_from_the_rest(tmp_path: Path) -> None:
+    varied, shared = parted(sweep_of(tmp_path / "sweep"))
+    assert varied == {"degree": ["1", "2", "3"]}
+    assert shared == ["+exp=toy"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("simple/n_i/r2_test", "simple, n_i: R2 on held-out rows"),
+        ("simple/living/nrmse", "simple, the model that lives: " + WORDS["nrmse"]),
+        ("n_points", "number of points"),
+        ("mean_of_it", "mean of it"),
+    ],
+)
+def test_headline_figures_read_in_words(name: str, words: str) -> None:
+    assert in_words(name) == words
+
+
+def test_runs_in_years_are_compared_in_years(
+    runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    year = ep.Clock.of("year").seconds
+    for folder in runs:
+        summary = json.loads((folder / "summary.json").read_text())
+        summary |= {"data": {"time_unit": "year"}, "headline": {"one/f_kHz": 0.1e-3 / year}}
+        (folder / "summary.json").write_text(json.dumps(summary))
+    compare([*map(str, runs), "--page", str(tmp_path / "page.html")])
+    said = capsys.readouterr().out
+    assert "0.1 per year" in said
+    assert f"A: x' = -{2.0 * year:.3g} x [m year^-1]" in said
+    assert f"-{2.0 * year:.4g} ±{0.1 * year:.2g}" in said
