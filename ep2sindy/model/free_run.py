@@ -25,7 +25,6 @@ from ep2sindy.signals.attractor import (
 from ep2sindy.signals.spectrum import dominant_frequency
 
 LONG = 8.0  # periods of a record whose first half may be left out as a transient
-
 DEAD = 0.1  # of the data's spread: a state that varies less in the second half has died out
 
 
@@ -36,6 +35,7 @@ class Verdict(StrEnum):
     SLIPS = "slips"
     WRONG_CYCLE = "wrong cycle"
     DIES_OUT = "dies out"
+    LEAVES_DOMAIN = "leaves the domain"
     DIVERGES = "diverges"
 
 
@@ -67,11 +67,10 @@ class FreeRun:
     """A model run from one sample over a record, driven by its inputs if it has any.
 
     Compared are the second halves, where transients are over; all of a record that has no period,
-    or less than eight.
-    f_error: relative, of the frequency. amplitude_ratio, waveform_error (in standard deviations),
-    distribution (the same): by state. NaN where they are not known: all of a run that diverged,
-    frequency and waveform where the record or the run has no period. periods: until the model's
-    phase has slipped from the data's by a quarter, or those of the record. excursion: largest
+    or less than eight. f_error: relative, of the frequency. amplitude_ratio, waveform_error (in
+    standard deviations), distribution (the same): by state. NaN where they are not known: all of a
+    run that diverged, frequency and waveform where the record or the run has no period. periods:
+    until the model's phase has slipped by a quarter, or those of the record. excursion: largest
     distance from the data's mean, in standard deviations. frequency_Hz: by state; nrmse: root mean
     square error over all samples in standard deviations. NaN where it diverged, or died out.
     """
@@ -94,7 +93,8 @@ class FreeRun:
         """The verdict, and how long after its start it diverged."""
         if not (self.rollout.diverged and len(self.rollout.t)):
             return str(self.verdict)
-        return f"{self.verdict} after {self.rollout.t[-1] - self.rollout.t[0]:.3g} s"
+        of = f" of {self.rollout.outside}" if self.rollout.outside else ""
+        return f"{self.verdict}{of} after {self.rollout.t[-1] - self.rollout.t[0]:.3g} s"
 
 
 def free_run(
@@ -128,7 +128,7 @@ def free_run(
     return FreeRun(
         model=model,
         rollout=rollout,
-        verdict=ours.verdict,
+        verdict=Verdict.LEAVES_DOMAIN if rollout.outside else ours.verdict,
         f_error=ours.f_error,
         spectrum=likeness.spectrum,
         periods=_periods_kept(record, rollout.states),

@@ -10,6 +10,7 @@ from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csr_array
 
+from ep2sindy.data.domain import kept_inside
 from ep2sindy.data.scales import column_norms
 from ep2sindy.regression.rows import NoisyRows, Regression
 
@@ -85,7 +86,7 @@ def _following(
     limit: the misfit that a whole step may reach.
     """
     coef = rows.fitted(terms)
-    x = rows.corrected(coef)
+    x = kept_inside(problem.library, rows.corrected(coef), rows.x)
     whole = _Linearised.at(problem, x, coef)
     if whole.misfit <= limit:
         return whole
