@@ -198,6 +198,14 @@ def test_relations_name_terms_with_functions() -> None:
     assert coef[("x", "sin(2*x)*v")] == 1.5
 
 
+def test_greek_names_are_written_as_letters() -> None:
+    model = ep.pendulum().model
+    assert r"\dot{\theta} &= 1 \, w" in model.latex()
+    assert r"- 9.81 \, \sin(\theta)" in model.latex()
+    assert latex_term_name("omega_c*x") == r"\omega_{c} x"
+    assert "sin(<i>&theta;</i>)" in equation_html("w", {"sin(theta)": 1.0})
+
+
 # A user's own function
 
 
@@ -365,6 +373,26 @@ def test_only_functions_that_end_somewhere_have_edges() -> None:
         ("1/(1+u)", (0.0, np.inf)),
         ("log(u)", None),
     ]
+
+
+def test_terms_that_a_model_does_not_have_need_no_domain() -> None:
+    """A library may hold log(x) where the model that was chosen runs below zero."""
+    library = polynomial(["x"], degree=1, functions=["log"])
+    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x": -1.0}]))
+    below = np.array([[-2.0], [0.0]])
+    np.testing.assert_array_equal(model.predict(below), -below)
+    run = model.simulate(T, [-1.0])
+    assert not run.diverged
+    assert model.score(run.trajectory(), x_dot=-run.states) == 1.0
+    nothing = ep.SparseModel(library, ["x"], np.zeros((3, 1)))
+    np.testing.assert_array_equal(nothing.predict(below), 0 * below)
+
+
+def test_a_score_names_samples_that_the_model_is_not_defined_at() -> None:
+    model = model_of({"x": {"log(x)": 1.0}, "v": {"x": 1.0}})
+    with pytest.raises(ValueError, match=r"log\(x\) needs x > 0: x\[158\] = -0.009"):
+        model.score(signal(np.cos(T)))
+    assert np.isnan(model.predict(np.array([-1.0, 0.0]))[0])
 
 
 # Searches

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
+from html.entities import name2codepoint
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ def latex_name(variable: str) -> str:
     if variable.startswith("<"):
         return rf"\langle {latex_term_name(variable[1:-1])} \rangle"
     stem, _, index = variable.partition("_")
+    stem = rf"\{stem}" if _is_greek(stem) else stem
     return rf"{stem}_{{{index.replace('_', ',')}}}" if index else stem
 
 
@@ -197,4 +199,11 @@ def _variable_html(variable: str) -> str:
     if variable.startswith("<") and variable.endswith(">"):
         return f"&lang;{_term_html(variable[1:-1])}&rang;"
     stem, _, index = variable.partition("_")
-    return f"<i>{html.escape(stem)}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
+    stem = f"&{stem};" if _is_greek(stem) else html.escape(stem)
+    return f"<i>{stem}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
+
+
+def _is_greek(stem: str) -> bool:
+    """Small letters that LaTeX, matplotlib and HTML call by the same name."""
+    alpha_to_omega = 0x3B1 <= name2codepoint.get(stem, 0) <= 0x3C9
+    return alpha_to_omega and stem not in ("omicron", "sigmaf")

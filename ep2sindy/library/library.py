@@ -111,8 +111,8 @@ class Library:
         """Some of the terms, by position or by mask, and the functions that they need."""
         n, exponents = len(self.variables), self.exponents[rows]
         used = np.flatnonzero(exponents[:, n:].any(axis=0))
-        kept = np.append(np.arange(n), n + used)
-        return Library(self.variables, exponents[:, kept], [self.functions[k] for k in used])
+        kept, functions = [*range(n), *(n + used)], [self.functions[k] for k in used.tolist()]
+        return Library(self.variables, exponents[:, kept], functions)
 
     def over(self, variables: Sequence[str]) -> Library:
         """The same terms over other variables, in their order, among them all that are used."""

@@ -15,6 +15,7 @@ from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library
 from ep2sindy.model.edges import Border, Edge, edges_of
 from ep2sindy.model.inputs import Drive, driven, spline
+from ep2sindy.model.rates import used_terms
 
 # Evaluations of the right-hand side that a run may take: a hundred times what an oscillation
 # takes that its samples resolve. A model that blows up in steps ever smaller stops there.
@@ -123,10 +124,11 @@ def simulate(
         )
     check_time(times)
     drive, samples = driven(model.inputs, inputs, times)
-    values, terms = model.library.at_points([*model.states, *model.inputs])
+    library, coef = used_terms(model.library, model.coef)
+    values, terms = library.at_points([*model.states, *model.inputs])
     values[:] = np.append(start, samples[0])
     # What starts at zero is as large as its first rate makes it; what stays there, one.
-    reach = np.abs(start) + (start == 0.0) * np.abs(terms() @ model.coef) * (times[-1] - times[0])
+    reach = np.abs(start) + (start == 0.0) * np.abs(terms() @ coef) * (times[-1] - times[0])
     return _integrated(
         model,
         times,
@@ -218,9 +220,8 @@ def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.
     def values(t: float, y: np.ndarray) -> np.ndarray:
         return y * scale if drive is None else np.append(y * scale, drive(t))
 
-    present = np.flatnonzero(model.coef.any(axis=1))
-    functions = model.library.take(present).functions if len(present) else ()
-    return Border(edges_of(functions, [*model.states, *model.inputs], start), values)
+    library, _ = used_terms(model.library, model.coef)
+    return Border(edges_of(library.functions, [*model.states, *model.inputs], start), values)
 
 
 class _Counted:
