@@ -436,6 +436,20 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(search: str, noise: fl
     assert judged.verdict in (ep.Verdict.LIVES, ep.Verdict.SLIPS)
 
 
+def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:
+    """Without what noise adds to sin on average, errors have a mean of 3.5 standard deviations."""
+    library = named_terms(["theta", "w"], ["w", "sin(theta)"])
+    known = {"theta": ["w"], "w": ["sin(theta)"]}
+    errors = []
+    for seed in range(16):
+        run = ep.pendulum().trajectory(noise=0.1, rng=seed)
+        model = ep.discover(run, library, terms=known).model
+        low, high = model.intervals("w")["sin(theta)"]
+        errors.append((0.5 * (low + high) + 9.81) / ((high - low) / 3.92))
+    assert abs(np.mean(errors)) < 0.9  # 0.25 by chance, 0.2 by noise above second order
+    assert 0.6 < np.std(errors) < 1.5
+
+
 def test_a_joint_search_takes_a_function_of_ones_own(tanh: str) -> None:
     truth = model_of({"x": {"y": 1.0}, "y": {"tanh(3*x)": -4.0, "y": -0.05}})
     clean = truth.simulate(np.linspace(0.0, 20.0, 1001), [1.5, 0.0]).trajectory()
