@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 from collections.abc import Iterator
 
@@ -142,6 +143,7 @@ def test_a_library_takes_functions_of_every_variable_or_of_one() -> None:
     ("setting", "message"),
     [
         ({"functions": ["sine"]}, r"functions must be some of \['sin', .*: 'sine' came"),
+        ({"functions": "sin"}, r"functions must be a list: 'sin' came; write \['sin'\]"),
         ({"functions": ["x*sin(v)"]}, "go into products"),
         ({"functions": ["sin(x)^2"]}, "come with function_degree=2"),
         ({"function_degree": 2}, r"function_degree=2 needs functions, such as \['sin'\]"),
@@ -257,6 +259,7 @@ def test_a_function_of_ones_own_travels_to_other_processes() -> None:
         ("a b", np.sin, np.cos, None, "must be a plain word, such as 'tanh': 'a b' came"),
         ("wrong", np.sin, np.sin, None, "derivative of 'wrong' must be that of its value: at"),
         ("root", np.sqrt, lambda x: 0.5 / np.sqrt(x), None, "value of 'root' must give a finite"),
+        ("of_one", math.tanh, np.cos, None, "must take and return NumPy arrays: .* not math.tanh"),
         ("sums", np.sum, np.cos, None, "value of 'sums' must give a finite number for each"),
         ("turned", np.sin, np.cos, (1.0, -1.0), r"interval \(low, high\): \(1.0, -1.0\) came"),
     ],

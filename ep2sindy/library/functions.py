@@ -228,9 +228,15 @@ def _check_derivative(
     """Hold a derivative to central differences at a few points of the domain."""
     points = _points(low, high)
     step = 1e-5 * np.minimum(1.0, np.minimum(points - low, high - points))
-    with np.errstate(all="ignore"):
-        slopes, values = (np.asarray(f(points)) for f in (derivative, value))
-        ahead, behind = (np.asarray(value(x)) for x in (points + step, points - step))
+    try:
+        with np.errstate(all="ignore"):
+            slopes, values = (np.asarray(f(points), np.float64) for f in (derivative, value))
+            ahead, behind = (np.asarray(value(x)) for x in (points + step, points - step))
+    except (TypeError, AttributeError) as error:
+        raise ValueError(
+            f"value and derivative of {name!r} must take and return NumPy arrays: {error}; write "
+            "them with NumPy, np.tanh and not math.tanh"
+        ) from error
     for what, found in (("value", values), ("derivative", slopes)):
         if found.shape != points.shape or not np.isfinite(found).all():
             raise ValueError(
@@ -256,7 +262,7 @@ def _points(low: float, high: float) -> Float[np.ndarray, " points"]:
     away = np.array([0.37, 1.13, 2.71])
     if np.isfinite(low):
         return low + away
-    return high - away if np.isfinite(high) else away - 1.3
+    return high - away if np.isfinite(high) else away - 1.5
 
 
 def _built_in(name: str) -> Kind:

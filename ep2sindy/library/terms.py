@@ -108,6 +108,8 @@ def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Func
 
     Raises ValueError for what is no function.
     """
+    if isinstance(names, str):
+        raise ValueError(f"functions must be a list: {names!r} came; write [{names!r}]")
     found: list[Function] = []
     for name in names:
         texts = [f"{name}({v})" for v in variables] if name in function_names() else [name]
