@@ -23,7 +23,7 @@ class Edge:
     interval: Interval | None
 
     def margin(self, values: Float[np.ndarray, " known"]) -> float:
-        """How far the argument is inside; zero or less, or NaN, where it has left."""
+        """How far the argument is inside; zero or less where it has left."""
         argument = self.function.scale * values[self.place] + self.function.shift
         low, high = self.interval or (np.inf, -np.inf)
         return float(min(argument - low, high - argument))
@@ -70,4 +70,4 @@ class Border:
         if not self.edges:
             return None
         at = self.values(t, y)
-        return next((edge for edge in self.edges if not edge.margin(at) > 0.0), None)
+        return next((edge for edge in self.edges if edge.margin(at) <= 0.0), None)

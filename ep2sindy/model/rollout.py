@@ -233,11 +233,14 @@ class _Counted:
         self.rhs, self.budget, self.border = rhs, budget, border
         self.calls, self.given_up_s = 0, float("inf")
         self.beyond: Edge | None = None
+        self.beyond_s = float("inf")
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         self.calls += 1
-        if self.border.edges:
-            self.beyond = self.border.beyond(t, y) or self.beyond
+        if edge := self.border.beyond(t, y):
+            self.beyond, self.beyond_s = edge, t
+        elif t > self.beyond_s and np.isfinite(y).all():  # a step too long has been mended
+            self.beyond = None
         return self.rhs(t, y)
 
     def left_s(self, t: float) -> float:
