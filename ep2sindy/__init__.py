@@ -59,6 +59,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.estimation.estimate import estimate as estimate
     from ep2sindy.estimation.joint import Joint as Joint
     from ep2sindy.library.equations import equation_text as equation_text
+    from ep2sindy.library.functions import register_function as register_function
     from ep2sindy.library.library import Library as Library
     from ep2sindy.library.library import named_terms as named_terms
     from ep2sindy.library.library import polynomial as polynomial
@@ -153,6 +154,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.synthetic.systems import damped_oscillator as damped_oscillator
     from ep2sindy.synthetic.systems import lorenz as lorenz
     from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra
+    from ep2sindy.synthetic.systems import pendulum as pendulum
     from ep2sindy.synthetic.systems import van_der_pol as van_der_pol
     from ep2sindy.thruster.anode import AnodeSheath as AnodeSheath
     from ep2sindy.thruster.anode import FixedAnode as FixedAnode
@@ -220,6 +222,7 @@ _FACE = {
     "estimation.estimate": "Estimate estimate",
     "estimation.joint": "Joint",
     "library.equations": "equation_text",
+    "library.functions": "register_function",
     "library.library": "Library polynomial named_terms",
     "machine.parallel": "Serial Loky Dask",
     "library.units": "Clock",
@@ -270,7 +273,7 @@ _FACE = {
         "PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm"
     ),
     "synthetic.regions": "three_regions",
-    "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz",
+    "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz pendulum",
     "thruster.anode": "AnodeSheath FixedAnode",
     "thruster.axial.balance": "zone_balance",
     "thruster.axial.simulate": "simulate",

@@ -45,3 +45,14 @@ def write_h5(path: Path) -> None:
         wave = 1.0 + 0.5 * np.sin(np.linspace(0.0, 40.0, 201))[:, None] * np.ones(11)
         for name in ("ni", "nn", "rate", "uz"):
             file[name] = 1e12 * wave
+
+
+def test_pysindys_examples_take_no_more_lines_here() -> None:
+    page = (ROOT / "docs" / "pysindy.md").read_text("utf-8")
+    pairs = [re.findall(r"```python\n(.*?)```", row, re.DOTALL) for row in page.split("<tr>")]
+    compared = [pair for pair in pairs if len(pair) == 2]
+    assert len(compared) == 6
+    for theirs, ours in compared:
+        assert "ps." in theirs or "model." in theirs
+        assert "ps." not in ours
+        assert len(ours.splitlines()) <= len(theirs.splitlines()), ours

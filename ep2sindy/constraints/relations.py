@@ -11,13 +11,13 @@ from jaxtyping import Float, Int
 
 from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.library import Library
-from ep2sindy.library.names import PRODUCT, VARIABLE
+from ep2sindy.library.names import NUMBER, PRODUCT, VARIABLE
 
 ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
 
-_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w)"
+_NUMBER = rf"{NUMBER}(?!\w)"
 
-_TERM = rf"(?:1(?![\w.])|{PRODUCT})"
+_TERM = rf"(?:1(?![\w.]|\s*/)|{PRODUCT})"
 
 _ADDEND = re.compile(
     rf"\s*(?P<sign>[+-]?)\s*(?:(?:(?P<factor>[+-]?{_NUMBER})\s*\*\s*)?"

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
+from ep2sindy.data.domain import check_domain
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.joint import SAMPLES_PER_TERM, Joint, Solution, enough_samples, solve
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
@@ -133,6 +134,7 @@ def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
             f"a library of {len(library)} terms needs more samples than terms: {n_samples} came; "
             "use a smaller library or more data"
         )
+    check_domain(runs, library)
     for run in runs:
         if run.n_samples < 5:
             raise ValueError(
@@ -149,7 +151,7 @@ def _named_coef(problem: Problem, free: Float[np.ndarray, " free"], block: int) 
     """Term -> SI coefficient of one equation, those that are not zero."""
     values = _coef_SI(problem, free)
     own = (problem.equation == block) & (values != 0.0)
-    names = [problem.library.names[j] for j in problem.column[own]]
+    names = [problem.term_names[j] for j in problem.column[own]]
     return dict(zip(names, values[own].tolist(), strict=True))
 
 

@@ -65,13 +65,15 @@ class Flow:
 class Problem:
     """Records, the library of their variables, and the coefficients: coef = C free + fixed.
 
-    library: of scaled variables, states first. equation, column: (coefficients,), where each
-    stands. C: (coefficients, free), fixed: (coefficients,), both scaled; without relations C is
-    the identity. required: (free,), those that are never left out. to_SI: (coefficients,), what
-    takes each from scaled to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
+    library: of scaled variables, states first. term_names: of its terms, variables in SI. equation,
+    column: (coefficients,), where each stands. C: (coefficients, free), fixed: (coefficients,),
+    both scaled; without relations C is the identity. required: (free,), those that are never left
+    out. to_SI: (coefficients,), what takes each from scaled to SI. scale: (d,), RMS of the states
+    in SI; step_s: the unit of time.
     """
 
     library: Library
+    term_names: tuple[str, ...]
     states: tuple[str, ...]
     records: tuple[Record, ...]
     equation: Int[np.ndarray, " coefficients"]
@@ -220,6 +222,7 @@ def scaled_problem(
     known = np.isin(equation, [states.index(state) for state in terms or {}])
     return Problem(
         library=scaled,
+        term_names=over.names,
         states=tuple(states),
         records=tuple(_record(run, size, step_s) for run in runs),
         equation=equation,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.domain import kept_inside
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.estimation.likelihood import Fit
 from ep2sindy.estimation.noise import FLOOR
@@ -26,13 +27,13 @@ def smoothed_start(
     smoother = KalmanSmoother(log10_ratio)
     estimates = [smoother.estimate(r.times, r.samples) for r in problem.records]
     variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
-    paths = tuple(e.smoothed for e in estimates)
-    theta = np.concatenate(
-        [
-            problem.library.evaluate(np.concatenate([path, record.inputs], axis=1))
-            for path, record in zip(paths, problem.records, strict=True)
-        ]
-    )
+    samples = [np.concatenate([r.samples, r.inputs], axis=1) for r in problem.records]
+    values = [
+        kept_inside(problem.library, np.concatenate([e.smoothed, r.inputs], axis=1), raw)
+        for e, r, raw in zip(estimates, problem.records, samples, strict=True)
+    ]
+    paths = tuple(each[:, : len(problem.states)] for each in values)
+    theta = np.concatenate([problem.library.evaluate(each) for each in values])
     rates = np.concatenate([e.derivative for e in estimates])
     support = np.ones(problem.C.shape[1], dtype=np.bool_)
     fit = Fit(paths, _regressed(problem, theta, rates), support, np.full(len(variance), np.inf))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Mapping
+from html.entities import name2codepoint
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ep2sindy.library.names import split_factors
+from ep2sindy.library.names import RECIPROCAL, Part, split_term
 
 if TYPE_CHECKING:
     import sympy
@@ -24,7 +25,10 @@ def latex_name(variable: str) -> str:
     if variable.startswith("<"):
         return rf"\langle {latex_term_name(variable[1:-1])} \rangle"
     stem, _, index = re.sub(r"([#$%&{}])", r"\\\1", re.sub(r"[\\^~]", " ", variable)).partition("_")
-    stem = stem if len(stem) < 2 else rf"\mathrm{{{stem}}}"
+    if _is_greek(stem):
+        stem = rf"\{stem}"
+    elif len(stem) > 1:
+        stem = rf"\mathrm{{{stem}}}"
     return rf"{stem}_{{{index.replace('_', ',')}}}" if index else stem
 
 
@@ -37,14 +41,31 @@ def latex_derivative(state: str) -> str:
 
 
 def latex_term_name(name: str) -> str:
-    r"""`n_i^2*n_n` -> `n_{i}^{2} \, n_{n}`."""
-    return (
-        r" \, ".join(
-            latex_name(factor) + (f"^{{{power}}}" if power > 1 else "")
-            for factor, power in _factors(name)
-        )
-        or name
+    r"""`n_i^2*n_n` -> `n_{i}^{2} \, n_{n}`, `x*sin(y)/z` -> `\frac{x \, \sin(y)}{z}`."""
+    above, below = _sides(name)
+    over, under = (
+        r" \, ".join(_latex_factor(p) + _latex_power(p) for p in side) for side in (above, below)
     )
+    return rf"\frac{{{over or 1}}}{{{under}}}" if below else over or name
+
+
+def _latex_factor(part: Part) -> str:
+    argument = part.argument_of(latex_name(part.variable), times=r" \, ")
+    if not part.function:
+        return latex_name(part.variable)
+    if part.function == RECIPROCAL:
+        return argument if part.is_bare else f"({argument})"
+    if part.function == "sqrt":
+        root = rf"\sqrt{{{argument}}}"
+        return root if part.power == 1 else f"({root})"
+    if part.function == "abs":
+        return rf"|{argument}|"
+    known = part.function in ("sin", "cos", "exp", "log")
+    return (rf"\{part.function}" if known else rf"\mathrm{{{part.function}}}") + f"({argument})"
+
+
+def _latex_power(part: Part) -> str:
+    return f"^{{{part.power}}}" if part.power > 1 else ""
 
 
 def equation_text(state: str, terms: Mapping[str, float], *, digits: int = 3) -> str:
@@ -61,6 +82,7 @@ def equation_parts(
         sign = "-" if coef < 0 else "+" if k else ""
         error = f" (±{reach[name]:.2g})" if name in reach else ""
         factors = "" if name == "1" else " " + name.replace("*", " ")
+        factors = factors.replace(" 1/", "/", 1) if name.startswith(RECIPROCAL) else factors
         parts.append(f"{sign}{' ' if k else ''}{abs(coef):.{digits}g}{error}{factors}")
     return parts
 
@@ -100,22 +122,45 @@ def equation_html(
         number = _number_html(coef, digits)
         if name in reach:
             number += f" (&plusmn;{_number_html(reach[name], 2)})"
-        factors = [_factor_html(factor, power) for factor, power in _factors(name)]
-        parts.append(" ".join([sign, number, *factors]).strip())
-    left = f"d{_factor_html(state, 1)}/dt"
+        parts.append(" ".join([sign, number, _term_html(name)]).strip())
+    left = f"d{_variable_html(state)}/dt"
     return f"{left} = {' '.join(parts) or '0'}".replace("-", "&minus;")
 
 
 def sum_sympy(terms: Mapping[str, float]) -> sympy.Expr:
-    """The right-hand side of an equation as a sympy expression, coefficients as floats."""
+    """The right-hand side of an equation as a sympy expression, coefficients as floats.
+
+    A function of a user's own is one that sympy knows by name alone.
+    """
     import sympy  # half a second that most runs do not need
 
     return sympy.Add(
         *(
-            sympy.Float(coef) * sympy.Mul(*(sympy.Symbol(v) ** p for v, p in _factors(name)))
+            sympy.Float(coef) * sympy.Mul(*(_factor_sympy(p) ** p.power for p in _parts(name)))
             for name, coef in terms.items()
         )
     )
+
+
+def _factor_sympy(part: Part) -> sympy.Expr:
+    import sympy
+
+    argument = sympy.Symbol(part.variable)
+    if not part.is_bare:
+        argument = _sympy_number(part.scale) * argument + _sympy_number(part.shift)
+    if not part.function:
+        return argument
+    if part.function == RECIPROCAL:
+        return 1 / argument
+    known = {"sin": sympy.sin, "cos": sympy.cos, "exp": sympy.exp, "log": sympy.log}
+    known |= {"sqrt": sympy.sqrt, "abs": sympy.Abs}
+    return known.get(part.function, sympy.Function(part.function))(argument)
+
+
+def _sympy_number(value: float) -> sympy.Expr:
+    import sympy
+
+    return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value)
 
 
 def _number(coef: float, digits: int) -> tuple[str, int | None]:
@@ -129,19 +174,45 @@ def _number_html(coef: float, digits: int) -> str:
     return mantissa + ("" if exponent is None else f"&times;10<sup>{exponent}</sup>")
 
 
-def _factors(name: str) -> list[tuple[str, int]]:
-    """Factors and powers; a name that is no product stands as it is."""
+def _parts(name: str) -> list[Part]:
+    """Factors and powers; a name that is no term stands as it is."""
     try:
-        return [] if name == "1" else split_factors(name)
+        return split_term(name)
     except ValueError:
-        return [(name, 1)]
+        return [Part("", name)]
 
 
-def _factor_html(factor: str, power: int) -> str:
-    if factor.startswith("<") and factor.endswith(">"):
-        inner = " ".join(_factor_html(f, p) for f, p in _factors(factor[1:-1]))
-        text = f"&lang;{inner}&rang;"
+def _sides(name: str) -> tuple[list[Part], list[Part]]:
+    """What stands above and below the fraction line."""
+    parts = _parts(name)
+    below = [part for part in parts if part.function == RECIPROCAL]
+    return [part for part in parts if part.function != RECIPROCAL], below
+
+
+def _term_html(name: str) -> str:
+    above, below = _sides(name)
+    over = " ".join(map(_part_html, above))
+    return " / ".join([over, *map(_part_html, below)]).strip()
+
+
+def _part_html(part: Part) -> str:
+    argument = part.argument_of(_variable_html(part.variable), times=" ")
+    if part.function == RECIPROCAL:
+        text = argument if part.is_bare else f"({argument})"
     else:
-        stem, _, index = factor.partition("_")
-        text = f"<i>{html.escape(stem)}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
-    return text + (f"<sup>{power}</sup>" if power > 1 else "")
+        text = f"{html.escape(part.function)}({argument})" if part.function else argument
+    return text + (f"<sup>{part.power}</sup>" if part.power > 1 else "")
+
+
+def _variable_html(variable: str) -> str:
+    if variable.startswith("<") and variable.endswith(">"):
+        return f"&lang;{_term_html(variable[1:-1])}&rang;"
+    stem, _, index = variable.partition("_")
+    stem = f"&{stem};" if _is_greek(stem) else html.escape(stem)
+    return f"<i>{stem}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
+
+
+def _is_greek(stem: str) -> bool:
+    """Small letters that LaTeX, matplotlib and HTML call by the same name."""
+    alpha_to_omega = 0x3B1 <= name2codepoint.get(stem, 0) <= 0x3C9
+    return alpha_to_omega and stem not in ("omicron", "sigmaf")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,8 +12,9 @@ import numpy as np
 from array_api_compat import array_namespace
 from jaxtyping import Float, Int
 
-from ep2sindy.library.terms import Factor, Term, Variable, product, read_term
-from ep2sindy.machine.screen import N_LINES, cut, html_table, one_screen, wrapped
+from ep2sindy.library.display import library_html, library_text
+from ep2sindy.library.functions import Function
+from ep2sindy.library.terms import Factor, Term, Variable, functions_named, product, read_term
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Library:
 
     variables: Sequence[str]
     exponents: Int[np.ndarray, "terms factors"]
-    functions: Sequence[Factor] = ()
+    functions: Sequence[Function] = ()
 
     def __post_init__(self) -> None:
         exponents = np.array(self.exponents, dtype=np.int64)
@@ -58,7 +58,7 @@ class Library:
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:
-        factors = [*map(Variable, self.variables), *self.functions]
+        factors: list[Factor] = [*map(Variable, self.variables), *self.functions]
         return tuple(
             product({f: p for f, p in zip(factors, row, strict=True) if p}, self.variables)
             for row in self.exponents.tolist()
@@ -85,20 +85,10 @@ class Library:
         return table
 
     def __repr__(self) -> str:
-        lines = [f"Library of {len(self)} terms over {', '.join(self.variables)}"]
-        by_degree = list(self._by_degree().items())
-        for k, (degree, names) in enumerate(by_degree):
-            left = N_LINES - len(lines) - (len(by_degree) - k - 1)
-            head = f"{len(names)} of degree {degree}:"
-            lines += wrapped([head, *names], what="terms", n_lines=max(1, min(6, left)))
-        return one_screen(lines)
+        return library_text(self.variables, self.names, self.degrees)
 
     def _repr_html_(self) -> str:
-        rows = [
-            [str(degree), str(len(names)), html.escape(cut(", ".join(names), 1000))]
-            for degree, names in self._by_degree().items()
-        ]
-        return html_table(["degree", "terms", ""], rows)
+        return library_html(self.names, self.degrees)
 
     def index(self, name: str) -> int:
         """Position of a term; factors may come in any order. Raises ValueError if absent."""
@@ -118,8 +108,11 @@ class Library:
         return tuple(term.unit(units) for term in self.terms)
 
     def take(self, rows: np.ndarray) -> Library:
-        """Some of the terms, by position or by mask."""
-        return replace(self, exponents=self.exponents[rows])
+        """Some of the terms, by position or by mask, and the functions that they need."""
+        n, exponents = len(self.variables), self.exponents[rows]
+        used = np.flatnonzero(exponents[:, n:].any(axis=0))
+        kept, functions = [*range(n), *(n + used)], [self.functions[k] for k in used.tolist()]
+        return Library(self.variables, exponents[:, kept], functions)
 
     def over(self, variables: Sequence[str]) -> Library:
         """The same terms over other variables, in their order, among them all that are used."""
@@ -162,7 +155,8 @@ class Library:
             return columns
         xp = array_namespace(columns)
         of = [xp.take(columns, xp.asarray([k]), axis=axis) for k in self._arguments]
-        values = [f.value(x) for f, x in zip(self.functions, of, strict=True)]
+        with np.errstate(all="ignore"):  # callers look for what is not finite outside a domain
+            values = [f.value(x) for f, x in zip(self.functions, of, strict=True)]
         return xp.concat([columns, *values], axis=axis)
 
     def at_points(
@@ -180,11 +174,12 @@ class Library:
         functions = [
             (n + 1 + k, f, places[v])
             for k, (f, v) in enumerate(zip(self.functions, self._arguments, strict=True))
+            if n + 1 + k in table
         ]
 
         def terms() -> np.ndarray:
             for place, function, argument in functions:
-                columns[place : place + 1] = function.value(columns[argument : argument + 1])
+                columns[place] = function.at(columns[argument])
             return columns[table].prod(axis=1)
 
         return columns[:n], terms
@@ -219,12 +214,6 @@ class Library:
                     column[products._places[term]] = weight
         return products, shares
 
-    def _by_degree(self) -> dict[int, list[str]]:
-        found: dict[int, list[str]] = {degree: [] for degree in sorted(set(self.degrees.tolist()))}
-        for name, degree in zip(self.names, self.degrees.tolist(), strict=True):
-            found[degree].append(name)
-        return found
-
     @cached_property
     def _named(self) -> dict[str, int]:
         return {name: k for k, name in enumerate(self.names)}
@@ -256,12 +245,12 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
     """A library of these terms, each once, in this order."""
     distinct = list(dict.fromkeys(terms))
     used = (factor for term in distinct for factor, _ in term.factors)
-    factors = list(dict.fromkeys([*map(Variable, variables), *used]))
+    factors: list[Factor] = list(dict.fromkeys([*map(Variable, variables), *used]))
     exponents = np.zeros((len(distinct), len(factors)), dtype=np.int64)
     for row, term in zip(exponents, distinct, strict=True):
         for factor, power in term.factors:
             row[factors.index(factor)] = power
-    functions = factors[len(variables) :]
+    functions = [factor for factor in factors if isinstance(factor, Function)]
     return Library(variables, exponents, functions)
 
 
@@ -278,18 +267,34 @@ def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
     return library_of(variables, terms)
 
 
-def polynomial(variables: Sequence[str], *, degree: int, products: Sequence[str] = ()) -> Library:
+def polynomial(
+    variables: Sequence[str],
+    *,
+    degree: int,
+    products: Sequence[str] = (),
+    functions: Sequence[str] = (),
+    function_degree: int = 1,
+) -> Library:
     """All products of `variables` up to `degree`, the constant included, then named products.
 
-    Ordered by degree, then by the order of the variables: 1, x, y, x^2, x*y, y^2, ...
-    Raises ValueError for a negative degree or an unknown variable in a product.
+    functions: by name, `sin`, of every variable, or written out, `sin(2*x)`, `1/(0.5+x)`, of that
+    one. function_degree: the most factors of a term with a function: 1 takes functions alone, 2
+    their products with a variable or with each other, too.
+    Ordered by degree, then by the order of the variables, functions last: 1, x, y, sin(x), x^2, ...
+    Raises ValueError for a wrong degree, or a variable or a function that is unknown.
     """
     if not isinstance(degree, int) or degree < 0:
         raise ValueError(f"degree must be a whole number, zero or more: {degree!r} came")
+    if not isinstance(function_degree, int) or function_degree < 1:
+        raise ValueError(f"function_degree must be one or more: {function_degree!r} came")
+    if function_degree > 1 and not functions:
+        raise ValueError(f"function_degree={function_degree} needs functions, such as ['sin']")
+    n, factors = len(variables), functions_named(functions, variables)
     rows = [
-        np.bincount(combination, minlength=len(variables))
-        for n in range(degree + 1)
-        for combination in map(list, combinations_with_replacement(range(len(variables)), n))
+        np.bincount(combination, minlength=n + len(factors))
+        for k in range(max(degree, function_degree if factors else 0) + 1)
+        for combination in map(list, combinations_with_replacement(range(n + len(factors)), k))
+        if k <= (function_degree if combination and combination[-1] >= n else degree)
     ]
-    full = Library(variables, np.array(rows, dtype=np.int64))
+    full = Library(variables, np.array(rows, dtype=np.int64), factors)
     return full + named_terms(variables, products) if products else full

@@ -3,24 +3,125 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 
 # The grammar of terms, for expressions without groups of their own.
 VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*)"  # or the average of a product, in < >
 
-_FACTOR = rf"{VARIABLE}(?:\^\d+)?"
+NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
-PRODUCT = rf"{_FACTOR}(?:\s*\*\s*{_FACTOR})*"
+# x, 2*x, -x, 0.5 + x, 1 - 2*x, and x + 0.5
+ARGUMENT = (
+    rf"(?:-?\s*{NUMBER}\s*(?=[+-]))?\s*[+-]?\s*(?:{NUMBER}\s*\*\s*)?{VARIABLE}"
+    rf"(?:\s*[+-]\s*{NUMBER})?"
+)
+
+_POWER = r"(?:\^\d+)?"
+
+_FACTOR = rf"(?:[^\W\d]\w*\(\s*{ARGUMENT}\s*\)|{VARIABLE}){_POWER}"
+
+_DIVISOR = rf"(?:\(\s*{ARGUMENT}\s*\)|{VARIABLE}){_POWER}"
+
+PRODUCT = rf"(?:1\s*/\s*{_DIVISOR}|{_FACTOR})(?:\s*\*\s*{_FACTOR}|\s*/\s*{_DIVISOR})*"
+
+_PLAIN = rf"{VARIABLE}{_POWER}"
+
+_PLAIN_PRODUCT = re.compile(rf"\s*{_PLAIN}(?:\s*\*\s*{_PLAIN})*\s*")
 
 _TERM = re.compile(rf"\s*{PRODUCT}\s*")
 
 _PARTS = re.compile(rf"({VARIABLE})(?:\^(\d+))?")
 
+_FACTORS = re.compile(
+    rf"(?P<over>/)?\s*(?:(?P<function>[^\W\d]\w*)?\(\s*(?P<argument>{ARGUMENT})\s*\)"
+    rf"|(?P<variable>{VARIABLE}))(?:\^(?P<power>\d+))?"
+)
 
-def split_factors(name: str) -> list[tuple[str, int]]:
-    """Variables and powers of a term: `n_i^2*<n_n*R_ion>` -> (n_i, 2), (<n_n*R_ion>, 1)."""
+_ARGUMENT = re.compile(
+    rf"(?P<shift>-?\s*{NUMBER}(?=\s*[+-]))?\s*(?P<sign>[+-]?)\s*(?:(?P<scale>{NUMBER})\s*\*\s*)?"
+    rf"(?P<variable>{VARIABLE})\s*(?P<behind>[+-]\s*{NUMBER})?"
+)
+
+RECIPROCAL = "1/"  # the function of what stands below a fraction line
+
+
+@dataclass(frozen=True)
+class Part:
+    """One factor as it is written: function(shift + scale * variable)^power.
+
+    function: empty for the variable itself, `RECIPROCAL` for what is divided by.
+    """
+
+    function: str
+    variable: str
+    scale: float = 1.0
+    shift: float = 0.0
+    power: int = 1
+
+    @property
+    def argument(self) -> str:
+        """`x`, `2*x`, `0.5+x`, `1-2*x`: numbers so that they are read back exactly."""
+        return self.argument_of(self.variable, times="*")
+
+    def argument_of(self, variable: str, *, times: str) -> str:
+        """The same with the variable, and what multiplies it, written in another way."""
+        size = abs(self.scale)
+        product = variable if size == 1.0 else f"{number_text(size)}{times}{variable}"
+        sign = "-" if self.scale < 0.0 else "+" if self.shift else ""
+        return f"{number_text(self.shift) if self.shift else ''}{sign}{product}"
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether the argument is the variable itself."""
+        return self.scale == 1.0 and self.shift == 0.0
+
+    @property
+    def text(self) -> str:
+        """Without its power: `x`, `sin(2*x)`, `1/x`, `1/(0.5+x)`."""
+        if self.function != RECIPROCAL:
+            return f"{self.function}({self.argument})" if self.function else self.variable
+        return f"1/{self.argument}" if self.is_bare else f"1/({self.argument})"
+
+
+def number_text(value: float) -> str:
+    """The shortest text that is read back as the same number: `2`, `0.5`, `1e+18`."""
+    return repr(value).removesuffix(".0")
+
+
+def split_term(name: str) -> list[Part]:
+    """Factors of a term as they are written: `x^2*sin(2*y)/(0.5+z)`; of `1`, none.
+
+    Raises ValueError for what is no product of variables and functions of one variable.
+    """
+    if name.strip() == "1":
+        return []
     if not _TERM.fullmatch(name):
         raise ValueError(
-            f"a term is variables joined by *, with whole powers: {name!r} came; write it like "
+            f"a term is variables joined by *, with whole powers, and functions of one variable: "
+            f"{name!r} came; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
+        )
+    parts = []
+    for found in _FACTORS.finditer(name):
+        function = RECIPROCAL if found["over"] else found["function"] or ""
+        variable, scale, shift = _split_argument(found["argument"] or found["variable"])
+        parts.append(Part(function, variable, scale, shift, int(found["power"] or 1)))
+    return parts
+
+
+def _split_argument(text: str) -> tuple[str, float, float]:
+    """Variable, what multiplies it, and what is added."""
+    found = _ARGUMENT.fullmatch(text.strip())
+    assert found is not None
+    scale = float(found["scale"] or 1.0) * (-1.0 if found["sign"] == "-" else 1.0)
+    added = (found["shift"] or "0", found["behind"] or "0")
+    return found["variable"], scale, sum(float(part.replace(" ", "")) for part in added)
+
+
+def split_factors(name: str) -> list[tuple[str, int]]:
+    """Variables and powers of a product: `n_i^2*<n_n*R_ion>` -> (n_i, 2), (<n_n*R_ion>, 1)."""
+    if not _PLAIN_PRODUCT.fullmatch(name):
+        raise ValueError(
+            f"a product is variables joined by *, with whole powers: {name!r} came; write it like "
             "'n_i^2*n_n'"
         )
     return [(variable, int(power or 1)) for variable, power in _PARTS.findall(name)]

@@ -4,39 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
-from ep2sindy.library.names import split_factors
+from ep2sindy.library.functions import Function, function_names, function_of
+from ep2sindy.library.names import RECIPROCAL, Part, split_term
 from ep2sindy.library.units import unit_product
-
-
-@runtime_checkable
-class Factor(Protocol):
-    """What terms multiply: a variable, or a function of one. Equal by value, and hashable."""
-
-    @property
-    def name(self) -> str:
-        """As the names of terms write it."""
-        ...
-
-    @property
-    def variable(self) -> str: ...
-
-    def value(self, x: Any) -> Any:
-        """At any values of the variable, in a NumPy array or a torch tensor."""
-        ...
-
-    def derivative(self) -> tuple[float, Factor | None]:
-        """By the variable: a number times a factor, or times one where it is None."""
-        ...
-
-    def scaled(self, scale: float) -> tuple[float, Factor]:
-        """The factor of `scale` times the variable: a number times a factor of the variable."""
-        ...
-
-    def unit(self, unit: str) -> str:
-        """From the unit of the variable."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -62,6 +34,9 @@ class Variable:
         return unit
 
 
+Factor = Variable | Function
+
+
 @dataclass(frozen=True)
 class Term:
     """A product of powers of factors; of none, the constant.
@@ -73,9 +48,10 @@ class Term:
 
     @property
     def name(self) -> str:
-        """`1`, `n_i`, `n_i*n_n`, `n_i^2`."""
-        parts = (f.name if power == 1 else f"{f.name}^{power}" for f, power in self.factors)
-        return "*".join(parts) or "1"
+        """`1`, `n_i`, `n_i*n_n`, `n_i^2`, `x*sin(y)/z`."""
+        parts = [f.name if power == 1 else f"{f.name}^{power}" for f, power in self.factors]
+        over = "*".join(part for part in parts if not part.startswith(RECIPROCAL)) or "1"
+        return over + "".join(part[1:] for part in parts if part.startswith(RECIPROCAL))
 
     def derivative(self, variable: str) -> dict[Term, float]:
         """By one variable: the terms it is a sum of, and what each is multiplied by."""
@@ -108,6 +84,14 @@ def product(powers: Mapping[Factor, int], variables: Sequence[str]) -> Term:
 
 def read_term(name: str, variables: Sequence[str]) -> Term:
     """Read a term name such as `n_i^2*n_n`; factors may come in any order."""
+    return product(read_factors(name, variables), variables)
+
+
+def read_factors(name: str, variables: Sequence[str]) -> dict[Factor, int]:
+    """The factors of a term name, and their powers.
+
+    Raises ValueError for a name that is no term, an unknown variable or an unknown function.
+    """
     powers: dict[Factor, int] = {}
     for factor, power in _factors(name):
         if factor.variable not in variables:
@@ -116,7 +100,29 @@ def read_term(name: str, variables: Sequence[str]) -> Term:
                 f"{list(variables)}"
             )
         powers[factor] = powers.get(factor, 0) + power
-    return product(powers, variables)
+    return powers
+
+
+def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Function]:
+    """What a list of functions means: each of every variable, or of the one that it names.
+
+    Raises ValueError for what is no function.
+    """
+    if isinstance(names, str):
+        raise ValueError(f"functions must be a list: {names!r} came; write [{names!r}]")
+    found: list[Function] = []
+    for name in names:
+        texts = [f"{name}({v})" for v in variables] if name in function_names() else [name]
+        for text in texts:
+            if [(bool(p.function), p.power) for p in split_term(text)] != [(True, 1)]:
+                raise ValueError(
+                    f"functions must be some of {function_names()}, for every variable, or one "
+                    f"written out, such as 'sin(2*{variables[0]})': {name!r} came; products go "
+                    "into products, or come with function_degree=2; a function of your own is "
+                    "registered first, by ep.register_function"
+                )
+            found += [f for f in read_factors(text, variables) if isinstance(f, Function)]
+    return list(dict.fromkeys(found))
 
 
 def variables_of(name: str) -> list[str]:
@@ -125,6 +131,9 @@ def variables_of(name: str) -> list[str]:
 
 
 def _factors(name: str) -> list[tuple[Factor, int]]:
-    if name.strip() == "1":
-        return []
-    return [(Variable(text), power) for text, power in split_factors(name)]
+    return [(factor_of(part), part.power) for part in split_term(name)]
+
+
+def factor_of(part: Part) -> Factor:
+    """A variable, or a function of one, as it is written."""
+    return function_of(part) if part.function else Variable(part.variable)

@@ -41,8 +41,8 @@ def _powers(unit: str) -> dict[str, float]:
     return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}  # type: ignore[arg-type]
 
 
-def unit_product(factors: Iterable[tuple[str, int]]) -> str:
-    """Multiply units raised to integer powers: [("m^-3", 2), ("m^3/s", 1)] -> "m^-3 s^-1"."""
+def unit_product(factors: Iterable[tuple[str, int | float]]) -> str:
+    """Multiply units raised to powers: [("m^-3", 2), ("m^3/s", 1)] -> "m^-3 s^-1"."""
     total: dict[str, float] = {}
     for unit, power in factors:
         for symbol, exponent in _powers(unit).items():

@@ -25,7 +25,6 @@ from ep2sindy.signals.attractor import (
 from ep2sindy.signals.spectrum import dominant_frequency
 
 LONG = 8.0  # periods of a record whose first half may be left out as a transient
-
 DEAD = 0.1  # of the data's spread: a state that varies less in the second half has died out
 
 
@@ -36,6 +35,7 @@ class Verdict(StrEnum):
     SLIPS = "slips"
     WRONG_CYCLE = "wrong cycle"
     DIES_OUT = "dies out"
+    LEAVES_DOMAIN = "leaves the domain"
     DIVERGES = "diverges"
 
 
@@ -67,11 +67,10 @@ class FreeRun:
     """A model run from one sample over a record, driven by its inputs if it has any.
 
     Compared are the second halves, where transients are over; all of a record that has no period,
-    or less than eight.
-    f_error: relative, of the frequency. amplitude_ratio, waveform_error (in standard deviations),
-    distribution (the same): by state. NaN where they are not known: all of a run that diverged,
-    frequency and waveform where the record or the run has no period. periods: until the model's
-    phase has slipped from the data's by a quarter, or those of the record. excursion: largest
+    or less than eight. f_error: relative, of the frequency. amplitude_ratio, waveform_error (in
+    standard deviations), distribution (the same): by state. NaN where they are not known: all of a
+    run that diverged, frequency and waveform where the record or the run has no period. periods:
+    until the model's phase has slipped by a quarter, or those of the record. excursion: largest
     distance from the data's mean, in standard deviations. frequency_Hz: by state; nrmse: root mean
     square error over all samples in standard deviations. NaN where it diverged, or died out.
     """
@@ -92,8 +91,9 @@ class FreeRun:
     @property
     def text(self) -> str:
         """The verdict, and how long after its start it diverged."""
+        of = f" of {self.rollout.outside}" if self.rollout.outside else ""
         lasted = self.rollout.lasted_text if self.rollout.diverged else ""
-        return f"{self.verdict} after {lasted}" if lasted else str(self.verdict)
+        return f"{self.verdict}{of} after {lasted}" if lasted else str(self.verdict)
 
 
 def free_run(
@@ -127,7 +127,7 @@ def free_run(
     return FreeRun(
         model=model,
         rollout=rollout,
-        verdict=ours.verdict,
+        verdict=Verdict.LEAVES_DOMAIN if rollout.outside else ours.verdict,
         f_error=ours.f_error,
         spectrum=likeness.spectrum,
         periods=_periods_kept(record, rollout.states),

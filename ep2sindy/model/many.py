@@ -103,7 +103,7 @@ class Ensemble:
     def _used(self) -> tuple[Library, np.ndarray]:
         """The terms that any model uses, and their coefficients."""
         used = np.abs(self.coef).max(axis=(1, 2)) > 0.0
-        used[0] = True  # a library needs a term
+        used[0] |= not used.any()  # a library needs a term
         return self.library.take(used), self.coef[used]
 
     def errors(

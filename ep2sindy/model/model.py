@@ -22,6 +22,7 @@ from ep2sindy.machine.files import write_text
 from ep2sindy.machine.screen import N_LINES
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.inputs import sampled
+from ep2sindy.model.rates import rates
 from ep2sindy.model.rollout import Rollout, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model
@@ -106,9 +107,12 @@ class SparseModel:
         states: Float[np.ndarray, "... n_states"],
         inputs: Float[np.ndarray, "... n_inputs"],
     ) -> Float[np.ndarray, "... n_states"]:
-        """Right-hand side at any number of samples; inputs in the order of `inputs`."""
+        """Right-hand side at any number of samples; inputs in the order of `inputs`.
+
+        NaN outside the domain of a function of the model.
+        """
         values = np.concatenate([states, inputs], axis=-1)
-        return self.library.evaluate(values[..., self._gather]) @ self.coef
+        return rates(self.library, self.coef, values[..., self._gather])
 
     def rollout(
         self,
@@ -195,7 +199,8 @@ class SparseModel:
         The derivative and the samples at which the right-hand side is taken come from `smoother`,
         by default SavitzkyGolay(), as in `Differential`; with x_dot, (samples, n_states) in SI
         and in the order of the model's states, that is the truth, and samples are taken raw.
-        Raises ValueError for a missing variable, a wrong shape or a derivative that is constant.
+        Raises ValueError for a missing variable, a wrong shape, a derivative that is constant, or
+        a sample outside the domain of a function of the model.
         """
         return derivative_r2(
             self, trajectory_of(run), x_dot=x_dot, smoother=smoother or SavitzkyGolay()

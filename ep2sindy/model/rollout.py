@@ -14,7 +14,9 @@ from scipy.integrate import solve_ivp
 from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.model.edges import Border, Edge, edges_of
 from ep2sindy.model.inputs import Drive, driven, spline
+from ep2sindy.model.rates import used_terms
 
 # Evaluations of the right-hand side that a run may take: a hundred times what an oscillation
 # takes that its samples resolve. A model that blows up in steps ever smaller stops there.
@@ -47,6 +49,7 @@ class Rollout:
 
     t: (samples,) in s, states: (samples, n_states), inputs: (samples, n_inputs), all cut where
     a diverged run stopped. units: by name, of states and inputs. clock: how people read t.
+    outside: the function of the model whose domain the run has left; it counts as diverged.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -57,6 +60,7 @@ class Rollout:
     inputs: Float[np.ndarray, "samples n_inputs"]
     input_names: tuple[str, ...]
     units: Mapping[str, str]
+    outside: str = ""
     clock: Clock = SECONDS
 
     @property
@@ -133,10 +137,11 @@ def simulate(
         )
     check_time(times)
     drive, samples = driven(model.inputs, inputs, times)
-    values, terms = model.library.at_points([*model.states, *model.inputs])
+    library, coef = used_terms(model.library, model.coef)
+    values, terms = library.at_points([*model.states, *model.inputs])
     values[:] = np.append(start, samples[0])
     # What starts at zero is as large as its first rate makes it; what stays there, one.
-    reach = np.abs(start) + (start == 0.0) * np.abs(terms() @ model.coef) * (times[-1] - times[0])
+    reach = np.abs(start) + (start == 0.0) * np.abs(terms() @ coef) * (times[-1] - times[0])
     return _integrated(
         model,
         times,
@@ -163,7 +168,11 @@ def _integrated(
     rtol: float,
 ) -> Rollout:
     """From x0 over t, in units of `scale`, until a state exceeds `blow_up` of them."""
-    rhs = _Counted(_scaled_rhs(model, drive, scale), CALLS + CALLS_PER_SAMPLE * len(t))
+    border = _border(model, np.append(x0, samples[0]), drive, scale)
+    if edge := border.beyond(t[0], x0 / scale):
+        message = f"the start, at t = {t[0]:.6g} s, is outside {edge.text}"
+        return _ended(model, t[:1], x0[None], samples, message, edge.function.name)
+    rhs = _Counted(_scaled_rhs(model, drive, scale), CALLS + CALLS_PER_SAMPLE * len(t), border)
 
     def ends(t: float, y: np.ndarray) -> float:
         return min(blow_up - float(np.abs(y).max()), rhs.left_s(t))
@@ -177,31 +186,74 @@ def _integrated(
             x0 / scale,
             method="DOP853",
             t_eval=t,
-            events=ends,
+            events=[ends, border] if border.edges else [ends],
             rtol=rtol,
             atol=rtol,
         )
-    return Rollout(
-        t=solution.t,
-        states=solution.y.T * scale,
+    message = _ending_text(solution, blow_up, bound, exhausted=rhs.given_up_s < np.inf)
+    if edge := _left(solution, rhs, border):
+        message = f"the run left {edge.text}, at t = {solution.t[-1]:.6g} s"
+    return _ended(
+        model,
+        solution.t,
+        solution.y.T * scale,
+        samples,
+        message,
+        edge.function.name if edge else "",
         diverged=solution.status != 0,
-        message=_ending_text(solution, blow_up, bound, exhausted=rhs.given_up_s < np.inf),
-        state_names=tuple(model.states),
-        inputs=samples[: len(solution.t)],
-        input_names=tuple(model.inputs),
-        units=model.units,
     )
 
 
-class _Counted:
-    """A right-hand side that may be evaluated so many times."""
+def _ended(
+    model: Equations,
+    t: np.ndarray,
+    states: np.ndarray,
+    samples: np.ndarray,
+    message: str,
+    outside: str = "",
+    *,
+    diverged: bool = True,
+) -> Rollout:
+    return Rollout(
+        t=t,
+        states=states,
+        diverged=diverged,
+        message=message,
+        state_names=tuple(model.states),
+        inputs=samples[: len(t)],
+        input_names=tuple(model.inputs),
+        units=model.units,
+        outside=outside,
+    )
 
-    def __init__(self, rhs: Callable[[float, np.ndarray], np.ndarray], budget: int) -> None:
-        self.rhs, self.budget = rhs, budget
+
+def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.ndarray) -> Border:
+    """Of the functions that the model uses."""
+
+    def values(t: float, y: np.ndarray) -> np.ndarray:
+        return y * scale if drive is None else np.append(y * scale, drive(t))
+
+    library, _ = used_terms(model.library, model.coef)
+    return Border(edges_of(library.functions, [*model.states, *model.inputs], start), values)
+
+
+class _Counted:
+    """A right-hand side that may be evaluated so many times, and that knows its border."""
+
+    def __init__(
+        self, rhs: Callable[[float, np.ndarray], np.ndarray], budget: int, border: Border
+    ) -> None:
+        self.rhs, self.budget, self.border = rhs, budget, border
         self.calls, self.given_up_s = 0, float("inf")
+        self.beyond: Edge | None = None
+        self.beyond_s = float("inf")
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         self.calls += 1
+        if edge := self.border.beyond(t, y):
+            self.beyond, self.beyond_s = edge, t
+        elif t > self.beyond_s and np.isfinite(y).all():  # a step too long has been mended
+            self.beyond = None
         return self.rhs(t, y)
 
     def left_s(self, t: float) -> float:
@@ -227,6 +279,13 @@ def _scaled_rhs(
         return terms() @ coef
 
     return rhs
+
+
+def _left(solution: Any, rhs: _Counted, border: Border) -> Edge | None:
+    """The edge that a run ended at, if it did: crossed, or too steep for a solver to cross."""
+    if border.edges and solution.status == 1 and solution.t_events[1].size:
+        return border.nearest(solution.t_events[1][0], solution.y_events[1][0])
+    return rhs.beyond if solution.status == -1 else None
 
 
 def _ending_text(solution: object, blow_up: float, bound: str, *, exhausted: bool) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.domain import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.model.rates import rates, used_terms
 from ep2sindy.model.rollout import Equations
 from ep2sindy.signals.smoothers import Smoother
 
@@ -31,9 +33,13 @@ def derivative_r2(
     smoother: Smoother,
 ) -> float:
     """Mean over the states of the R2 of their derivatives: see `SparseModel.score`."""
+    library, _ = used_terms(model.library, model.coef)
+    check_domain([run], library)
     values, data = run.columns(model.library.variables), run.columns(model.states)
     if x_dot is None:
-        values, truth = smoother.smooth(run.t, values), smoother.derivative(run.t, data)
+        smooth = smoother.smooth(run.t, values)
+        values = kept_inside(library, smooth, values)
+        truth = smoother.derivative(run.t, data)
     else:
         truth = np.asarray(x_dot, dtype=np.float64)
         if truth.shape != data.shape:
@@ -41,6 +47,6 @@ def derivative_r2(
                 f"x_dot must have shape {data.shape}, a row per sample and a column for each of "
                 f"{list(model.states)}: {truth.shape} came"
             )
-    found = model.library.evaluate(values) @ model.coef
+    found = rates(model.library, model.coef, values)
     pairs = zip(truth.T, found.T, strict=True)
     return float(np.mean([r2(truth=y, prediction=p[None])[0] for y, p in pairs]))

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 
 FORMAT = "ep2sindy.SparseModel/1"
@@ -41,6 +42,7 @@ def model_text(
 def read_model(text: str, make: Callable[..., Model]) -> Model:
     """Inverse of `model_text`: make(library, equations, units=, provenance=, covariance=).
 
+    Terms are read by name: no code runs, and a user's own function must be registered before.
     Raises ValueError for anything else, also where it is `make` that refuses it.
     """
     try:
@@ -55,6 +57,8 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
             provenance=content["provenance"],
             covariance=None if covariance is None else _square(covariance),
         )
+    except UnknownFunctionError:
+        raise  # the file is sound: a function must be registered before it is read
     except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
         raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
 

@@ -145,5 +145,9 @@ def _combinations(
     for rank in np.flatnonzero(~independent):
         basis = np.sort(columns[:rank][independent[:rank]])
         weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
+        if (np.abs(weights) > 1e-6).sum() > MOST_PARTS:
+            # A Gram matrix has lost half the digits: by rows, many parts may turn out few.
+            rows = problem.train_theta
+            weights = np.linalg.lstsq(rows[:, basis], rows[:, columns[rank]], rcond=None)[0]
         found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ep2sindy.data.domain import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import Regression
@@ -40,6 +41,7 @@ class Differential:
         the library that a trajectory lacks.
         """
         check_agreement(trajectories, library.variables)
+        check_domain(trajectories, library)
         parts = [self._rows(run, library) for run in trajectories]
         test = [self.split.held_out(run.n_samples, rng) for run in trajectories]
         n_rows = sum(run.n_samples for run in trajectories)
@@ -57,6 +59,6 @@ class Differential:
     def _rows(self, run: Trajectory, library: Library) -> tuple[np.ndarray, np.ndarray]:
         values = run.columns(library.variables)
         if self.smooth_library:
-            values = self.smoother.smooth(run.t, values)
+            values = kept_inside(library, self.smoother.smooth(run.t, values), values)
         with np.errstate(over="ignore"):  # Regression names a term that is not finite
             return library.evaluate(values), self.smoother.derivative(run.t, run.states)

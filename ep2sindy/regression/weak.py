@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import block_diag, csr_array
 
+from ep2sindy.data.domain import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.exact_inputs import exact_columns
@@ -70,6 +71,7 @@ class Weak:
         Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
         """
         check_agreement(trajectories, library.variables)
+        check_domain(trajectories, library)
         pieces = [piece for run in trajectories for piece in _pieces(run)]
         runs = [self._sampled(piece, library, rng) for piece in pieces]
         states = range(len(runs[0].windows))
@@ -81,7 +83,7 @@ class Weak:
         n_segments = int(np.clip(run.n_samples // (2 * longest), 1, MAX_SEGMENTS))
         segment = np.arange(run.n_samples) * n_segments // run.n_samples
         names = tuple(dict.fromkeys([*library.variables, *run.state_names]))
-        at_hand, estimate = self._smoothed(run, names)
+        at_hand, estimate = self._smoothed(run, names, library)
         with np.errstate(over="ignore"):  # Regression names a term that is not finite
             terms = library.evaluate(at_hand[:, : len(library.variables)])
         return _Sampled(
@@ -95,7 +97,7 @@ class Weak:
         )
 
     def _smoothed(
-        self, run: Trajectory, names: Sequence[str]
+        self, run: Trajectory, names: Sequence[str], library: Library
     ) -> tuple[np.ndarray, KalmanEstimate | None]:
         """Samples for the library, and what the Kalman smoother says of them, where asked."""
         t, values = run.t, run.columns(names)
@@ -108,14 +110,15 @@ class Weak:
         if estimate is not None:
             estimate = replace(
                 estimate,
-                smoothed=np.where(exact, values, estimate.smoothed),
+                smoothed=kept_inside(library, np.where(exact, values, estimate.smoothed), values),
                 noise_std=np.where(exact, 0.0, estimate.noise_std),
             )
         if not self.smooth_library:
             return values, estimate
         if estimate is not None and kalman is self.smoother:
             return estimate.smoothed, estimate
-        return np.where(exact, values, self.smoother.smooth(t, values)), estimate
+        smooth = np.where(exact, values, self.smoother.smooth(t, values))
+        return kept_inside(library, smooth, values), estimate
 
     def _problem(
         self,

@@ -10,6 +10,7 @@ from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csr_array
 
+from ep2sindy.data.domain import kept_inside
 from ep2sindy.data.scales import column_norms
 from ep2sindy.regression.rows import NoisyRows, Regression
 
@@ -63,7 +64,7 @@ def whitened_rows(
     Britt & Luecke 1973, Technometrics 15, 233, for the steps.
     """
     assert problem.noisy is not None
-    rows = _Linearised.at(problem, problem.noisy.smoothed, coef)
+    rows = _Linearised.at(problem, problem.noisy.smoothed, coef, noisy=False)
     least = rows.misfit
     for _ in range(n_steps):
         following = _following(problem, rows, terms, limit=least + RISE * len(rows.target))
@@ -85,7 +86,7 @@ def _following(
     limit: the misfit that a whole step may reach.
     """
     coef = rows.fitted(terms)
-    x = rows.corrected(coef)
+    x = kept_inside(problem.library, rows.corrected(coef), rows.x)
     whole = _Linearised.at(problem, x, coef)
     if whole.misfit <= limit:
         return whole
@@ -122,7 +123,10 @@ class _Linearised:
         problem: Regression,
         x: Float[np.ndarray, "samples variables"],
         coef: Float[np.ndarray, " terms"],
+        *,
+        noisy: bool = True,
     ) -> _Linearised:
+        """noisy: the samples hold what noise the rows cannot reveal, unlike smoothed ones."""
         rows, library = problem.noisy, problem.library
         assert rows is not None
         n_variables = len(library.variables)
@@ -130,6 +134,8 @@ class _Linearised:
         slopes = library.jacobian(known) / problem.theta_scale
         change = np.einsum("vst,sv->st", slopes, rows.values[:, :n_variables] - known)
         terms = library.evaluate(known) / problem.theta_scale
+        if noisy and library.functions:
+            terms = terms - _lift(problem, known) / problem.theta_scale
         slope = rows.slope / problem.target_scale[0]
         noise = []
         for v, std in enumerate(rows.noise_std.T):
@@ -177,6 +183,31 @@ class _Linearised:
         noise = np.stack([m.T @ weighted for m in self.noise], axis=1)
         limited = np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION)
         return self.source.values - limited * self.source.noise_std
+
+
+def _lift(
+    problem: Regression, x: Float[np.ndarray, "samples variables"]
+) -> Float[np.ndarray, "samples terms"]:
+    """What the noise left in samples adds to terms with functions on average, to second order.
+
+    sin(x + e) is on average sin(x) exp(-s^2/2), which weights do not see. Products of variables
+    are taken as they are. Left is what the rows do not reveal, of s^2 one part in every row.
+    """
+    rows, library = problem.noisy, problem.library
+    assert rows is not None
+    n = len(library.variables)
+    curved = np.flatnonzero(library.exponents[:, n:].any(axis=1))
+    some, lift = library.take(curved), np.zeros((len(x), len(library)))
+    left = max(1.0 - rows.mean.shape[0] / rows.values.size, 0.0)
+    here = some.evaluate(x)
+    for v in range(n):
+        step = np.zeros_like(x)
+        step[:, v] = np.sqrt(left) * rows.noise_std[:, v]
+        ahead, behind = (kept_inside(some, x + s * step, x) for s in (1.0, -1.0))
+        both = (ahead[:, v] != x[:, v]) & (behind[:, v] != x[:, v])
+        mean = 0.5 * (some.evaluate(ahead) + some.evaluate(behind))
+        lift[:, curved] += np.where(both[:, None], mean - here, 0.0)
+    return lift
 
 
 def _times(matrix: csr_array, columns: np.ndarray) -> csr_array:

@@ -14,6 +14,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.report.run import Run
 from ep2sindy.signals.attractor import find_cycle
+from ep2sindy.studies.functions import registered
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll, Share
 from ep2sindy.studies.libraries_view import Outcome
 from ep2sindy.studies.library_result import result_of
@@ -27,19 +28,29 @@ from ep2sindy.studies.term_roles import Compared
 class LibraryCase:
     """A polynomial library; variables_if_present are left out where the field lacks them.
 
-    n_norm: what a knee takes for this library, if not what the recipe says.
+    functions, function_degree: as `ep.polynomial` takes them; `my_module.tanh` is the function that
+    my_module registers by that name. n_norm: what a knee takes for this library, if not what the
+    recipe says.
     """
 
     variables: Sequence[str]
     degree: int
     variables_if_present: Sequence[str] = ()
     products: Sequence[str] = ()
+    functions: Sequence[str] = ()
+    function_degree: int = 1
     n_norm: str | None = None
 
     def library(self, data: xr.Dataset) -> Library:
         optional = [name for name in self.variables_if_present if name in data]
         names = [*self.variables, *optional]
-        return polynomial(names, degree=self.degree, products=list(self.products))
+        return polynomial(
+            names,
+            degree=self.degree,
+            products=list(self.products),
+            functions=registered(self.functions),
+            function_degree=self.function_degree,
+        )
 
     def recipe(self, recipe: Recipe) -> Recipe:
         """The recipe that all libraries share, with this one's norm where the rule has one."""

@@ -103,7 +103,7 @@ def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
 
 def cycle_of(run: FreeRun) -> LimitCycle | None:
     """The closed orbit that a free run ends on."""
-    if run.model.inputs or run.verdict in (Verdict.DIVERGES, Verdict.DIES_OUT):
+    if run.model.inputs or run.rollout.diverged or run.verdict is Verdict.DIES_OUT:
         return None
     frequency_Hz = np.nanmax(list(run.frequency_Hz.values()), initial=0.0)
     if not frequency_Hz > 0.0:

@@ -116,6 +116,12 @@ def lorenz(*, sigma: float = 10.0, rho: float = 28.0, beta: float = 8 / 3) -> Sy
     return _system("Lorenz", equations, 2, [-8.0, 8.0, 27.0], 10.0, 300.0)
 
 
+def pendulum(*, length: float = 1.0, gravity: float = 9.81) -> System:
+    """theta' = w, w' = -(gravity / length) sin(theta): in rad, let go at 2 rad, for 20 s."""
+    equations = {"theta": {"w": 1.0}, "w": {"sin(theta)": -gravity / length}}
+    return _system("pendulum", equations, 1, [2.0, 0.0], 20.0, 100.0, ["sin"])
+
+
 def _system(
     name: str,
     equations: Mapping[str, Mapping[str, float]],
@@ -123,8 +129,9 @@ def _system(
     initial: Sequence[float],
     duration_s: float,
     rate_Hz: float,
+    functions: Sequence[str] = (),
 ) -> System:
-    library = polynomial(list(equations), degree=degree)
+    library = polynomial(list(equations), degree=degree, functions=functions)
     coef = coef_matrix(library, list(equations.values()))
     model = SparseModel(library, list(equations), coef, provenance={"truth": name})
     return System(name, model, np.array(initial), duration_s, rate_Hz)

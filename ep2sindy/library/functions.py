@@ -1,0 +1,274 @@
+"""Functions of one variable, as factors of terms: those that are known by name, and a user's own.
+
+A function takes the number of its variable in SI: log(n_i) of n_i in m^-3 is log(n_i / 1 m^-3).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace, is_numpy_array
+from jaxtyping import Bool, Float
+
+from ep2sindy.library.names import RECIPROCAL, Part, number_text
+from ep2sindy.library.units import unit_product
+
+Values = Callable[[Any], Any]
+Interval = tuple[float, float]
+
+REAL_LINE: tuple[Interval, ...] = ((-np.inf, np.inf),)
+LARGEST_EXPONENT = 709.0  # of e, in float64
+
+
+class UnknownFunctionError(ValueError):
+    """A function that a term names, and that nobody has registered."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a name stands for: a function and its derivative, element by element.
+
+    domain: open intervals in which both are finite; a trajectory stays in one of them. degree: p
+    where f(s x) = s^p f(x) for positive s, None for others. own: a user's, of NumPy arrays alone.
+    """
+
+    name: str
+    value: Values = field(compare=False)
+    slope: Values = field(compare=False)
+    domain: tuple[Interval, ...] = REAL_LINE
+    degree: float | None = None
+    own: bool = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By name; a user's function brings its registration to another process."""
+        if not self.own:
+            return _built_in, (self.name,)
+        return _arrived, (self.name, self.value, self.slope, self.domain)
+
+
+@dataclass(frozen=True)
+class Function:
+    """A factor of terms: f(shift + scale * variable), or where it is a slope, f' of that."""
+
+    kind: Kind
+    variable: str
+    scale: float = 1.0
+    shift: float = 0.0
+    is_slope: bool = False
+
+    @property
+    def name(self) -> str:
+        """`sin(2*x)`, `1/(0.5+x)`, as it is read back; a slope, which no user names, has a '."""
+        text = Part(self.kind.name, self.variable, self.scale, self.shift).text
+        return f"{text}'" if self.is_slope else text
+
+    def value(self, x: Any) -> Any:
+        argument = x if self._plain else self.scale * x + self.shift
+        if self.kind.own and not is_numpy_array(argument):
+            return self._bridged(argument)
+        return (self.kind.slope if self.is_slope else self.kind.value)(argument)
+
+    def at(self, x: float) -> float:
+        """At one value of the variable; NaN or infinite outside the domain."""
+        with np.errstate(all="ignore"):
+            return float(self.value(np.array([x]))[0])
+
+    def derivative(self) -> tuple[float, Function]:
+        assert not self.is_slope, "second derivatives are never needed"
+        return self.scale, replace(self, is_slope=True)
+
+    def scaled(self, scale: float) -> tuple[float, Function]:
+        if self.kind.degree is None or not scale > 0.0:
+            return 1.0, replace(self, scale=self.scale * scale)
+        power = self.kind.degree - self.is_slope
+        return scale**power, replace(self, shift=self.shift / scale)
+
+    def unit(self, unit: str) -> str:
+        """That of a pure number where the function has no degree."""
+        return unit_product([(unit, self.kind.degree or 0)])
+
+    def interval(self, x: float) -> Interval | None:
+        """The part of the domain, in the argument, that a value of the variable is in."""
+        argument = self.scale * x + self.shift
+        return next(((low, high) for low, high in self.kind.domain if low < argument < high), None)
+
+    def misplaced(
+        self, x: Float[np.ndarray, " samples"], beside: Float[np.ndarray, " _"]
+    ) -> Bool[np.ndarray, " samples"]:
+        """Values of the variable that are not in one interval of the domain with others, or where
+        f or f' is not finite."""
+        here, there = (self.scale * values + self.shift for values in (x, beside))
+        wrong = np.ones(x.shape, dtype=np.bool_)
+        for low, high in self.kind.domain:
+            wrong &= ~((low < here) & (here < high) & (low < there) & (there < high))
+        slope = replace(self, is_slope=True)
+        with np.errstate(all="ignore"):
+            return wrong | ~np.isfinite(self.value(x)) | ~np.isfinite(slope.value(x))
+
+    @property
+    def has_poles(self) -> bool:
+        """Whether the domain is of several intervals."""
+        return len(self.kind.domain) > 1
+
+    @property
+    def need(self) -> str:
+        """What must hold, in words: `x > 0`."""
+        argument = Part("", self.variable, self.scale, self.shift).argument
+        if self.has_poles:
+            ends = ", ".join(number_text(high) for _, high in self.kind.domain[:-1])
+            return f"{argument} to stay on one side of {ends}"
+        ((low, high),) = self.kind.domain
+        above = f"{argument} > {number_text(low)}" if np.isfinite(low) else ""
+        below = f"{argument} < {number_text(high)}" if np.isfinite(high) else ""
+        return " and ".join(filter(None, [above, below])) or "finite values"
+
+    @property
+    def _plain(self) -> bool:
+        return self.scale == 1.0 and self.shift == 0.0
+
+    def _bridged(self, argument: Any) -> Any:
+        """A user's NumPy function of a torch tensor, which follows its gradient by the slope."""
+        at = argument.detach()
+        numbers = at.cpu().numpy()
+        found = self.kind.slope if self.is_slope else self.kind.value
+        value = argument.new_tensor(found(numbers))
+        if not argument.requires_grad:
+            return value
+        assert not self.is_slope, "second derivatives are never needed"
+        return value + argument.new_tensor(self.kind.slope(numbers)) * (argument - at)
+
+
+def _of(name: str) -> Values:
+    return lambda x: getattr(array_namespace(x), name)(x)
+
+
+def _negative_sine(x: Any) -> Any:
+    return -array_namespace(x).sin(x)
+
+
+def _half_root(x: Any) -> Any:
+    return 0.5 / array_namespace(x).sqrt(x)
+
+
+def _reciprocal(x: Any) -> Any:
+    return 1.0 / x
+
+
+def _negative_square(x: Any) -> Any:
+    return -1.0 / (x * x)
+
+
+_POSITIVE: tuple[Interval, ...] = ((0.0, np.inf),)
+_POLE: tuple[Interval, ...] = ((-np.inf, 0.0), (0.0, np.inf))
+_BUILT_IN = (
+    Kind("sin", _of("sin"), _of("cos")),
+    Kind("cos", _of("cos"), _negative_sine),
+    Kind("exp", _of("exp"), _of("exp"), ((-np.inf, LARGEST_EXPONENT),)),
+    Kind("log", _of("log"), _reciprocal, _POSITIVE),
+    Kind("sqrt", _of("sqrt"), _half_root, _POSITIVE, degree=0.5),
+    Kind("abs", _of("abs"), _of("sign"), degree=1.0),
+    Kind(RECIPROCAL, _reciprocal, _negative_square, _POLE, degree=-1.0),
+)
+_kinds = {kind.name: kind for kind in _BUILT_IN}  # register_function adds to it
+INVERSE = "inverse"  # what the reciprocal of every variable is called
+
+
+def function_names() -> list[str]:
+    """The functions that terms may name, in the order of their registration."""
+    return [INVERSE if name == RECIPROCAL else name for name in _kinds]
+
+
+def function_of(part: Part) -> Function:
+    """The factor that a part of a term's name stands for.
+
+    Raises UnknownFunctionError with the functions that there are, and ValueError for a factor of
+    zero.
+    """
+    name = RECIPROCAL if part.function == INVERSE else part.function
+    if name not in _kinds:
+        raise UnknownFunctionError(
+            f"unknown function {name!r} in {part.text!r}; there are {function_names()}; register "
+            f"your own before it is named: ep.register_function({name!r}, value, derivative)"
+        )
+    if not part.scale:
+        raise ValueError(f"a function must be of its variable: {part.text!r} multiplies it by 0")
+    return Function(_kinds[name], part.variable, part.scale, part.shift)
+
+
+def register_function(
+    name: str, value: Values, derivative: Values, *, domain: Interval = (-np.inf, np.inf)
+) -> None:
+    """Let terms name a function of your own, as in `tanh(x)` or `tanh(2*x)`.
+
+    value, derivative: take a NumPy array and return one of its shape, element by element; nothing
+    else is needed, also for PyTorch. domain: an open interval in which both are finite.
+    Models store the name alone, so register before you load one. Registered again, a name means
+    the new function from then on.
+    Raises ValueError for a name that is no plain word or that is built in, a domain that is no
+    interval, values of another shape or not finite, or a derivative that is not that of the value.
+    """
+    if not re.fullmatch(r"[^\W\d]\w*", name) or name == INVERSE:
+        raise ValueError(f"a function's name must be a plain word, such as 'tanh': {name!r} came")
+    if name in _kinds and not _kinds[name].own:
+        raise ValueError(f"{name!r} is built in: give your function another name")
+    low, high = map(float, domain)
+    if not low < high:
+        raise ValueError(f"a domain must be an interval (low, high): {domain} came")
+    _check_derivative(name, value, derivative, low, high)
+    _kinds[name] = Kind(name, value, derivative, ((low, high),), own=True)
+
+
+def _check_derivative(
+    name: str, value: Values, derivative: Values, low: float, high: float
+) -> None:
+    """Hold a derivative to central differences at a few points of the domain."""
+    points = _points(low, high)
+    step = 1e-5 * np.minimum(1.0, np.minimum(points - low, high - points))
+    try:
+        with np.errstate(all="ignore"):
+            slopes, values = (np.asarray(f(points), np.float64) for f in (derivative, value))
+            ahead, behind = (np.asarray(value(x)) for x in (points + step, points - step))
+    except (TypeError, AttributeError) as error:
+        raise ValueError(
+            f"value and derivative of {name!r} must take and return NumPy arrays: {error}; write "
+            "them with NumPy, np.tanh and not math.tanh"
+        ) from error
+    for what, found in (("value", values), ("derivative", slopes)):
+        if found.shape != points.shape or not np.isfinite(found).all():
+            raise ValueError(
+                f"{what} of {name!r} must give a finite number for each of {points.tolist()}: "
+                f"{found.tolist()} came; write it with NumPy, and give domain=(low, high) where "
+                "it ends"
+            )
+    differences = (ahead - behind) / (2.0 * step)
+    rounding = 1e-9 * np.abs(values) / step
+    wrong = np.abs(differences - slopes) > 1e-3 * np.abs(differences) + rounding + 1e-8
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise ValueError(
+            f"the derivative of {name!r} must be that of its value: at {points[k]:g} it gives "
+            f"{slopes[k]:.6g}, and differences of the value {differences[k]:.6g}"
+        )
+
+
+def _points(low: float, high: float) -> Float[np.ndarray, " points"]:
+    """Some places of an interval."""
+    if np.isfinite(low) and np.isfinite(high):
+        return low + (high - low) * np.array([0.21, 0.47, 0.83])
+    away = np.array([0.37, 1.13, 2.71])
+    if np.isfinite(low):
+        return low + away
+    return high - away if np.isfinite(high) else away - 1.5
+
+
+def _built_in(name: str) -> Kind:
+    return _kinds[name]
+
+
+def _arrived(name: str, value: Values, slope: Values, domain: tuple[Interval, ...]) -> Kind:
+    """A user's function that came from another process: registered here, unless it is already."""
+    return _kinds.setdefault(name, Kind(name, value, slope, domain, own=True))

@@ -1,0 +1,536 @@
+"""Functions as factors of terms: names, values, scaling, search, free runs, storage."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+import ep2sindy as ep
+from ep2sindy.data.domain import kept_inside
+from ep2sindy.library import functions as registry
+from ep2sindy.library.equations import (
+    equation_html,
+    equation_text,
+    latex_term_name,
+    sum_sympy,
+)
+from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.model.edges import edges_of
+from ep2sindy.refinement.refine import refine
+from ep2sindy.regression.ambiguity import ambiguities, usable_terms
+
+T = np.linspace(0.0, 5.0, 501)
+EVERY = ["sin(2*x)", "cos(x)", "exp(-0.5*x)", "log(1+x)", "sqrt(x)", "abs(v)", "1/x", "v/(0.5+x)^2"]
+
+
+@pytest.fixture
+def tanh() -> Iterator[str]:
+    ep.register_function("tanh", np.tanh, lambda x: 1.0 - np.tanh(x) ** 2)
+    yield "tanh"
+    del registry._kinds["tanh"]
+
+
+def model_of(
+    equations: dict[str, dict[str, float]], inputs: tuple[str, ...] = ()
+) -> ep.SparseModel:
+    names = list(dict.fromkeys(name for terms in equations.values() for name in terms))
+    library = named_terms([*equations, *inputs], names)
+    return ep.SparseModel(library, list(equations), ep.coef_matrix(library, [*equations.values()]))
+
+
+def points() -> np.ndarray:
+    rng = np.random.default_rng(4)
+    return np.stack([rng.uniform(0.3, 2.0, 40), rng.normal(size=40)], axis=1)
+
+
+def every() -> Library:
+    return named_terms(["x", "v"], EVERY)
+
+
+@pytest.mark.parametrize(
+    ("written", "name"),
+    [
+        ("v*sin( 2 * x )", "sin(2*x)*v"),
+        ("1/(x + 0.5)", "1/(0.5+x)"),
+        ("inverse(x)", "1/x"),
+        ("v / x^2", "v/x^2"),
+        ("log(1 - 2*x)", "log(1-2*x)"),
+        ("exp(-x)", "exp(-x)"),
+        ("sqrt(1e-18*x)*sin(x)^2", "sin(x)^2*sqrt(1e-18*x)"),
+        ("sin(<x*v>)*x", "x*sin(<x*v>)"),
+    ],
+)
+def test_names_are_read_in_any_way_and_written_in_one(written: str, name: str) -> None:
+    variables = ["x", "v", "<x*v>"]
+    library = named_terms(variables, [written])
+    assert library.names == (name,)
+    assert named_terms(variables, [name]).terms == library.terms
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("sine(x)", r"unknown function 'sine' in 'sine\(x\)'; there are \['sin', 'cos'.*register"),
+        ("sin(q)", r"unknown variable 'q' in term 'sin\(q\)'"),
+        ("sin(0*x)", r"must be of its variable: 'sin\(0\*x\)' multiplies it by 0"),
+        *((bad, "a term is variables joined by") for bad in ("sin(x*v)", "sin()", "1/sin(x)")),
+    ],
+)
+def test_bad_functions_are_refused_by_name(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        named_terms(["x", "v"], [name])
+
+
+def test_values_are_those_of_the_formula_in_numpy_and_torch() -> None:
+    x, v = points().T
+    expected = [np.sin(2 * x), np.cos(x), np.exp(-0.5 * x), np.log(1 + x), np.sqrt(x), np.abs(v)]
+    expected += [1 / x, v / (0.5 + x) ** 2]
+    np.testing.assert_allclose(every().evaluate(points()).T, expected, rtol=1e-14)
+    together = every().evaluate(torch.from_numpy(points())).numpy()
+    np.testing.assert_allclose(together.T, expected, rtol=1e-14)
+
+
+def test_derivatives_are_those_of_differences_and_of_autograd(tanh: str) -> None:
+    library = every() + named_terms(["x", "v"], ["x*tanh(2*x)*v"])
+    jacobian, h = library.jacobian(points()), 1e-6
+    for k, step in enumerate(h * np.eye(2)):
+        ahead, behind = (library.evaluate(points() + s * step) for s in (1, -1))
+        np.testing.assert_allclose(jacobian[k], (ahead - behind) / (2 * h), rtol=1e-7, atol=1e-8)
+    values = torch.from_numpy(points()).requires_grad_()
+    library.evaluate(values).sum().backward()
+    assert values.grad is not None
+    np.testing.assert_allclose(values.grad.numpy().T, jacobian.sum(axis=-1), rtol=1e-12)
+
+
+def test_terms_of_scaled_variables_give_back_the_values_and_slopes() -> None:
+    scale = np.array([3e17, 0.02])
+    library = named_terms(["x", "v"], [*EVERY, "sqrt(2e17+x)", "exp(-1e-18*x)", "log(x)*v"])
+    values = points() * scale
+    scaled, numbers = library.scaled(scale)
+    np.testing.assert_allclose(
+        scaled.evaluate(points()) * numbers, library.evaluate(values), rtol=1e-9
+    )
+    slopes = library.jacobian(values) * scale[:, None, None]
+    np.testing.assert_allclose(scaled.jacobian(points()) * numbers, slopes, rtol=1e-9)
+    assert numbers[EVERY.index("1/x")] == 1 / 3e17  # of order one where a power allows it
+    assert numbers[EVERY.index("abs(v)")] == 0.02
+
+
+def test_units_are_those_of_the_numbers_functions_take() -> None:
+    units = dict(zip(EVERY, every().units({"x": "m", "v": "m/s"}), strict=True))
+    assert units["sin(2*x)"] == units["log(1+x)"] == "1"
+    assert units["sqrt(x)"] == "m^0.5"
+    assert units["abs(v)"] == "m s^-1"
+    assert units["v/(0.5+x)^2"] == "m^-1 s^-1"
+
+
+def test_a_library_takes_functions_of_every_variable_or_of_one() -> None:
+    library = polynomial(["x", "v"], degree=1, functions=["sin", "1/(0.5+v)"])
+    assert library.names == ("1", "x", "v", "sin(x)", "sin(v)", "1/(0.5+v)")
+    products = polynomial(["x", "v"], degree=1, functions=["cos(x)"], function_degree=2)
+    assert products.names == ("1", "x", "v", "cos(x)", "x*cos(x)", "cos(x)*v", "cos(x)^2")
+    named = polynomial(["x", "v"], degree=1, products=["v*sin(x)"])
+    assert named.names[-1] == "sin(x)*v"
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"functions": ["sine"]}, r"functions must be some of \['sin', .*: 'sine' came"),
+        ({"functions": "sin"}, r"functions must be a list: 'sin' came; write \['sin'\]"),
+        ({"functions": ["x*sin(v)"]}, "go into products"),
+        ({"functions": ["sin(x)^2"]}, "come with function_degree=2"),
+        ({"function_degree": 2}, r"function_degree=2 needs functions, such as \['sin'\]"),
+        ({"functions": ["sin"], "function_degree": 0}, "must be one or more: 0 came"),
+    ],
+)
+def test_wrong_functions_of_a_library_are_refused(setting: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        polynomial(["x", "v"], degree=1, **setting)
+
+
+def test_polynomials_are_the_same_library_as_ever() -> None:
+    """No column, no call and no copy more than without functions."""
+    library = polynomial(["x", "v"], degree=3)
+    columns = np.ones((7, 3))
+    assert library.functions == ()
+    assert library.with_functions(columns, axis=1) is columns
+    assert kept_inside(library, columns, columns) is columns
+    assert library.exponents.shape == (10, 2)
+
+
+def test_a_share_of_the_terms_keeps_only_the_functions_it_needs() -> None:
+    some = every().take(np.array([1, 7]))
+    assert [f.name for f in some.functions] == ["cos(x)", "1/(0.5+x)"]
+    np.testing.assert_array_equal(some.evaluate(points()), every().evaluate(points())[:, [1, 7]])
+
+
+def test_equations_are_written_in_every_language() -> None:
+    terms = {"x": 1.0, "x*sin(2*v)/(0.5+n_i)^2": -2.0, "1/x": 3.0}
+    assert equation_text("x", terms) == "x' = 1 x - 2 x sin(2 v)/(0.5+n_i)^2 + 3/x"
+    latex = r"\frac{x \sin(2 \, v)}{(0.5+n_{i})^{2}}"
+    assert latex_term_name("x*sin(2*v)/(0.5+n_i)^2") == latex
+    assert latex_term_name("sqrt(x)*abs(v)*tanh(x)") == r"\sqrt{x} |v| \mathrm{tanh}(x)"
+    assert "sin(2 <i>v</i>) / (0.5+<i>n</i><sub>i</sub>)<sup>2</sup>" in equation_html("x", terms)
+    sympy = pytest.importorskip("sympy")
+    x, v, n = sympy.symbols("x v n_i")
+    expected = 1.0 * x - 2.0 * x * sympy.sin(2 * v) / (n + 0.5) ** 2 + 3.0 / x
+    assert sympy.simplify(sum_sympy(terms) - expected) == 0
+    values = {x: 0.7, v: -0.3, n: 1.9}
+    own = sum_sympy({"tanh(x)": 1.0})
+    (tanh,) = own.atoms(sympy.Function)
+    assert str(tanh) == "tanh(x)"
+    assert tanh != sympy.tanh(x)  # what it means is the user's
+    number = 0.7 - 2 * 0.7 * np.sin(-0.6) / 2.4**2 + 3 / 0.7
+    assert float(sum_sympy(terms).subs(values)) == pytest.approx(number, rel=1e-12)
+
+
+def test_relations_name_terms_with_functions() -> None:
+    library = named_terms(["x", "v"], ["1", "1/x", "sin(2*x)*v"])
+    both = {"x": ["1", "1/x", "sin(2*x)*v"], "v": ["1/x"]}
+    held = ep.constraint(library, both, ["x: 1/x == -2 * v: 1/x", "x: v*sin(2*x) == 1.5"])
+    coef = dict(zip(held.coefficients, held.coef(np.array([7.0, 3.0])), strict=True))
+    assert coef[("x", "1/x")] == -2 * coef[("v", "1/x")]
+    assert coef[("x", "sin(2*x)*v")] == 1.5
+
+
+def test_greek_names_are_written_as_letters() -> None:
+    model = ep.pendulum().model
+    assert r"\dot{\theta} &= 1 \, w" in model.latex()
+    assert r"- 9.81 \, \sin(\theta)" in model.latex()
+    assert latex_term_name("omega_c*x") == r"\omega_{c} x"
+    assert "sin(<i>&theta;</i>)" in equation_html("w", {"sin(theta)": 1.0})
+
+
+# A user's own function
+
+
+def test_a_function_of_ones_own_is_stored_by_name_and_read_when_registered(tanh: str) -> None:
+    model = model_of({"x": {"tanh(2*x)": -1.5, "x": 0.1}})
+    text = model.to_json()
+    assert json.loads(text)["library"] == ["tanh(2*x)", "x"]
+    assert ep.SparseModel.from_json(text).to_json() == text
+    kind = registry._kinds.pop("tanh")
+    try:
+        with pytest.raises(
+            ValueError, match=r"^unknown function 'tanh' in 'tanh\(2\*x\)'; .*regis"
+        ):
+            ep.SparseModel.from_json(text)
+    finally:
+        registry._kinds["tanh"] = kind
+
+
+def test_an_unknown_function_is_never_looked_up_as_code() -> None:
+    text = model_of({"x": {"sin(x)": 1.0}}).to_json().replace("sin(x)", "system(x)")
+    with pytest.raises(ValueError, match="unknown function 'system'"):
+        ep.SparseModel.from_json(text)
+
+
+def _square(x: np.ndarray) -> np.ndarray:
+    return x * x
+
+
+def _twice(x: np.ndarray) -> np.ndarray:
+    return 2.0 * x
+
+
+def test_a_function_of_ones_own_travels_to_other_processes() -> None:
+    ep.register_function("own_square", _square, _twice)
+    sent = pickle.dumps(named_terms(["x"], ["own_square(x)", "sin(x)"]))
+    del registry._kinds["own_square"]
+    try:
+        library = pickle.loads(sent)  # as in a worker, where nobody registered it
+        assert library.evaluate(np.array([[3.0]]))[0, 0] == 9.0
+        assert named_terms(["x"], ["own_square(2*x)"]).evaluate(np.array([[3.0]]))[0, 0] == 36.0
+    finally:
+        del registry._kinds["own_square"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "slope", "domain", "message"),
+    [
+        ("sin", np.sin, np.cos, None, "'sin' is built in: give your function another name"),
+        ("a b", np.sin, np.cos, None, "must be a plain word, such as 'tanh': 'a b' came"),
+        ("wrong", np.sin, np.sin, None, "derivative of 'wrong' must be that of its value: at"),
+        ("root", np.sqrt, lambda x: 0.5 / np.sqrt(x), None, "value of 'root' must give a finite"),
+        ("of_one", math.tanh, np.cos, None, "must take and return NumPy arrays: .* not math.tanh"),
+        ("sums", np.sum, np.cos, None, "value of 'sums' must give a finite number for each"),
+        ("turned", np.sin, np.cos, (1.0, -1.0), r"interval \(low, high\): \(1.0, -1.0\) came"),
+    ],
+)
+def test_functions_that_cannot_be_are_refused(
+    name: str, value: object, slope: object, domain: object, message: str
+) -> None:
+    setting = {} if domain is None else {"domain": domain}
+    with pytest.raises(ValueError, match=message):
+        ep.register_function(name, value, slope, **setting)
+    assert name == "sin" or name not in registry._kinds
+
+
+# Domains
+
+
+def signal(x: np.ndarray, label: str = "") -> ep.Trajectory:
+    return ep.Trajectory(T, np.column_stack([x, np.sin(T)]), ["x", "v"], label=label)
+
+
+@pytest.mark.parametrize("recipe", ["weak", "differential", "joint"])
+def test_a_sample_outside_a_domain_is_named(recipe: str) -> None:
+    x = 1.5 + np.cos(T)
+    x[412] = -0.03
+    chosen = {
+        "weak": ep.Recipe(),
+        "differential": ep.Recipe(ep.Differential()),
+        "joint": ep.Recipe(search=ep.Joint()),
+    }[recipe]
+    library = polynomial(["x", "v"], degree=1, functions=["log(x)"])
+    message = r"log\(x\) needs x > 0: x\[412\] = -0.03 at t = 4.12 s of 'probe'; name functions"
+    with pytest.raises(ValueError, match=message):
+        ep.discover(signal(x, "probe"), library, chosen)
+
+
+@pytest.mark.parametrize(
+    ("function", "x", "message"),
+    [
+        ("1/x", np.cos(T), r"1/x needs x to stay on one side of 0: x\[158\] = -0.009"),
+        ("sqrt(x)", T, r"sqrt\(x\) needs x > 0: x\[0\] = 0 at t = 0 s; name"),
+        ("log(1-2*x)", 0.6 - 0.3 * np.cos(T), r"needs 1-2\*x > 0: x\[124\] .*\(377 such samples\)"),
+        ("exp(x)", 800.0 + T, r"exp\(x\) needs x < 709: x\[0\] = 800"),
+    ],
+)
+def test_every_domain_has_its_words(function: str, x: np.ndarray, message: str) -> None:
+    library = polynomial(["x", "v"], degree=1, functions=[function])
+    with pytest.raises(ValueError, match=message):
+        ep.discover(signal(x), library)
+
+
+def test_each_run_may_stay_on_a_side_of_its_own_of_a_pole() -> None:
+    """x' = -1/x + v from both sides."""
+    truth = model_of({"x": {"1/x": -0.1, "v": 1.0}, "v": {"x": -1.0, "v": -0.3}})
+    runs = [truth.simulate(T[:300], [x, 0.0]).trajectory() for x in (2.0, -2.0)]
+    library = polynomial(["x", "v"], degree=1, functions=["1/x"])
+    found = ep.discover(runs, library).model
+    assert found.terms("x") == pytest.approx({"v": 1.0, "1/x": -0.1}, rel=1e-3)
+
+
+def test_what_a_smoother_moves_out_of_a_domain_stays_with_its_sample() -> None:
+    library = named_terms(["x", "v"], ["log(x)", "v"])
+    samples, moved = np.array([[0.1, 1.0], [0.2, 2.0]]), np.array([[-0.1, 1.5], [0.3, 2.5]])
+    expected = [[0.1, 1.5], [0.3, 2.5]]
+    np.testing.assert_array_equal(kept_inside(library, moved, samples), expected)
+
+
+@pytest.mark.parametrize(
+    ("equations", "outside", "t_end_s"),
+    [
+        ({"x": {"sqrt(x)": -1.0}}, "sqrt(x)", 2.0),  # x = (1 - t/2)^2
+        ({"x": {"1/x": -1.0}}, "1/x", 0.5),  # x^2 = 1 - 2 t
+        ({"x": {"1": -1.0, "1/(2+x)": 1e-9}}, "1/(2+x)", 3.0),
+        ({"x": {"1": -1.0, "log(x)": 1e-9}}, "log(x)", 1.0),
+        ({"x": {"1": -1.0, "abs(x)": 1e-9, "sin(x)": 1e-9}}, "", 5.0),
+    ],
+)
+def test_a_run_that_leaves_a_domain_ends_there_and_says_so(
+    equations: dict, outside: str, t_end_s: float
+) -> None:
+    run = model_of(equations).simulate(T, [1.0])
+    assert run.outside == outside
+    assert run.diverged == bool(outside)
+    assert run.t[-1] == pytest.approx(t_end_s, abs=0.011)  # a sample's step
+    assert np.isfinite(run.states).all()
+    if outside:
+        assert f"left the domain of {outside}, which needs" in run.message
+
+
+def test_a_run_may_start_outside_a_domain_or_be_driven_out_of_it() -> None:
+    fall = model_of({"x": {"log(x)": 1.0}}).simulate(T, [-1.0])
+    assert (fall.diverged, fall.outside, len(fall.t)) == (True, "log(x)", 1)
+    assert (
+        "the start, at t = 0 s, is outside the domain of log(x), which needs x > 0" in fall.message
+    )
+    driven = model_of({"x": {"log(u)": 1.0}}, ("u",))
+    run = driven.simulate(T, [-1.0], {"u": lambda t: 2.0 - t})
+    assert run.outside == "log(u)"
+    assert run.t[-1] == pytest.approx(2.0, abs=0.011)
+
+
+def test_leaving_a_domain_is_a_verdict() -> None:
+    model = model_of({"x": {"1": -1.0, "log(x)": 0.1}})
+    run = ep.Trajectory(T, (np.cos(T) + 1.2)[:, None], ["x"])
+    judged = ep.free_run(model, run)
+    assert judged.verdict is ep.Verdict.LEAVES_DOMAIN
+    assert judged.text.startswith("leaves the domain of log(x) after 2.1")
+
+
+def test_only_functions_that_end_somewhere_have_edges() -> None:
+    library = named_terms(["x", "u"], ["sin(x)", "exp(x)", "1/(1+u)", "log(u)"])
+    edges = edges_of(library.functions, ["u", "x"], np.array([-0.5, 2.0]))
+    assert [(edge.function.name, edge.interval) for edge in edges] == [
+        ("exp(x)", (-np.inf, 709.0)),
+        ("1/(1+u)", (0.0, np.inf)),
+        ("log(u)", None),
+    ]
+
+
+def test_terms_that_a_model_does_not_have_need_no_domain() -> None:
+    """A library may hold log(x) where the model that was chosen runs below zero."""
+    library = polynomial(["x"], degree=1, functions=["log"])
+    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x": -1.0}]))
+    below = np.array([[-2.0], [0.0]])
+    np.testing.assert_array_equal(model.predict(below), -below)
+    run = model.simulate(T, [-1.0])
+    assert not run.diverged
+    assert model.score(run.trajectory(), x_dot=-run.states) == 1.0
+    nothing = ep.SparseModel(library, ["x"], np.zeros((3, 1)))
+    np.testing.assert_array_equal(nothing.predict(below), 0 * below)
+
+
+def test_a_score_names_samples_that_the_model_is_not_defined_at() -> None:
+    model = model_of({"x": {"log(x)": 1.0}, "v": {"x": 1.0}})
+    with pytest.raises(ValueError, match=r"log\(x\) needs x > 0: x\[158\] = -0.009"):
+        model.score(signal(np.cos(T)))
+    assert np.isnan(model.predict(np.array([-1.0, 0.0]))[0])
+
+
+# Searches
+
+
+def test_of_dependent_products_one_is_left_out_and_named() -> None:
+    run = ep.pendulum().trajectory(noise=0.05, rng=0)
+    library = polynomial(["theta", "w"], degree=1, functions=["sin", "cos"], function_degree=2)
+    for problem in ep.WeightedWeak().assemble([run], library, rng=np.random.default_rng(0)):
+        left_out = {name: f for f in ambiguities(problem) if f.exact for name in f.terms[:1]}
+        for v in ("theta", "w"):
+            finding = left_out[f"cos({v})^2"]
+            assert finding.terms == (f"cos({v})^2", "1", f"sin({v})^2")
+            assert finding.message.endswith("on every row and is left out")
+            assert not usable_terms(problem)[library.index(f"cos({v})^2")]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.1])
+@pytest.mark.parametrize("search", ["regression", "joint"])
+def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(search: str, noise: float) -> None:
+    """theta' = w, w' = -g/L sin(theta); its energy w^2/2 - g/L cos(theta) stays."""
+    system = ep.pendulum()
+    run = system.trajectory(noise=noise, rng=3)
+    recipe = ep.Recipe(search=ep.Joint()) if search == "joint" else None
+    library = polynomial(run.names, degree=3, functions=["sin", "cos"])
+    found = ep.discover(run, library, recipe)
+    assert {s: set(found.model.terms(s)) for s in found.model.states} == {
+        "theta": {"w"},
+        "w": {"sin(theta)"},
+    }
+    assert found.model.terms("theta")["w"] == pytest.approx(1.0, abs=0.02)
+    assert found.model.terms("w")["sin(theta)"] == pytest.approx(-9.81, rel=0.03)
+    truth = system.trajectory()
+    free = found.model.simulate(truth.t, truth.states[0])
+    assert not free.diverged
+    theta, w = free.states.T
+    speed, restoring = found.model.terms("theta")["w"], found.model.terms("w")["sin(theta)"]
+    energy = 0.5 * speed * w**2 + restoring * np.cos(theta)
+    assert np.ptp(energy) < 1e-4  # of some 4
+    judged = ep.free_run(found.model, truth)
+    assert judged.verdict in (ep.Verdict.LIVES, ep.Verdict.SLIPS)
+
+
+def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:
+    """Without what noise adds to sin on average, errors have a mean of 3.5 standard deviations."""
+    library = named_terms(["theta", "w"], ["w", "sin(theta)"])
+    known = {"theta": ["w"], "w": ["sin(theta)"]}
+    errors = []
+    for seed in range(16):
+        run = ep.pendulum().trajectory(noise=0.1, rng=seed)
+        model = ep.discover(run, library, terms=known).model
+        low, high = model.intervals("w")["sin(theta)"]
+        errors.append((0.5 * (low + high) + 9.81) / ((high - low) / 3.92))
+    assert abs(np.mean(errors)) < 0.9  # 0.25 by chance, 0.2 by noise above second order
+    assert 0.6 < np.std(errors) < 1.5
+
+
+def test_a_joint_search_takes_a_function_of_ones_own(tanh: str) -> None:
+    truth = model_of({"x": {"y": 1.0}, "y": {"tanh(3*x)": -4.0, "y": -0.05}})
+    clean = truth.simulate(np.linspace(0.0, 20.0, 1001), [1.5, 0.0]).trajectory()
+    noisy = clean.states + 0.03 * np.random.default_rng(1).standard_normal(clean.states.shape)
+    run = ep.Trajectory(clean.t, noisy, ["x", "y"])
+    library = polynomial(["x", "y"], degree=3, functions=["tanh(3*x)"])
+    found = ep.discover(run, library, ep.Recipe(search=ep.Joint())).model
+    assert found.terms("x") == pytest.approx({"y": 1.0}, rel=0.02)
+    assert set(found.terms("y")) == {"tanh(3*x)", "y"}
+    assert found.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, rel=0.02)
+
+
+@pytest.mark.parametrize("search", ["regression", "joint"])
+def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
+    """Decay with feed, s' = u - b s/(K + s), of some 1e18 and over microseconds."""
+    K = 4e17
+    truth = model_of({"s": {"u": 1.0, "s/(4e17+s)": -3e24}}, ("u",))
+    t = np.linspace(0.0, 4e-5, 2001)
+    feed = 1.6e24 * (1.0 + 0.9 * np.sin(4e5 * t))
+    run = truth.simulate(t, [1e18], {"u": feed}).trajectory()
+    rng = np.random.default_rng(0)
+    states = run.states * (1.0 + 0.01 * rng.standard_normal(run.states.shape))
+    noisy = ep.Trajectory(t, states, ["s"], inputs=run.inputs, input_names=["u"])
+    library = polynomial(
+        ["s", "u"], degree=1, functions=["log(s)", "sqrt(s)"], products=[f"s/({K:g}+s)"]
+    )
+    recipe = ep.Recipe(search=ep.Joint()) if search == "joint" else None
+    found = ep.discover(noisy, library, recipe).model
+    expected = {"u": 1.0, "s/(4e+17+s)": -3e24}
+    assert found.terms("s") == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "selection", [ep.IntegralScore(), pytest.param(ep.FreeRunScore(), marks=pytest.mark.slow)]
+)
+def test_rules_that_run_models_take_functions(selection: object) -> None:
+    run = ep.pendulum().trajectory(noise=0.02, rng=0)
+    library = polynomial(run.names, degree=1, functions=["sin(theta)"])
+    recipe = ep.Recipe(search=ep.BestSubset(max_terms=1), selection=selection)
+    found = ep.discover(run, library, recipe).model
+    assert set(found.terms("w")) == {"sin(theta)"}
+
+
+def test_a_pendulum_swings_on_closed_orbits() -> None:
+    system = ep.pendulum()
+    cycle = ep.limit_cycle(system.model, np.array([1.0, 3.0]), period_s=2.4)
+    assert cycle is not None
+    theta, w = cycle.states[0]
+    furthest = np.arccos(np.cos(theta) - 0.5 * w**2 / 9.81)
+    # T = 2 pi sqrt(L / g) / M(1, cos(furthest / 2)), M the arithmetic-geometric mean.
+    a, b = 1.0, np.cos(furthest / 2.0)
+    for _ in range(8):
+        a, b = (a + b) / 2.0, np.sqrt(a * b)
+    assert cycle.period_s == pytest.approx(2.0 * np.pi / a / np.sqrt(9.81), rel=1e-6)
+    assert cycle.stability.value == "neutral"
+
+
+def test_a_function_of_ones_own_is_refined(tanh: str) -> None:
+    truth = model_of({"x": {"y": 1.0}, "y": {"tanh(3*x)": -4.0, "y": -0.05}})
+    t = np.linspace(0.0, 6.0, 301)
+    run = truth.simulate(t, [1.5, 0.0]).trajectory()
+    off = model_of({"x": {"y": 1.02}, "y": {"tanh(3*x)": -4.1, "y": -0.06}})
+    ways: list[dict] = [{}, {"method": ep.GradientDescent(), "free_start": False}]
+    for way in ways:
+        found = refine(off, [run], n_windows=4, window=60, rng=np.random.default_rng(0), **way)
+        # Steps of 0.02 s are exact to 1e-6 where tanh(3 x) turns.
+        assert found.model.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, abs=1e-4)
+
+
+def test_refinement_survives_windows_that_leave_a_domain() -> None:
+    """Started so far off that trajectories leave x > 0, it ends with a status, not an exception."""
+    truth = model_of({"x": {"1": 1.0, "sqrt(x)": -1.0, "u": 1.0}}, ("u",))
+    t = np.linspace(0.0, 10.0, 501)
+    run = truth.simulate(t, [1.0], {"u": 0.5 * np.sin(2 * t)}).trajectory()
+    off = model_of({"x": {"1": -6.0, "sqrt(x)": -1.0, "u": 1.0}}, ("u",))
+    for free_start in (True, False):
+        found = refine(
+            off, [run], n_windows=4, window=80, rng=np.random.default_rng(0), free_start=free_start
+        )
+        assert isinstance(found.status, str)
+        assert found.status != "converged" or np.isfinite(found.model.coef).all()
