@@ -1,5 +1,7 @@
 """The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
+`ep2sindy inspect PATH` looks into files instead.
+
 Only Hydra is imported here: `--help` must not wait for the numerics.
 """
 
@@ -29,6 +31,11 @@ def main() -> None:
     failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
     try:
         conf = conf_folder()
+        if sys.argv[1:2] == ["inspect"]:
+            from ep2sindy.app.inspection import main as inspect_files
+
+            inspect_files(sys.argv[2:], conf)
+            return
         prepare_arguments(conf)
 
         @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")

@@ -19,7 +19,8 @@ from ep2sindy.report.tensorboard import Board
 class Run:
     """One run of a study: its name and seed, where it writes and what it says on the way.
 
-    settings: the whole config as plain values. warnings: what the page and the summary repeat.
+    settings: the whole config as plain values. used: which data were used, in words, and warnings:
+    what the page and the summary repeat.
     """
 
     title: str
@@ -28,11 +29,17 @@ class Run:
     screen: Screen
     board: Board
     settings: Mapping[str, Any] = field(default_factory=dict)
+    used: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     def say(self, text: str, *, warning: bool = False) -> None:
         """A line for those who watch, at once: on the screen and in run.log."""
         self.screen.print(*renderables(Text(text, warning=warning)))
+
+    def say_used(self, text: str) -> None:
+        """Say which data are used, at once, on the page and in the summary."""
+        self.used.append(text)
+        self.say(f"data: {text}")
 
     def warn(self, text: str) -> None:
         """Say that something is amiss, at once, on the page and in the summary."""

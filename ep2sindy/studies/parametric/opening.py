@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ep2sindy.data.quantities import unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.parametric.oscillation import STEADY, PointData, naming, point_label
@@ -38,7 +39,7 @@ class PointSource:
                     return PointData(self.parameters, None, status)
                 sampling = self.source.trajectory
                 run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                notes = amiss(field.attrs) if is_simulation(field.attrs) else []
+                notes = amiss(field.attrs) if is_simulation(field.attrs) else unit_doubts(field)
                 return PointData(self.parameters, run, notes=notes)
             except DivergedError:
                 return PointData(self.parameters, None, "diverged")
