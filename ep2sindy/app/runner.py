@@ -139,11 +139,10 @@ def write(run: Run, outcome: Outcome, hparams: Mapping[str, Any]) -> dict[str, f
     headline = dict(outcome.headline())
     board.settings(hparams, headline)
     warned = [Section("Warnings", [Text(text, warning=True) for text in run.warnings])]
-    used = [Section("Data", [Text(text) for text in run.used])]
-    page = [*(warned if run.warnings else []), *(used if run.used else []), *sections]
+    said = [Section("Data and method", [Text(text) for text in run.said])]
+    page = [*(warned if run.warnings else []), *(said if run.said else []), *sections]
     folder.write_text("report.html", page_html(run.title, page, figures))
     named = {"experiment": run.title, "seed": run.seed}
-    named |= {"data_used": run.used} if run.used else {}
     named |= {"warnings": run.warnings} if run.warnings else {}
     folder.write_json("summary.json", named | outcome.summary())
     return headline

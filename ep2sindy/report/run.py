@@ -19,8 +19,8 @@ from ep2sindy.report.tensorboard import Board
 class Run:
     """One run of a study: its name and seed, where it writes and what it says on the way.
 
-    settings: the whole config as plain values. used: which data were used, in words, and warnings:
-    what the page and the summary repeat.
+    settings: the whole config as plain values. said: what the page repeats; warnings: that is
+    amiss, the summary too.
     """
 
     title: str
@@ -29,17 +29,14 @@ class Run:
     screen: Screen
     board: Board
     settings: Mapping[str, Any] = field(default_factory=dict)
-    used: list[str] = field(default_factory=list)
+    said: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     def say(self, text: str, *, warning: bool = False) -> None:
-        """A line for those who watch, at once: on the screen and in run.log."""
+        """A line for those who watch, at once: on the screen and in run.log, later on the page."""
+        if not warning:
+            self.said.append(text)
         self.screen.print(*renderables(Text(text, warning=warning)))
-
-    def say_used(self, text: str) -> None:
-        """Say which data are used, at once, on the page and in the summary."""
-        self.used.append(text)
-        self.say(f"data: {text}")
 
     def warn(self, text: str) -> None:
         """Say that something is amiss, at once, on the page and in the summary."""

@@ -131,7 +131,7 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
         units,
         f"dominant frequency {frequencies}",
     ]
-    run.say_used("; ".join(words))
+    run.say(f"data: {'; '.join(words)}")
     if "file" in field.attrs:
         for text in unit_doubts(field):
             run.warn(text)
