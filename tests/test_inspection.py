@@ -268,3 +268,14 @@ def test_the_steps_of_a_plasmas_record_show_the_unit_of_time(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ep.open_field(tmp_path / "a.npz", variables=slow, time=ep.Variable("t", "s"))
+
+
+def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> None:
+    np.savez(
+        tmp_path / "a.npz",
+        t=T, z=Z, B=RNG.uniform(size=NZ), n_i=N_I[:, :, 0], I_d=WAVE[:, 0, 0],
+        V_d=np.full(NT, 300.0),
+    )  # fmt: skip
+    found = ep.inspect(tmp_path / "a.npz")
+    signals = [name for name, variable in found.variables.items() if found.is_trace(variable)]
+    assert signals == ["I_d"]

@@ -82,13 +82,11 @@ class Inspection:
         return {name: tuple(v for v in needs if v not in have) for name, needs in NEEDS.items()}
 
     def is_trace(self, variable: Variable) -> bool:
-        """Whether a variable has only time."""
+        """Whether a variable has only time, varies, and does not rise all along."""
         (one,) = (e for e in self.found.held if str(variable.name).split("[")[0] == e.name)
-        return (
-            len(one.lengths) == 1 + (one.name != variable.name)
-            and one.step is None
-            and (one.low < one.high)
-        )
+        n_axes = 1 + (one.name != variable.name)
+        of_time = len(one.lengths) == n_axes and self.found.n_samples in one.lengths
+        return of_time and one.step is None and one.low < one.high
 
     def notes(self) -> list[str]:
         """What is to be decided, what is only likely, and what is lacking, in words."""

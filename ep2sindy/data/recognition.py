@@ -30,7 +30,7 @@ class Recognised:
     """A mapping of a file as far as it can be told.
 
     variables, axes: our name -> where it is. guesses: our name -> a unit that is only likely, in
-    words. questions: what is left open, in words.
+    words. questions: what is left open, in words. n_samples: None where they cannot be counted.
     """
 
     held: Sequence[Held]
@@ -39,6 +39,7 @@ class Recognised:
     dt_s: float | None
     guesses: Mapping[str, str] = field(default_factory=dict)
     questions: Sequence[str] = ()
+    n_samples: int | None = None
 
     def check(self, source: Source) -> None:
         """Raise ValueError unless a field can be made of it without doubt."""
@@ -87,7 +88,7 @@ def recognised(
     variables = _variables(source, rest, axes, held, lengths, questions, guesses)
     if "time" not in named and (one := _of(held, getattr(axes.get("time"), "name", None))):
         axes["time"] = with_time_unit(axes["time"], one, variables, guesses)
-    return Recognised(held, variables, axes, dt_s, guesses, questions)
+    return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
 
 
 def _of(held: Sequence[Held], name: str | None) -> Held | None:

@@ -9,7 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
 
-from ep2sindy.data.extent import in_numbers
+from ep2sindy.data.extent import in_numbers, zone_words
+from ep2sindy.data.fields import grid_points
 from ep2sindy.data.gaps import gap_words
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
@@ -117,6 +118,25 @@ def zone_length_m(source: Source, field: xr.Dataset) -> float | None:
     return None if z is None else float(z[1] - z[0])
 
 
+def say_field(run: Run, field: xr.Dataset) -> None:
+    """Which data, for a study of every grid point."""
+    t = grid_points(field, "time")
+    words = [
+        field.attrs.get("file", ""),
+        zone_words(None, field),
+        f"{len(t)} samples of {(t[-1] - t[0]) / (len(t) - 1):.4g} s from {t[0]:.4g} s",
+    ]
+    run.say(f"data: {'; '.join(word for word in words if word)}")
+    say_doubts(run, field)
+
+
+def say_doubts(run: Run, field: xr.Dataset) -> None:
+    """Numbers of a file that look like another unit."""
+    if "file" in field.attrs:
+        for text in unit_doubts(field):
+            run.warn(text)
+
+
 def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
     """Which data: the file, the zone, samples and units; what is missing, what looks amiss."""
     units = ", ".join(f"{name} in {unit}" for name, unit in data.units.items())
@@ -132,9 +152,7 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
         f"dominant frequency {frequencies}",
     ]
     run.say(f"data: {'; '.join(words)}")
-    if "file" in field.attrs:
-        for text in unit_doubts(field):
-            run.warn(text)
+    say_doubts(run, field)
     if data.n_samples < field.sizes["time"]:
         run.warn(gap_words(data.t, field.sizes["time"]))
 

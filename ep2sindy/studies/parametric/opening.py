@@ -8,6 +8,7 @@ from typing import Any
 
 from ep2sindy.data.quantities import unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError
+from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.parametric.oscillation import STEADY, PointData, naming, point_label
 from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
@@ -40,7 +41,9 @@ class PointSource:
                 sampling = self.source.trajectory
                 run = sampling.trajectory(field, inputs=inputs, label=self.label)
                 notes = amiss(field.attrs) if is_simulation(field.attrs) else unit_doubts(field)
-                return PointData(self.parameters, run, notes=notes)
+                words = [field.attrs.get("file", ""), sampling.place(field)]
+                used = "; ".join(word for word in words if word)
+                return PointData(self.parameters, run, notes=notes, used=used)
             except DivergedError:
                 return PointData(self.parameters, None, "diverged")
             except ConstantStateError:
@@ -75,6 +78,16 @@ def point_sources(
         seen[same] = point.label
         found.append(point)
     return found
+
+
+def say_used(run: Run, points: Sequence[PointData]) -> None:
+    """Which data: in one line where all points are averaged alike, else one each."""
+    used = {point_label(point.parameters): point.used for point in points if point.used}
+    if len({*used.values()}) == 1:
+        run.say(f"data: {next(iter(used.values()))}")
+        return
+    for label, words in used.items():
+        run.say(f"data: {label}: {words}")
 
 
 def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
