@@ -139,6 +139,12 @@ def test_a_scalar_may_say_the_step(tmp_path: Path, name: str, value: float) -> N
     np.testing.assert_allclose(field["time"].values, T, rtol=1e-12)
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1.0, "s"), (1e3, "ms"), (1e6, "us"), (7.0, "s")])
+def test_a_rate_beside_a_time_says_its_unit(tmp_path: Path, factor: float, unit: str) -> None:
+    savemat(tmp_path / "a.mat", {"signal": WAVE[:, 0, 0], "t": factor * T, "fs": 1 / 1.5e-6})
+    assert ep.inspect(tmp_path / "a.mat").time == ep.Variable("t", unit)
+
+
 def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
     square = 1e18 * np.repeat(WAVE[:, :, :1], NZ, axis=2)
     np.savez(tmp_path / "a.npz", t=T, z=Z, r=R[0] + Z, ni=square, I_d=WAVE[:, 0, 0])

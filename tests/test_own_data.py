@@ -96,7 +96,10 @@ def test_a_written_config_is_that_of_the_file(
         (["empty.csv"], "error: empty.csv is empty"),
         (["."], "a folder that ends in .zarr"),
         (["*.h5"], "no file fits the pattern '\\*.h5'"),
-        (["a.npz", "b.npz"], r"must hold the same names: b.npz differs from a.npz in \['x', 'y'\]"),
+        (
+            ["a.npz", "b.npz", "--write"],
+            r"must hold the same names: b.npz differs from a.npz in \['x', 'y'\]",
+        ),
     ],
 )
 def test_what_cannot_be_looked_into_ends_in_one_message(

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from ep2sindy.data.conversion import KNOWN_UNITS
-from ep2sindy.data.inspection import Inspection, inspect_together
+from ep2sindy.data.inspection import Inspection, check_alike, inspect
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import files_of
 from ep2sindy.machine.files import write_text
@@ -38,13 +38,14 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     )
     given = parser.parse_args(arguments)
     paths = files_of(given.path)
-    found = inspect_together(paths)
+    found = [inspect(path) for path in paths]
     for each in found:
         print("\n".join(each.lines()), end="\n\n")
     name = re.sub(r"\W+", "_", given.write or Path(paths[0]).stem).strip("_")
     if given.write is None:
         print(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
+    check_alike(found)
     path = own_config(name, conf)
     write_text(path, config_text(found, paths))
     print(f"written: {path}; next, for example:")

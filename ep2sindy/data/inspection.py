@@ -175,12 +175,8 @@ def inspect(path: str | Path) -> Inspection:
     return Inspection(path, kind, source.words, found, source.channel_m)
 
 
-def inspect_together(paths: Sequence[str | Path]) -> list[Inspection]:
-    """Several files, which are several records of one kind.
-
-    Raises ValueError for files that hold other names than the first.
-    """
-    found = [inspect(path) for path in paths]
+def check_alike(found: Sequence[Inspection]) -> None:
+    """Raise ValueError for files that hold other names than the first: one mapping must fit all."""
     names = [{v.name for v in each.variables.values()} for each in found]
     for each, held in zip(found, names, strict=True):
         if held != names[0]:
@@ -188,4 +184,3 @@ def inspect_together(paths: Sequence[str | Path]) -> list[Inspection]:
                 f"files of one mapping must hold the same names: {each.path} differs from "
                 f"{found[0].path} in {sorted(map(str, held ^ names[0]))}; give each its own"
             )
-    return found

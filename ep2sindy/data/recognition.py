@@ -87,7 +87,8 @@ def recognised(
     lengths = _lengths(axes, held, source, rest, dt_s, questions)
     variables = _variables(source, rest, axes, held, lengths, questions, guesses)
     if "time" not in named and (one := _of(held, getattr(axes.get("time"), "name", None))):
-        axes["time"] = with_time_unit(axes["time"], one, variables, guesses)
+        said_s = _said_step_s(usable)
+        axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
     return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
 
 
@@ -122,9 +123,14 @@ def _step_s(source: Source, axes: Mapping[str, Variable], held: Sequence[Held]) 
     one = _of(held, time.name) if time is not None else None
     if source.step_s is not None:
         return None if one is not None and is_of(one.unit, "s") else source.step_s
+    return _said_step_s(held) if time is None else None
+
+
+def _said_step_s(held: Sequence[Held]) -> float | None:
+    """The time step that scalars such as dt or fs say, if they say one."""
     scalars = [step_said(e.name, e.low) for e in held if not e.lengths and not e.dims]
     said = {step for step in scalars if step is not None}
-    return said.pop() if time is None and len(said) == 1 else None
+    return said.pop() if len(said) == 1 else None
 
 
 def _lengths(

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from math import isclose
 
 from ep2sindy.data.conversion import SUFFIX_UNITS, conversion
 from ep2sindy.data.held import Held
 from ep2sindy.data.mapping import Variable
-from ep2sindy.data.quantities import Quantity, likely_time_unit, named_unit
+from ep2sindy.data.quantities import AXES, Quantity, likely_time_unit, named_unit
 from ep2sindy.library.units import unit_like
 
 
@@ -35,11 +36,23 @@ def with_unit(ours: str, one: Held, quantity: Quantity, guesses: dict[str, str])
 
 
 def with_time_unit(
-    time: Variable, one: Held, variables: Mapping[str, Variable], guesses: dict[str, str]
+    time: Variable,
+    one: Held,
+    variables: Mapping[str, Variable],
+    said_s: float | None,
+    guesses: dict[str, str],
 ) -> Variable:
-    """The unit of time, which a plasma's record shows in its steps where the file says none."""
-    likely = likely_time_unit(one.step or 0.0, variables)
-    if one.unit not in ("", "1") or _ending("time", one.name) or likely is None:
+    """The unit of time where the file names none: that in which its steps are those it says.
+
+    Else a plasma's record shows it in its steps. said_s: the step that a scalar such as fs says.
+    """
+    if one.unit not in ("", "1") or _ending("time", one.name) or one.step is None:
+        return time
+    for unit in ("s", *AXES["time"].others):
+        if said_s and isclose(one.step * conversion("time", unit)[0], said_s, rel_tol=1e-3):
+            return replace(time, unit=unit)
+    likely = likely_time_unit(one.step, variables)
+    if likely is None:
         return time
     guesses["time"] = (
         f"time ({one.name!r}) goes in steps of {one.step:.2g}, as if the file counted in {likely}, "
