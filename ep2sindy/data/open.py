@@ -20,6 +20,7 @@ from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.readers.source import UNDECODED, Source, damage_named
+from ep2sindy.library.names import check_variable
 from ep2sindy.machine.files import replacing
 
 
@@ -96,6 +97,7 @@ def _in_file(variables: Mapping[str, Variable | Keys | None]) -> dict[str, Varia
     """Those that the file has; a config's keys become a `Variable`."""
     found = {}
     for ours, value in variables.items():
+        check_variable(ours)
         if isinstance(value, Mapping):
             if not {"name", "unit"} <= set(value) <= {"name", "unit", "dims"}:
                 raise ValueError(f"{ours} needs a name, a unit, perhaps dims: {dict(value)} came")
