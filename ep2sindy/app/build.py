@@ -102,7 +102,7 @@ def _built(node: Any, place: str) -> Any:
     try:
         return call()
     except TypeError as error:
-        raise ValueError(f"{place}: {error}") from error
+        raise ValueError(f"{place} cannot be made: {error}") from error
 
 
 def instance_of(node: DictConfig, kind: type, place: str) -> Any:

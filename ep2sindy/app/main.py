@@ -50,7 +50,7 @@ def main() -> None:
 
         job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(f"error: {error or type(error).__name__}")
     except OSError as error:
         sys.exit(f"error: {error}; a folder that can be written is chosen with output=PATH")
     except KeyboardInterrupt:
