@@ -73,6 +73,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.library.library import named_terms as named_terms
     from ep2sindy.library.library import polynomial as polynomial
     from ep2sindy.library.units import Clock as Clock
+    from ep2sindy.machine.own import for_configs as for_configs
     from ep2sindy.machine.parallel import Dask as Dask
     from ep2sindy.machine.parallel import Loky as Loky
     from ep2sindy.machine.parallel import Serial as Serial
@@ -154,6 +155,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.studies.parametric.quantities import Quantity as Quantity
     from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap as TimeBootstrap
     from ep2sindy.studies.pysindy_variants import PySINDyEnsemble as PySINDyEnsemble
+    from ep2sindy.studies.pysindy_variants import PySINDySmoothing as PySINDySmoothing
     from ep2sindy.studies.pysindy_variants import PySINDySsr as PySINDySsr
     from ep2sindy.studies.pysindy_variants import PySINDyStlsq as PySINDyStlsq
     from ep2sindy.studies.pysindy_variants import PySINDyVariant as PySINDyVariant
@@ -239,6 +241,7 @@ _FACE = {
     "library.equations": "equation_text",
     "library.functions": "register_function",
     "library.library": "Library polynomial named_terms",
+    "machine.own": "for_configs",
     "machine.parallel": "Serial Loky Dask",
     "library.units": "Clock",
     "model.free_run": "FreeRun free_run",
@@ -286,7 +289,7 @@ _FACE = {
     "studies.parametric.quantities": "Quantity",
     "studies.parametric.time_bootstrap": "TimeBootstrap",
     "studies.pysindy_variants": (
-        "PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm"
+        "PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm PySINDySmoothing"
     ),
     "synthetic.regions": "three_regions",
     "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz pendulum",

@@ -6,12 +6,12 @@ pytest.importorskip("pysindy")
 from ep2sindy.library.library import named_terms
 from ep2sindy.studies.pysindy_variants import (
     PySINDyEnsemble,
+    PySINDySmoothing,
     PySINDySsr,
     PySINDyStlsq,
     PySINDyVariant,
     PySINDyWeakForm,
     Rows,
-    Smoothing,
     best_of_each_size,
     pysindy_library,
 )
@@ -78,7 +78,7 @@ def test_r2_is_that_of_a_least_squares_refit() -> None:
     rng = np.random.default_rng(3)
     run = system.trajectory(noise=0.05, rng=rng)
     library = system.model.library
-    rows = Smoothing().rows([run], library)
+    rows = PySINDySmoothing().rows([run], library)
     for terms, r2 in PySINDyStlsq().candidates([run], library, rng=rng)["x"]:
         columns = rows.theta[:, [library.index(name) for name in terms]]
         coef = np.linalg.lstsq(columns, rows.x_dot[:, 0], rcond=None)[0]

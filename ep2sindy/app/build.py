@@ -7,24 +7,14 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from hydra.errors import HydraException
-from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from ep2sindy.app.defaults import write_defaults
+from ep2sindy.app.targets import target_of
 from ep2sindy.studies.source import Step
-
-
-def innermost(error: BaseException) -> BaseException:
-    """Hydra wraps what a constructor raised; the user needs the constructor's own words."""
-    while isinstance(error, HydraException) and error.__cause__ is not None:
-        error = error.__cause__
-    return error
-
 
 PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 
@@ -53,42 +43,12 @@ def check_arguments(node: Any, place: str) -> None:
         if wanted and value is not None and not any(is_plain(value, kind) for kind in wanted):
             words = " or ".join(PLAIN[kind] for kind in wanted)
             raise ValueError(f"{place}.{name} must be {words}: {value!r} came")
-        if isinstance(value, DictConfig) and "_target_" in value:
-            _check_names(value, f"{place}.{name}")
         check_arguments(value, f"{place}.{name}")
-
-
-def _target(node: DictConfig, place: str) -> Any:
-    """What a node names; raises ValueError if there is no such thing."""
-    try:
-        module, _, name = node["_target_"].rpartition(".")
-        return getattr(import_module(module), name)
-    except Exception as error:
-        raise ValueError(
-            f"{place} must name a _target_ that there is, such as ep2sindy.EBIC: "
-            f"{node['_target_']!r} came"
-        ) from error
-
-
-def _check_names(node: DictConfig, place: str) -> None:
-    """Raise ValueError, with its place, for an argument that a nested target does not take."""
-    target = _target(node, place)
-    try:
-        takes = inspect.signature(target)
-    except ValueError:  # compiled, it does not say what it takes
-        return
-    names = [name for name in map(str, node) if not name.startswith("_")]
-    try:
-        takes.bind_partial(**dict.fromkeys(names))
-    except TypeError as error:
-        raise ValueError(
-            f"{place}, {target.__name__}: {error}; it takes {list(takes.parameters)}"
-        ) from error
 
 
 def _plain_kinds(node: DictConfig, place: str) -> dict[str, tuple[type, ...]]:
     """Arguments of a target that can only be plain values, or None: by name, their kinds."""
-    target = _target(node, place)
+    target = target_of(node, place)
     try:
         hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
     except Exception:  # an annotation that is not there while the program runs; no annotations
@@ -111,24 +71,38 @@ def call_of(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     """
     check_set(node)
     check_arguments(node, place)
+    target = target_of(node, place)
+    call = partial(target, **_arguments(node, place))
     try:
-        call = instantiate(node, _convert_="all", _partial_=True)
-    except HydraException as error:
-        cause = innermost(error)
-        if isinstance(cause, HydraException | ImportError | TypeError):
-            raise ValueError(f"{place}: {cause}") from error
-        raise cause from error
-    try:
-        takes = inspect.signature(call.func)
+        takes = inspect.signature(target)
     except ValueError:  # compiled, it does not say what it takes
         return call
     try:
-        takes.bind(*first, *call.args, **call.keywords)
+        takes.bind(*first, **call.keywords)
     except TypeError as error:
-        name = getattr(call.func, "__name__", call.func)
+        name = getattr(target, "__name__", target)
         names = list(takes.parameters)[len(first) :]
         raise ValueError(f"{place}, {name}: {error}; it takes {names}") from error
     return call
+
+
+def _arguments(node: DictConfig, place: str) -> dict[str, Any]:
+    return {k: _built(node[k], f"{place}.{k}") for k in map(str, node) if k != "_target_"}
+
+
+def _built(node: Any, place: str) -> Any:
+    """A value of a config, with what it names at any depth made."""
+    if isinstance(node, ListConfig):
+        return [_built(each, f"{place}[{k}]") for k, each in enumerate(node)]
+    if not isinstance(node, DictConfig):
+        return node
+    if "_target_" not in node:
+        return {key: _built(node[key], f"{place}.{key!s}") for key in node}
+    call = call_of(node, place)
+    try:
+        return call()
+    except TypeError as error:
+        raise ValueError(f"{place} cannot be made: {error}") from error
 
 
 def instance_of(node: DictConfig, kind: type, place: str) -> Any:
@@ -174,7 +148,7 @@ class Configured:
         node = deepcopy(self.node)
         missing = object()
         for place, value in places.items():
-            write_defaults(node, place, partial(_target, place=self.place))
+            write_defaults(node, place, partial(target_of, place=self.place))
             if OmegaConf.select(node, place, default=missing) is missing:
                 raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
             OmegaConf.update(node, place, value)

@@ -21,6 +21,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from ep2sindy.app.typed_only import use_checked_loader
+
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -44,6 +46,7 @@ def main() -> None:
             inspect_files(sys.argv[2:], conf)
             return
         prepare_arguments(conf)
+        use_checked_loader()
 
         @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")
         def job(config: DictConfig) -> None:
@@ -53,7 +56,7 @@ def main() -> None:
 
         job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(f"error: {error or type(error).__name__}")
     except OSError as error:
         sys.exit(f"error: {error}; a folder that can be written is chosen with output=PATH")
     except KeyboardInterrupt:
@@ -83,6 +86,12 @@ def prepare_arguments(conf: Path) -> None:
     """Flags may stand anywhere, and configs in ./conf are found as with `--config-dir ./conf`."""
     flags = [text for text in sys.argv[1:] if text in ("-m", "--multirun")]
     sys.argv[1:] = [*flags, *(text for text in sys.argv[1:] if text not in flags)]
+    primary = ("--config-path", "-cp", "--config-name", "-cn")
+    if other := [text for text in sys.argv[1:] if text.startswith(primary)]:
+        raise ValueError(
+            f"every run begins with the package's own config.yaml, not with {other[0]!r}; "
+            "--config-dir FOLDER adds configs of yours"
+        )
     own = Path.cwd() / "conf"
     named = any(text.startswith(("--config-dir", "-cd")) for text in sys.argv[1:])
     if own.is_dir() and own.resolve() != conf.resolve() and not named:

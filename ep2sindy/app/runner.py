@@ -18,6 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
+from ep2sindy.app.targets import check_targets
+from ep2sindy.machine.own import own_module
 from ep2sindy.report.about import ASIDE, About, asked_of, by_place
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.page import page_html
@@ -42,6 +44,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     overrides: what was set on the command line; one that the study does not use is an error.
     """
     check_common(config)
+    check_targets(config)
     kind = study_class(config.get("study"))
     check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
     study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
@@ -54,21 +57,25 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
 def study_class(name: object) -> type:
     """The class `Study` of a module of `ep2sindy.studies`, or of one's own by its dotted name.
 
-    A folder holds it in its module `study`.
+    A folder holds it in its module `study`. One's own lies below the current folder.
     """
-    module = str(name) if "." in str(name) else f"ep2sindy.studies.{name}"
+    text = str(name)
+    inside = "." not in text or text.startswith("ep2sindy.")
+    module = text if "." in text else f"ep2sindy.studies.{text}"
+    load = import_module if inside else own_module
     try:
-        found = import_module(module)
+        found = load(module)
         if hasattr(found, "__path__") and not hasattr(found, "Study"):
             module = f"{module}.study"
-            found = import_module(module)
+            found = load(module)
         return found.Study
     except (ModuleNotFoundError, AttributeError) as error:
         if isinstance(error, ModuleNotFoundError) and not module.startswith(str(error.name)):
             raise  # the module is there, but one that it needs is not
         raise ValueError(
             f"study must name a module of ep2sindy.studies that has a class Study, one of "
-            f"{known_studies()}, or one of your own as package.module: {name!r} came"
+            f"{known_studies()}, or one of your own as package.module, below the folder that you "
+            f"start in: {name!r} came"
         ) from error
 
 

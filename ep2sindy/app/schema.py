@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
@@ -101,12 +102,24 @@ def _container(origin: type, parts: Sequence[Any], node: Any, place: str) -> Any
     if issubclass(origin, Mapping):
         if not OmegaConf.is_dict(node):
             raise ValueError(f"{place} must be like {{name: ...}}: {_plain(node)!r} came")
+        if parts[1] is Deferred or is_dataclass(parts[1]):
+            check_names(map(str, node), place)
         places = {key: f"{place}.{key}" for key in node}
         return {str(k): value_of(parts[1], _node(node, k, at), at) for k, at in places.items()}
     if not OmegaConf.is_list(node):
         raise ValueError(f"{place} must be a list: {_plain(node)!r} came")
     places = {k: f"{place}[{k}]" for k in range(len(node))}
     return [value_of(parts[0], _node(node, k, at), at) for k, at in places.items()]
+
+
+def check_names(names: Iterable[str], place: str) -> None:
+    """Raise ValueError for a name, of what files and headings are called by, that is more."""
+    for name in names:
+        if not re.fullmatch(r"\w[\w .,+-]{,99}", name):
+            raise ValueError(
+                f"{place} must be named by words, for files are named so: letters, digits and "
+                f"_ . , + -, not {name!r}"
+            )
 
 
 def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import tokenize
-from functools import cache
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import COORDINATE_UNITS
-from ep2sindy.library.units import PLAIN, netcdf_powers, registry, unit_product
+from ep2sindy.library.units import (
+    PLAIN,
+    check_unit,
+    netcdf_powers,
+    registry,
+    unit_errors,
+    unit_product,
+)
 
 # What our usual names mean: a unit of another kind is a mistake in the mapping.
 KNOWN_UNITS = {
@@ -22,16 +27,6 @@ NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
 
 # Names that end so keep this unit; all others are SI.
 SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
-
-
-@cache
-def _unit_errors() -> tuple[type[Exception], ...]:
-    """What pint raises on text that is no unit."""
-    import pint
-
-    return (
-        pint.PintError, ValueError, TypeError, AttributeError, ArithmeticError, tokenize.TokenError,
-    )  # fmt: skip
 
 
 def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = False) -> xr.DataArray:
@@ -65,10 +60,10 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
         given = given.to("kelvin") if target and given.check("[temperature]") else given
         # k_B T for a temperature that counts in eV
         ruler = given.to(target, "boltzmann") if target else given.to_base_units()
-    except _unit_errors() as error:
+    except unit_errors() as error:
         raise ValueError(
             f"the unit of {ours} must be one that converts to {target or 'SI'}: {unit!r} came "
-            f"({error}); write for example 'cm^-3', '1e19 m^-3', 'km/s'"
+            f"({error or type(error).__name__}); write for example 'cm^-3', '1e19 m^-3', 'km/s'"
         ) from None
     zero, one, two = (float(value) for value in ruler.magnitude)
     powers = ruler.dimensionality.values()
@@ -90,12 +85,13 @@ def same_unit(unit: str, stated: str) -> bool:
     """Whether both texts mean one unit; a text that is no unit says nothing against."""
     try:
         a, b = _ruler(unit).to_base_units(), _ruler(stated).to_base_units()
-    except _unit_errors():
+    except unit_errors():
         return True
     return a.check(b.dimensionality) and np.allclose(a.magnitude, b.magnitude, rtol=1e-9, atol=0.0)
 
 
 def _ruler(unit: str) -> Any:
     """0, 1 and 2 of a unit, which show its factor, its offset and whether it is linear."""
+    check_unit(unit)
     one: Any = registry().Quantity(netcdf_powers(unit))
     return registry().Quantity(np.arange(3.0) * one.magnitude, one.units)

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.readers.source import Source, damage_named
+from ep2sindy.library.names import check_variable
 
 # `probe[:, 1]`: part of an array, counted from 0.
 PART = re.compile(r"(.+?)\s*\[([\d:,\s-]+)\]")
@@ -55,14 +56,21 @@ class Problems:
         """Raise ValueError if there are any, with what the file holds where a name is missing."""
         if not self.found:
             return
-        text = self.found[0]
-        if len(self.found) > 1:
-            lines = "".join(f"\n  - {each}" for each in self.found)
-            text = f"{len(self.found)} things must be put right for {source.path}:{lines}\n"
-        if any(" no variable " in each for each in self.found):
-            text = f"{text.rstrip()}{'; it' if len(self.found) == 1 else '. It'}"
-            text += f" holds {listed(source)}; set the name, or null if the file has it not"
-        raise ValueError(text.rstrip())
+        if len(self.found) == 1:
+            raise ValueError(
+                f"the mapping must be put right: {self.found[0]}{self._held(source, '; it')}"
+            )
+        lines = "".join(f"\n  - {each}" for each in self.found)
+        raise ValueError(
+            f"{len(self.found)} things must be put right for {source.path}:{lines}"
+            f"{self._held(source, '. It')}"
+        )
+
+    def _held(self, source: Source, joined: str) -> str:
+        """What the file holds, where a name that it does not hold was asked for."""
+        if not any(" no variable " in each for each in self.found):
+            return ""
+        return f"{joined} holds {listed(source)}; set the name, or null if the file has it not"
 
 
 def in_file(
@@ -71,6 +79,8 @@ def in_file(
     """Those that the file has; a config's keys become a `Variable`."""
     found = {}
     for ours, value in variables.items():
+        with problems.noted():
+            check_variable(ours)
         if isinstance(value, Mapping):
             if not {"name", "unit"} <= set(value) <= {"name", "unit", "dims"}:
                 problems.found.append(

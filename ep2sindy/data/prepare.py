@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import SPACE, check_field, grid_points, mask_outside
+from ep2sindy.library.names import check_variable
 
 OPERATORS: Mapping[type, Callable] = {
     ast.Add: operator.add,
@@ -41,6 +42,7 @@ def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.D
     out. Computed in float64.
     Raises ValueError for an unknown name, one that is taken, or any other syntax.
     """
+    check_variable(name)
     if name in field:
         raise ValueError(f"a derived variable needs a new name: the field already has {name!r}")
     array = evaluate(field, expression)

@@ -42,6 +42,16 @@ _ARGUMENT = re.compile(
     rf"(?P<variable>{VARIABLE})\s*(?P<behind>[+-]\s*{NUMBER})?"
 )
 
+
+def check_variable(name: str) -> None:
+    """Raise ValueError for a name that no term could hold: it is no path and no markup either."""
+    if not re.fullmatch(r"[^\W\d]\w{,99}", name):
+        raise ValueError(
+            f"a variable's name must be a word of letters, digits and _, such as 'n_i': {name!r} "
+            "came"
+        )
+
+
 RECIPROCAL = "1/"  # the function of what stands below a fraction line
 
 

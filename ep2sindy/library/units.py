@@ -18,6 +18,40 @@ if TYPE_CHECKING:
 PLAIN = frozenset({"s", "m", "A", "V", "eV"})
 
 
+# How a unit may be written. What it says is reckoned out, so it must not be a sum to work on:
+# no power of a power, no brackets in brackets.
+_SIGNED = r"[({]?\s*[+-]?\d{1,2}(?:\.\d{1,2})?(?:/\d)?\s*[)}]?"
+_POWER = rf"(?:\s*(?:\^|\*\*)\s*{_SIGNED})?"
+_NUMBER = r"\d{1,20}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,2})?"
+_ONE = rf"(?:{_NUMBER}|[^\W\d]\w*(?:-\d{{1,2}}(?!\d))?|°\s?\w+|%){_POWER}"
+_JOIN = r"(?:\s*[*/.·×]\s*|\s+)"
+_FACTOR = rf"(?:{_ONE}|\({_ONE}(?:{_JOIN}{_ONE})*\){_POWER})"
+_UNIT = re.compile(rf"\s*{_FACTOR}(?:{_JOIN}{_FACTOR})*\s*")
+LONGEST = 60  # characters
+
+
+def check_unit(unit: str) -> None:
+    """Raise ValueError for text that is not written as a unit, before anything is made of it."""
+    if len(unit) > LONGEST or not _UNIT.fullmatch(unit):
+        shown = repr(unit) if len(unit) <= LONGEST else f"{unit[:LONGEST]!r}..."
+        raise ValueError(
+            f"a unit must be written as symbols and numbers joined by * / and ^, such as 'm^-3' "
+            f"or '1e19 m^-3': {shown} came; '1' is that of a pure number, 'm^-3' that of a count "
+            "in a volume"
+        )
+
+
+@cache
+def unit_errors() -> tuple[type[Exception], ...]:
+    """What pint raises on text that is no unit."""
+    import pint
+
+    return (
+        pint.PintError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError,
+        TokenError,
+    )  # fmt: skip
+
+
 @cache
 def registry() -> pint.UnitRegistry:
     """The one registry of the package; importing and building it takes a quarter of a second."""
@@ -33,11 +67,10 @@ def _powers(unit: str) -> dict[str, float]:
         return {}
     if unit in PLAIN:
         return {unit: 1.0}
-    import pint
-
     try:
+        check_unit(unit)
         parsed = registry().parse_units(unit)
-    except (pint.PintError, AttributeError, ValueError, TypeError):
+    except unit_errors():
         return {unit: 1.0}
     return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}  # type: ignore[arg-type]
 
@@ -45,11 +78,10 @@ def _powers(unit: str) -> dict[str, float]:
 @cache
 def unit_like(text: str, like: str | None = None) -> bool:
     """Whether a text is a unit, `like`: of the same kind as this one."""
-    import pint
-
     try:
+        check_unit(text)
         parsed = registry().parse_units(netcdf_powers(text)) if text.strip() else None
-    except (pint.PintError, AttributeError, ValueError, TypeError, TokenError):
+    except unit_errors():
         return False
     if parsed is None or like is None:
         return parsed is not None
@@ -95,11 +127,10 @@ class Clock:
 
         Raises ValueError for what is no unit of time.
         """
-        import pint
-
         try:
+            check_unit(unit)
             seconds = float(registry().Quantity(1.0, unit).to("s").magnitude)
-        except (pint.PintError, AttributeError, TypeError, TokenError) as error:
+        except unit_errors() as error:
             raise ValueError(
                 f"a unit of time must be such as 's', 'us', 'h' or 'year': {unit!r} came"
             ) from error

@@ -123,13 +123,16 @@ class SparseModel:
         initial: Float[np.ndarray, " n_states"] | None = None,
         blow_up: float = 100.0,
         rtol: float = 1e-8,
+        limit_s: float = 300.0,
     ) -> Rollout:
         """Integrate from one sample of a trajectory, driven by its inputs (cubic splines).
 
         trajectory: or a table or arrays (t, x), as `discover` takes them.
         initial: the state at that sample, in SI; None takes the data's.
         The states are scaled by their largest value in the window, so that one tolerance fits
-        all. A state that exceeds `blow_up` times that value ends the run as diverged.
+        all. A state that exceeds `blow_up` times that value ends the run as diverged. Stiff
+        equations go on implicitly; the run ends after some hundred evaluations per sample, or
+        `limit_s` of work, marked and with a message.
         Raises ValueError for a window outside the trajectory or a missing variable.
         """
         return rollout(
@@ -140,6 +143,7 @@ class SparseModel:
             initial=initial,
             blow_up=blow_up,
             rtol=rtol,
+            limit_s=limit_s,
         )
 
     def simulate(
@@ -150,6 +154,7 @@ class SparseModel:
         *,
         blow_up: float = 1e12,
         rtol: float = 1e-8,
+        limit_s: float = 300.0,
     ) -> Rollout:
         """Integrate freely from the state x0 at t[0], and give the states at the times t.
 
@@ -157,10 +162,11 @@ class SparseModel:
         joined by cubic splines, or by name such samples, a number, or a function of t in s.
         Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges is one
         too: marked `diverged`, with a message, it ends where a state exceeds `blow_up` times its
-        start (or, where that is zero, what its first rate makes of it), or the solver gave up.
+        start (or, where that is zero, what its first rate makes of it), or where the
+        solver gave up: see `rollout`.
         Raises ValueError for a missing or unknown input and for wrong shapes.
         """
-        return simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol)
+        return simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol, limit_s=limit_s)
 
     def predict(
         self, x: ArrayLike | Run, inputs: ArrayLike | Mapping[str, Any] | None = None

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.integrate import solve_ivp
 
 from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.edges import Border, Edge, edges_of
+from ep2sindy.model.edges import Border, edges_of
 from ep2sindy.model.inputs import Drive, driven, spline
 from ep2sindy.model.rates import used_terms
-
-# Evaluations of the right-hand side that a run may take: a hundred times what an oscillation
-# takes that its samples resolve. A model that blows up in steps ever smaller stops there.
-CALLS, CALLS_PER_SAMPLE = 20_000, 200
+from ep2sindy.model.solve import Rates, solved
 
 
 @runtime_checkable
@@ -98,6 +94,7 @@ def rollout(
     initial: Float[np.ndarray, " n_states"] | None,
     blow_up: float,
     rtol: float,
+    limit_s: float,
 ) -> Rollout:
     """Integrate along a trajectory: see `SparseModel.rollout`."""
     stop = trajectory.n_samples if n_samples is None else start + n_samples
@@ -114,6 +111,7 @@ def rollout(
         blow_up=blow_up,
         bound="the data's largest value",
         rtol=rtol,
+        limit_s=limit_s,
     )
     return replace(found, clock=trajectory.clock)
 
@@ -126,6 +124,7 @@ def simulate(
     *,
     blow_up: float,
     rtol: float,
+    limit_s: float,
 ) -> Rollout:
     """Integrate freely from one state: see `SparseModel.simulate`."""
     times, start = np.asarray(t, dtype=np.float64), np.asarray(x0, dtype=np.float64)
@@ -141,7 +140,9 @@ def simulate(
     values, terms = library.at_points([*model.states, *model.inputs])
     values[:] = np.append(start, samples[0])
     # What starts at zero is as large as its first rate makes it; what stays there, one.
-    reach = np.abs(start) + (start == 0.0) * np.abs(terms() @ coef) * (times[-1] - times[0])
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = np.abs(terms() @ coef) * (times[-1] - times[0])
+    reach = np.where((start == 0.0) & np.isfinite(moved), moved, np.abs(start))
     return _integrated(
         model,
         times,
@@ -152,6 +153,7 @@ def simulate(
         blow_up=blow_up,
         bound="its start",
         rtol=rtol,
+        limit_s=limit_s,
     )
 
 
@@ -166,41 +168,31 @@ def _integrated(
     blow_up: float,
     bound: str,
     rtol: float,
+    limit_s: float,
 ) -> Rollout:
     """From x0 over t, in units of `scale`, until a state exceeds `blow_up` of them."""
     border = _border(model, np.append(x0, samples[0]), drive, scale)
     if edge := border.beyond(t[0], x0 / scale):
         message = f"the start, at t = {t[0]:.6g} s, is outside {edge.text}"
         return _ended(model, t[:1], x0[None], samples, message, edge.function.name)
-    rhs = _Counted(_scaled_rhs(model, drive, scale), CALLS + CALLS_PER_SAMPLE * len(t), border)
-
-    def ends(t: float, y: np.ndarray) -> float:
-        return min(blow_up - float(np.abs(y).max()), rhs.left_s(t))
-
-    ends.terminal = True  # type: ignore[attr-defined]
-    # An overflow on the way to a blow-up is caught by the event, or ends the solver.
-    with np.errstate(over="ignore", invalid="ignore"):
-        solution = solve_ivp(
-            rhs,
-            (t[0], t[-1]),
-            x0 / scale,
-            method="DOP853",
-            t_eval=t,
-            events=[ends, border] if border.edges else [ends],
-            rtol=rtol,
-            atol=rtol,
-        )
-    message = _ending_text(solution, blow_up, bound, exhausted=rhs.given_up_s < np.inf)
-    if edge := _left(solution, rhs, border):
-        message = f"the run left {edge.text}, at t = {solution.t[-1]:.6g} s"
+    found = solved(
+        _scaled_rhs(model, drive, scale),
+        border,
+        t,
+        x0 / scale,
+        blow_up=blow_up,
+        bound=bound,
+        rtol=rtol,
+        limit_s=limit_s,
+    )
     return _ended(
         model,
-        solution.t,
-        solution.y.T * scale,
+        found.t,
+        found.y * scale,
         samples,
-        message,
-        edge.function.name if edge else "",
-        diverged=solution.status != 0,
+        found.message,
+        found.edge.function.name if found.edge else "",
+        diverged=found.ended_early,
     )
 
 
@@ -237,35 +229,7 @@ def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.
     return Border(edges_of(library.functions, [*model.states, *model.inputs], start), values)
 
 
-class _Counted:
-    """A right-hand side that may be evaluated so many times, and that knows its border."""
-
-    def __init__(
-        self, rhs: Callable[[float, np.ndarray], np.ndarray], budget: int, border: Border
-    ) -> None:
-        self.rhs, self.budget, self.border = rhs, budget, border
-        self.calls, self.given_up_s = 0, float("inf")
-        self.beyond: Edge | None = None
-        self.beyond_s = float("inf")
-
-    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
-        self.calls += 1
-        if edge := self.border.beyond(t, y):
-            self.beyond, self.beyond_s = edge, t
-        elif t > self.beyond_s and np.isfinite(y).all():  # a step too long has been mended
-            self.beyond = None
-        return self.rhs(t, y)
-
-    def left_s(self, t: float) -> float:
-        """Time until the run is given up, which is when it is first asked with nothing left."""
-        if self.calls > self.budget:
-            self.given_up_s = min(self.given_up_s, t)
-        return self.given_up_s - t
-
-
-def _scaled_rhs(
-    model: Equations, drive: Drive | None, scale: np.ndarray
-) -> Callable[[float, np.ndarray], np.ndarray]:
+def _scaled_rhs(model: Equations, drive: Drive | None, scale: np.ndarray) -> Rates:
     """The right-hand side for scaled states, with the absent terms left out."""
     present = np.flatnonzero(model.coef.any(axis=1))
     coef = model.coef[present] / scale
@@ -279,22 +243,3 @@ def _scaled_rhs(
         return terms() @ coef
 
     return rhs
-
-
-def _left(solution: Any, rhs: _Counted, border: Border) -> Edge | None:
-    """The edge that a run ended at, if it did: crossed, or too steep for a solver to cross."""
-    if border.edges and solution.status == 1 and solution.t_events[1].size:
-        return border.nearest(solution.t_events[1][0], solution.y_events[1][0])
-    return rhs.beyond if solution.status == -1 else None
-
-
-def _ending_text(solution: object, blow_up: float, bound: str, *, exhausted: bool) -> str:
-    status, t = solution.status, solution.t  # type: ignore[attr-defined]
-    last = t[-1] if len(t) else float("nan")
-    if status == 0:
-        return f"integrated to t = {last:.6g} s"
-    if status == 1 and exhausted:
-        return f"the solver gave up at t = {last:.6g} s: its steps became too small for the samples"
-    if status == 1:
-        return f"a state grew past {blow_up:g} times {bound} at t = {last:.6g} s"
-    return f"the solver stopped at t = {last:.6g} s: {solution.message}"  # type: ignore[attr-defined]

@@ -53,17 +53,23 @@ class RunFolder:
             ) from error
         raise OSError(f"1000 runs started in one second in {parent}; wait and start again")
 
+    def file(self, name: str, folder: str = "") -> Path:
+        """Where a result lies. Raises ValueError for a name that is a path."""
+        if name != Path(name).name or "\\" in name or not name.isprintable():
+            raise ValueError(f"a result's name must be that of a file, and no path: {name!r} came")
+        return self.path / folder / name
+
     def write_text(self, name: str, text: str) -> None:
-        write_text(self.path / name, text)
+        write_text(self.file(name), text)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        write_json(self.path / name, content)
+        write_json(self.file(name), content)
 
     def write_model(self, name: str, model: SparseModel) -> None:
-        model.save(self.path / "models" / f"{name}.json")
+        model.save(self.file(f"{name}.json", "models"))
 
     def write_table(self, name: str, table: pd.DataFrame) -> None:
-        self.write_text(f"tables/{name}.csv", table.to_csv(index=False))
+        write_text(self.file(f"{name}.csv", "tables"), table.to_csv(index=False))
 
     def write_figure(self, name: str, figure: Figure) -> bytes:
         """As PDF and PNG of one layout, which the figure keeps; returns what is in the PNG."""
@@ -71,7 +77,7 @@ class RunFolder:
         for suffix in ("pdf", "png"):
             # Without a date the same run gives the same file.
             dated = {"CreationDate": None} if suffix == "pdf" else {}
-            path = self.path / "figures" / f"{name}.{suffix}"
+            path = self.file(f"{name}.{suffix}", "figures")
             with replacing(path) as temporary:
                 figure.savefig(temporary, dpi=DPI, metadata=dated)
         return path.read_bytes()

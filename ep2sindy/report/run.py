@@ -46,7 +46,7 @@ class Run:
 
     def write(self, name: str, writer: Callable[[Path], None]) -> None:
         """A file of the study's own into the run folder, whole or not at all."""
-        with replacing(self.folder.path / name) as temporary:
+        with replacing(self.folder.file(name)) as temporary:
             writer(temporary)
 
     @contextmanager

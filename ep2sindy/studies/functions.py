@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from importlib import import_module
 
 from ep2sindy.library.functions import function_names
+from ep2sindy.machine.own import own_module
 
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
@@ -25,11 +25,11 @@ def _registered(text: str) -> str:
         return text
     module, name = found["module"], found["name"]
     try:
-        import_module(module)
+        own_module(module)
     except ImportError as error:
         raise ValueError(
             f"functions may name one of your own as MODULE.NAME: {text!r} came, and {error}; the "
-            "module must lie in the folder that you start in, or be installed"
+            "module must lie below the folder that you start in"
         ) from error
     if name not in function_names():
         raise ValueError(

@@ -76,7 +76,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Smoothing:
+class PySINDySmoothing:
     """Savitzky-Golay, then second-order differences; theta holds the smoothed states.
 
     window: samples. order: of the local polynomials.
@@ -104,7 +104,7 @@ class PySINDyStlsq:
 
     n_thresholds: int = 20
     smallest: float = 1e-3
-    smoothing: Smoothing = Smoothing()
+    smoothing: PySINDySmoothing = PySINDySmoothing()
 
     def candidates(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
@@ -118,7 +118,7 @@ class PySINDyStlsq:
 class PySINDySsr:
     """Stepwise sparse regression: the smallest normalised coefficient leaves, one at a time."""
 
-    smoothing: Smoothing = Smoothing()
+    smoothing: PySINDySmoothing = PySINDySmoothing()
 
     def candidates(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
@@ -143,7 +143,7 @@ class PySINDyEnsemble:
     n_dropped: int = 1
     n_thresholds: int = 12
     smallest: float = 3e-3
-    smoothing: Smoothing = Smoothing()
+    smoothing: PySINDySmoothing = PySINDySmoothing()
 
     def candidates(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator

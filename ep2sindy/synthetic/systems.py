@@ -8,11 +8,12 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
-from scipy.integrate import solve_ivp
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.edges import Border
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.solve import solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,16 +75,22 @@ def _integrated(
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]]:
     system = start.system
     t = np.arange(round(system.duration_s * system.rate_Hz)) / system.rate_Hz
-    solution = solve_ivp(
+    found = solved(
         lambda _, x: system.model.derivative(x, np.empty(0)),
-        (0.0, t[-1]),
+        Border((), lambda _, x: x),
+        t,
         start.initial,
-        method="DOP853",
-        t_eval=t,
+        blow_up=np.inf,
+        bound="",
         rtol=1e-10,
-        atol=1e-10,
+        limit_s=60.0,
     )
-    states = solution.y.T  # in this layout: sums over samples depend on it in the last digit
+    if found.ended_early:
+        raise ValueError(
+            f"{system.name} must run for duration_s={system.duration_s:g}: {found.message}; "
+            "choose milder parameters or a shorter duration"
+        )
+    states = found.y
     states.flags.writeable = False
     return t, states
 

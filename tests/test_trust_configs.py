@@ -1,0 +1,180 @@
+"""A config may come from anybody: it runs nothing, and writes nothing where nobody said so."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+from test_face import targets
+
+import ep2sindy as ep
+from ep2sindy.app.build import call_of
+from ep2sindy.app.defaults import defaults_of, plain
+from ep2sindy.app.runner import run_config, study_class
+from ep2sindy.app.targets import FOR_CONFIGS, check_targets
+from ep2sindy.studies.functions import registered
+
+ROOT = Path(__file__).resolve().parents[1]
+RUNS = "__import__('pathlib').Path('ran').touch()"
+# What Hydra would call, what writes or runs what it is given, and what is not for configs.
+REFUSED = [
+    "sympy.sympify", "joblib.load", "pandas.read_pickle", "numpy.load", "pathlib.Path.write_text",
+    "os.system", "subprocess.run", "builtins.eval", "builtins.exec", "builtins.dict", "torch.load",
+    "functools.partial", "importlib.import_module", "hydra.utils.instantiate", "shutil.rmtree",
+    "ep2sindy.write_field", "ep2sindy.SparseModel.load", "ep2sindy.SparseModel",
+    "ep2sindy.discover", "ep2sindy.register_function", "ep2sindy.for_configs",
+    "ep2sindy.machine.files.write_text", "ep2sindy.app.build.call_of",
+    "ep2sindy.studies.functions._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
+    "ep2sindy._MODULES", "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_only_what_is_for_configs_is_built(name: object) -> None:
+    node = OmegaConf.create({"_target_": name})
+    with pytest.raises(ValueError, match=r"here must name a _target_ .*came"):
+        call_of(node, "here")
+    inner = OmegaConf.create({"_target_": "ep2sindy.Weak", "windows": {"_target_": name}})
+    with pytest.raises(ValueError, match=r"here\.windows must name a _target_ .*came"):
+        call_of(inner, "here")
+    with pytest.raises(ValueError, match=r"a\.b\[0\] must name a _target_ .*came"):
+        check_targets(OmegaConf.create({"a": {"b": [{"_target_": name}]}}))
+
+
+def test_a_config_is_refused_before_anything_of_it_is_built(tmp_path: Path) -> None:
+    evil = {"_target_": "sympy.sympify", "a": RUNS}
+    common = {"seed": 0, "experiment": "toy", "study": "libraries", "output": str(tmp_path)}
+    with pytest.raises(ValueError, match=r"x\[0\] must name a _target_ .*'sympy.sympify' came"):
+        run_config(OmegaConf.create({**common, "x": [evil]}))
+    assert not list(tmp_path.iterdir())
+
+
+def test_keys_of_hydra_in_a_node_do_nothing_but_are_refused() -> None:
+    for key, value in (("_args_", [1]), ("_partial_", True), ("_recursive_", False)):
+        node = OmegaConf.create({"_target_": "ep2sindy.EBIC", key: value})
+        with pytest.raises(ValueError, match=f"unexpected keyword argument '{key}'"):
+            call_of(node, "rule")
+
+
+@pytest.mark.parametrize("name", sorted(FOR_CONFIGS))
+def test_defaults_that_are_written_out_can_be_built_again(name: str) -> None:
+    written = plain(defaults_of(getattr(ep, name)))
+    assert {each.removeprefix("ep2sindy.") for each in targets(written)} <= FOR_CONFIGS
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a module of the user's own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "my_steps.py").write_text(
+        "import os\nimport ep2sindy as ep\n"
+        "@ep.for_configs\ndef half(field):\n    return field / 2\n"
+        "def wipe(folder):\n    raise AssertionError('this ran')\n"
+        "class Study:\n    pass\n"
+    )
+    yield tmp_path
+    for name in ("my_steps", "my_pack", "my_pack.study"):
+        sys.modules.pop(name, None)
+
+
+def test_a_function_of_ones_own_is_taken_where_it_is_marked(own: Path) -> None:
+    assert call_of(OmegaConf.create({"_target_": "my_steps.half"}), "prepare[0]", None)(4.0) == 2.0
+    for name in ("wipe", "os.system", "os", "nothing"):
+        with pytest.raises(ValueError, match=f"'my_steps.{name}' came"):
+            call_of(OmegaConf.create({"_target_": f"my_steps.{name}", "folder": "/"}), "here")
+    with pytest.raises(ValueError, match=r"mark it with @ep\.for_configs where it is defined"):
+        call_of(OmegaConf.create({"_target_": "my_steps.wipe", "folder": "/"}), "here")
+    (own / "my_pack").mkdir()
+    (own / "my_pack" / "study.py").write_text("class Study:\n    pass\n")
+    assert study_class("my_pack.study").__module__ == "my_pack.study"
+
+
+@pytest.mark.parametrize("name", ["idlelib.idle", "this.Study", "os.path", "..my_steps", "a/b.c"])
+def test_studies_and_functions_are_the_packages_or_lie_in_the_folder(name: str, own: Path) -> None:
+    before = set(sys.modules)
+    with pytest.raises(ValueError, match="below the folder that you start in"):
+        study_class(name)
+    if "/" not in name and not name.startswith("."):
+        with pytest.raises(ValueError, match="must lie below the folder that you start in"):
+            registered([f"{name}.tanh(x)"])
+    assert not {"idlelib", "this"} & (set(sys.modules) - before)
+
+
+def program(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ep2sindy.app.main", *arguments],
+        cwd=cwd,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+CALLBACK = {"_target_": "sympy.sympify", "_args_": [RUNS]}
+ELSEWHERE = [
+    ({"hydra": {"callbacks": {"x": CALLBACK}}}, "hydra.callbacks must stay as it is"),
+    ({"hydra": {"job_logging": {"filters": {"f": {"()": "os.abort"}}}}}, "job_logging must stay"),
+    ({"hydra": {"run": {"dir": "../elsewhere"}}}, "must not set hydra.run.dir"),
+    ({"hydra": {"output_subdir": "elsewhere"}}, "must not set hydra.output_subdir"),
+    ({"hydra": {"job": {"env_set": {"PATH": "."}}}}, "must not set hydra.job.env_set.PATH"),
+    ({"hydra": {"launcher": {"_target_": "os.abort"}}}, "must not set hydra.launcher._target_"),
+    ({"hydra": {"sweeper": {"params": {"seed": "0,1"}}}}, "must not set hydra.sweeper.params.seed"),
+    ({"output": "../elsewhere"}, "output to a folder below the one that you start in"),
+    ({"output": "${oc.env:PATH}"}, "output to a folder below"),
+    ({"data": {"cache": "/elsewhere"}}, "data.cache to a folder below"),
+    ({"parallel": {"_target_": "ep2sindy.Dask", "address": "tcp://a:1"}}, "parallel.address, for"),
+]
+
+
+@pytest.mark.parametrize(("said", "message"), ELSEWHERE, ids=lambda v: v if type(v) is str else "")
+def test_a_file_cannot_say_what_must_be_typed(
+    said: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through Hydra's own door, in this process: what it would do with the config comes later."""
+    from hydra._internal.utils import create_config_search_path
+    from hydra.core.config_search_path import SearchPathQuery
+    from hydra.types import RunMode
+
+    from ep2sindy.app.typed_only import CheckedLoader
+
+    (tmp_path / "exp").mkdir()
+    text = "# @package _global_\ndefaults: [discover, _self_]\n" + OmegaConf.to_yaml(said)
+    (tmp_path / "exp" / "theirs.yaml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    path = create_config_search_path(str(ROOT / "conf"))
+    path.prepend("command-line", f"file://{tmp_path}", SearchPathQuery(provider="schema"))
+    loader = CheckedLoader(path)
+    assert loader.load_configuration("config", ["+exp=discover"], RunMode.RUN).seed == 0
+    for mode in (RunMode.RUN, RunMode.MULTIRUN):
+        with pytest.raises(ValueError, match=message):
+            loader.load_configuration("config", ["+exp=theirs"], mode)
+
+
+def test_what_is_typed_is_the_users_own_wish(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    here = tmp_path / "here"
+    here.mkdir()
+    result = program("-m", "+exp=discover", f"output={elsewhere}", "seed=-1", cwd=here)
+    assert "seed must be a whole number" in result.stdout
+    assert list(elsewhere.iterdir())
+
+
+def test_the_program_looks_before_hydra_does(tmp_path: Path) -> None:
+    """In the whole program, for Hydra's parts may move: neither a run nor a sweep obeys it."""
+    (tmp_path / "conf" / "exp").mkdir(parents=True)
+    text = "# @package _global_\ndefaults: [discover, _self_]\n" + OmegaConf.to_yaml(
+        {"hydra": {"callbacks": {"x": CALLBACK}}}
+    )
+    (tmp_path / "conf" / "exp" / "theirs.yaml").write_text(text)
+    for arguments in (["+exp=theirs"], ["-m", "+exp=discover,theirs"]):
+        result = program(*arguments, cwd=tmp_path)
+        assert result.returncode == 1
+        assert "error: hydra.callbacks must stay as it is" in result.stderr
+        assert "Traceback" not in result.stderr
+    assert {path.name for path in tmp_path.iterdir()} <= {"conf", "outputs"}  # it has not run
+    result = program("--config-path", str(tmp_path), "+exp=discover", cwd=tmp_path)
+    assert "error: every run begins with the package's own config.yaml" in result.stderr

@@ -1,0 +1,116 @@
+"""Names from configs are neither paths nor markup."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
+from programs import composed
+
+import ep2sindy as ep
+from ep2sindy.app.runner import run_config
+from ep2sindy.app.schema import value_of
+from ep2sindy.report.about import About
+from ep2sindy.report.document import Equation, Link, Section, Table, Text
+from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.page import page_html
+from ep2sindy.report.picture import drawn
+from ep2sindy.report.screen import Screen
+
+PATHS = ["../../x", "/tmp/x", "a/b", "a\\b", "..", ".", "", "~x", "a\nb", "a\0b", "x" * 300]
+MARKUP = ["<script>alert(1)</script>", "[/red]", "$x_{$", "a&b", '"onload="alert(1)', "'", "{{x}}"]
+
+
+@dataclass(frozen=True)
+class Inner:
+    width: float
+
+
+@pytest.mark.parametrize("name", [*PATHS, *MARKUP])
+def test_what_a_config_names_is_called_by_words(name: str) -> None:
+    with pytest.raises(ValueError, match="models must be named by words, for files are named so"):
+        value_of(Mapping[str, Inner], OmegaConf.create({name: {"width": 1.0}}), "models")
+
+
+@pytest.mark.parametrize("name", [*PATHS, *MARKUP, "1x", "a b"])
+def test_variables_are_words(name: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", x=np.arange(5.0))
+    with pytest.raises(ValueError, match="a variable's name must be a word"):
+        ep.open_field(tmp_path / "a.npz", variables={name: ep.Variable("x", "1")}, dt_s=1.0)
+    field = xr.Dataset({"x": ("time", np.arange(5.0))}, coords={"time": np.arange(5.0)})
+    with pytest.raises(ValueError, match="a variable's name must be a word"):
+        ep.derive(field, name=name, expression="2*x", units="1")
+
+
+@pytest.mark.parametrize("name", ["../../x", "/tmp/x", "a/b", "a\\b", "a\nb"])
+def test_a_run_writes_nowhere_but_in_its_folder(name: str, tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path, "toy", now=datetime(2020, 1, 1))
+    before = sorted(tmp_path.rglob("*"))
+    model = ep.lorenz().model
+    for write in (
+        lambda: folder.write_text(name, ""),
+        lambda: folder.write_json(name, {}),
+        lambda: folder.write_model(name, model),
+        lambda: folder.write_table(name, pd.DataFrame()),
+        lambda: folder.write_figure(name, Figure()),
+    ):
+        with pytest.raises(ValueError, match="must be that of a file, and no path"):
+            write()
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["../../x", "<b>x</b>"])
+def test_an_experiment_refuses_such_names_before_it_makes_a_folder(
+    name: str, tmp_path: Path
+) -> None:
+    config = composed("+exp=breathing", f"output={tmp_path}")
+    config.libraries = {name: config.libraries.simple}
+    with pytest.raises(ValueError, match="libraries must be named by words"):
+        run_config(config)
+    config = composed("+exp=breathing", f"output={tmp_path}")
+    config.experiment = name
+    with pytest.raises(ValueError, match="experiment names a folder"):
+        run_config(config)
+    assert not list(tmp_path.iterdir())
+
+
+class Tags(HTMLParser):
+    """All elements of a page, with their attributes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found += [tag, *(name for name, _ in attrs)]
+
+
+@pytest.mark.parametrize("text", MARKUP)
+def test_page_and_screen_show_markup_as_it_is(text: str, tmp_path: Path) -> None:
+    def page(text: str) -> str:
+        table = pd.DataFrame({text: [text, Link(text, text), Equation("x", {"x": 1.0}, lead=text)]})
+        blocks = [
+            Text(text), Text(text, warning=True), Table(table, title=text, note=text),
+            Equation("x", {"x": 1.0}, lead=text, mark=text, unit=text),
+        ]  # fmt: skip
+        provenance = {"commit": text, "seed": text, "command": [text], "versions": {text: text}}
+        about = About(text, {text: text}, [text], [text], provenance, text)
+        figures = {"a": drawn(Figure(), b"", text)}
+        sections = [Section(text, blocks)]
+        screen = Screen(tmp_path / "run.log")
+        screen.show(sections)
+        screen.close()
+        return page_html(text, sections, figures, about)
+
+    tags, harmless = Tags(), Tags()
+    tags.feed(page(text))
+    assert text in (tmp_path / "run.log").read_text()
+    harmless.feed(page("word"))
+    assert tags.found == harmless.found
