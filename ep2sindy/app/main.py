@@ -1,6 +1,7 @@
 """The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
 `ep2sindy compare RUN RUN` sets run folders side by side instead.
+`ep2sindy inspect PATH` looks into files instead.
 
 Only Hydra is imported here: `--help` must not wait for the numerics.
 """
@@ -36,6 +37,11 @@ def main() -> None:
             from ep2sindy.app.compare import main as compare_runs
 
             compare_runs(sys.argv[2:])
+            return
+        if sys.argv[1:2] == ["inspect"]:
+            from ep2sindy.app.inspection import main as inspect_files
+
+            inspect_files(sys.argv[2:], conf)
             return
         prepare_arguments(conf)
 

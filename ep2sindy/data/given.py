@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 
+from ep2sindy.data.gaps import MissingSamples, gap_words, present_rows
 from ep2sindy.data.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -26,7 +28,8 @@ def trajectories_of(runs: object) -> list[Trajectory]:
     """One run or a list of them as trajectories.
 
     A run is a Trajectory; a pandas DataFrame with a column of times in s (`time`, `t`, `time_s`,
-    `t_s`) or an index of that name, its other columns being states; or a tuple (t, x) of times
+    `t_s`) or an index of that name, its other columns being states, and rows that hold a NaN left
+    out with the warning `MissingSamples`; or a tuple (t, x) of times
     (samples,) and states (samples,) or (samples, n_states), which are then called x, or x0, x1 ...
     Raises ValueError for anything else, and as Trajectory does.
     """
@@ -78,7 +81,12 @@ def _from_table(table: pd.DataFrame) -> Trajectory:
         way_out = "give time in s, as numbers" if str(times[0]) in wrong else "drop them"
         raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
     values = table[states].to_numpy(dtype=np.float64)
-    return Trajectory(table[times[0]].to_numpy(dtype=np.float64), values, list(map(str, states)))
+    t = table[times[0]].to_numpy(dtype=np.float64)
+    if np.isnan(values).any():
+        present = present_rows(dict(zip(map(str, states), values.T, strict=True)))
+        t, values = t[present], values[present]
+        warnings.warn(gap_words(t, len(table)), MissingSamples, stacklevel=5)
+    return Trajectory(t, values, list(map(str, states)))
 
 
 def _from_arrays(t: object, x: object) -> Trajectory:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -39,6 +40,25 @@ def _powers(unit: str) -> dict[str, float]:
     except (pint.PintError, AttributeError, ValueError, TypeError):
         return {unit: 1.0}
     return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}  # type: ignore[arg-type]
+
+
+@cache
+def unit_like(text: str, like: str | None = None) -> bool:
+    """Whether a text is a unit, `like`: of the same kind as this one."""
+    import pint
+
+    try:
+        parsed = registry().parse_units(netcdf_powers(text)) if text.strip() else None
+    except (pint.PintError, AttributeError, ValueError, TypeError, TokenError):
+        return False
+    if parsed is None or like is None:
+        return parsed is not None
+    return parsed.is_compatible_with(like)
+
+
+def netcdf_powers(unit: str) -> str:
+    """`m-3`, as netCDF writes it, as `m^-3`."""
+    return re.sub(r"\b([A-Za-zµ]+)(-?\d+)\b", r"\1^\2", unit)
 
 
 def unit_product(factors: Iterable[tuple[str, int | float]]) -> str:

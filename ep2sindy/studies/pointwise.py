@@ -27,7 +27,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import A_LIST, Count, Names
 from ep2sindy.studies.pointwise_view import Outcome
 from ep2sindy.studies.simulated import say_simulation
-from ep2sindy.studies.source import FieldSource
+from ep2sindy.studies.source import FieldSource, say_field
 from ep2sindy.thruster.parameters import Thruster
 
 # What does not change the result of a point, and may differ when a broken run is taken up.
@@ -71,6 +71,7 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         field = self.source.field()
         say_simulation(run, field.attrs)
+        say_field(run, field)
         lacking = [name for name in self.variables_if_present if name not in field]
         search = self.search(self.library(lacking=lacking), seed=run.seed)
         left_out = [name for name in map(str, self.terms) if name not in search.library.names]

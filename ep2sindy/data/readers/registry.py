@@ -32,6 +32,8 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
     """
     if not path.exists():
         raise ValueError(f"no such file: {path.absolute()}")
+    if path.is_file() and path.stat().st_size == 0:
+        raise ValueError(f"{path} is empty: it holds no bytes; was it written to the end?")
     look = look_at(path)
     claims = [reader.claim(look) for reader in readers]
     if any(claims):

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import xarray as xr
+
+from ep2sindy.data.fields import channel_length_m
 
 # Time stays a number, whatever its attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
@@ -25,13 +27,23 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 class Source:
     """A file opened: the names it holds, and the array of one name.
 
-    dims_named: whether the arrays' dimension names are the file's own.
+    dims_named: whether the arrays' dimension names are the file's own. aliases: further names that
+    it answers to, such as a column's number. units: name -> unit that all files of the kind have.
+    step_s: of time, where the file says it elsewhere than in an array. channel_m: length of a
+    thruster's channel, where the file says it. words: how it was read, for those who look into it.
+    is_table: whether its arrays are columns.
     """
 
     path: Path
     names: Sequence[str]
     read: Callable[[str], xr.DataArray]
     dims_named: bool = False
+    aliases: Sequence[str] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    step_s: float | None = None
+    channel_m: float | None = None
+    words: str = ""
+    is_table: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,8 @@ def damage_named(path: Path) -> Iterator[None]:
 def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
     """Variables of a dataset whose dimensions the file names."""
     names = [str(name) for name in dataset.variables]
-    return Source(path, names, lambda name: dataset[name], dims_named=True)
+    length = channel_length_m(dataset.attrs)
+    return Source(path, names, lambda name: dataset[name], dims_named=True, channel_m=length)
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:
