@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,7 +29,7 @@ def blocks(page: Path) -> list[Block]:
     fences = list(FENCE.finditer(text))
     follows = [False] + [
         not re.sub(r"</?t[rdh]>|\s", "", text[before.end() : after.start()])
-        for before, after in zip(fences, fences[1:], strict=False)
+        for before, after in pairwise(fences)
     ]
     found: list[Block] = []
     k = 0
