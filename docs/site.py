@@ -67,8 +67,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """Markdown inside the cells of HTML tables, as GitHub reads it."""
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Pages called by their titles; Markdown inside the cells of HTML tables, as GitHub reads it."""
+
+    def titled(link: re.Match[str]) -> str:
+        target = files.get_file_from_path(link[1])
+        title = target and re.match(r"# (.*)", target.content_string)
+        return f"[{title[1]}]({link[2]})" if title else link[0]
+
+    markdown = re.sub(r"\[(\w+\.md)\]\((\1[^)]*)\)", titled, markdown)
     return re.sub(r"<(table|tr|td|th)>", r'<\1 markdown="1">', markdown)
 
 
