@@ -24,24 +24,22 @@ def names_of(obj: griffe.Object) -> set[str]:
 
 
 def markdown_of(text: str, names: set[str]) -> str:
-    """One line of a docstring after the other, code blocks (four spaces after a blank) as they are.
+    """One line of a docstring after the other; code blocks and examples as they are.
 
     names: what a line such as `t: (samples,) in s` may describe.
     """
     done: list[str] = []
-    is_code, after_blank = False, True
-    for line in text.splitlines():
-        if line.startswith("    ") and (after_blank or is_code):
-            is_code = True
-            done.append(line)
+    for block in re.split(r"\n\s*\n", text):
+        if block.startswith(">>>"):
+            done.append(f"```pycon\n{block.rstrip()}\n```")
+        elif block.startswith("    "):
+            done.append(block)
         else:
-            is_code = is_code and not line
-            done.extend(_prose(line, names, after_blank))
-        after_blank = not line.strip()
-    return "\n".join(done)
+            done.append("\n".join(t for line in block.splitlines() for t in _prose(line, names)))
+    return "\n\n".join(done)
 
 
-def _prose(line: str, names: set[str], after_blank: bool) -> list[str]:
+def _prose(line: str, names: set[str]) -> list[str]:
     line = " ".join(line.split())
     sentences = re.split(r"(?<=\.) (?=\w+: )", line)  # `t: in s. values: in u.` are two
     found = []

@@ -21,11 +21,15 @@ import ep2sindy
 # Page of the reference -> the rooms (or modules) whose names in the face it shows.
 REFERENCE = {
     "Discover": [
-        "discovery.discover", "discovery.recipe", "estimation", "discovery.shared_support",
+        "discovery.discover", "discovery.recipe", "estimation.joint", "estimation",
+        "discovery.shared_support",
     ],
-    "Data": ["data", "library.units", "synthetic"],
+    "Data": [
+        "data.trajectory", "data.inspection", "data.open", "data.zones", "data", "library.units",
+        "synthetic",
+    ],
     "Libraries": ["library.library", "library.functions", "library.equations"],
-    "Models": ["model"],
+    "Models": ["model.model", "model"],
     "Regressions": ["regression", "constraints"],
     "Searches": ["search"],
     "Selection": ["selection"],
@@ -37,7 +41,7 @@ REFERENCE = {
         "studies.parametric",
     ],
     "Grids": ["discovery.pointwise", "discovery.blocks", "discovery.regimes", "machine"],
-    "Thruster": ["thruster"],
+    "Thruster": ["thruster.parameters", "thruster.axial", "thruster"],
     "PySINDy": ["studies.pysindy_variants"],
 }  # fmt: skip
 CONTENTS = """# Reference
@@ -68,7 +72,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Pages called by their titles; Markdown inside the cells of HTML tables, as GitHub reads it."""
+    """Pages called by their titles; Markdown in the cells of HTML tables, as GitHub reads it."""
 
     def titled(link: re.Match[str]) -> str:
         target = files.get_file_from_path(link[1])
@@ -98,12 +102,15 @@ def _formula(tex: str, display: str) -> str:
 
 
 def names_of(title: str) -> list[str]:
-    """The names of the face on a page of the reference, in the order of the face."""
-    return [
-        name
-        for name, module in ep2sindy._MODULES.items()
-        if any(f"{module}.".startswith(f"{place}.") for place in REFERENCE[title])
-    ]
+    """The names of the face on a page of the reference, in the order of its places."""
+    return list(
+        dict.fromkeys(
+            name
+            for place in REFERENCE[title]
+            for name, module in ep2sindy._MODULES.items()
+            if f"{module}.".startswith(f"{place}.")
+        )
+    )
 
 
 def _path(title: str) -> str:

@@ -1,5 +1,6 @@
 """README and docs hold: their Python runs, prints what they say, and their commands compose."""
 
+import doctest
 import io
 import re
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+import ep2sindy as ep
 from ep2sindy.app.runner import check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
@@ -183,3 +185,20 @@ def test_pysindys_examples_take_no_more_lines_here() -> None:
 )
 def test_what_is_printed_is_compared(came: str, is_right: bool) -> None:
     assert (not difference("x' = 0.665 x - 1 (±0.002) y\n...\nend", came)) == is_right
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [n for n in ep._MODULES if ">>> " in (getattr(ep, n).__doc__ or "")]
+)
+def test_the_example_of_a_docstring_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a folder that holds run.nc."""
+    monkeypatch.chdir(tmp_path)
+    write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "run.nc")
+    text = getattr(ep, name).__doc__
+    example = doctest.DocTestParser().get_doctest(text, {"ep": ep, "np": np}, name, None, None)
+    said: list[str] = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append)
+    assert not said, "".join(said)

@@ -70,6 +70,12 @@ def trace(
     "auto" leaves a hundred to a period. detrend: a straight line is taken out: a positive signal
     is divided by it, another less it, and the mean stays.
     Raises ValueError for a signal that does not oscillate, under six periods, or a wrong setting.
+
+    >>> t = np.linspace(0.0, 1e-3, 2001)
+    >>> current = 3.0 + np.sin(2e4 * np.pi * t)
+    >>> signal = ep.trace(ep.Trajectory(t, current[:, None], ["I_d"], units={"I_d": "A"}))
+    >>> round(1e6 * signal.period_s), signal.is_positive
+    (100, True)
     """
     name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal
     if name is None:
