@@ -41,6 +41,13 @@ class Discovery:
     note: how a rule that judges whole systems of equations came to its model, how sure a joint
     search is, or that a model leaves more than noise; else empty.
     estimate: of states and coefficients together, where the search was joint.
+
+    >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    >>> found = ep.discover(run)
+    >>> found.model.terms("x")
+    {'x': 0.66..., 'x*y': -0.99...}
+    >>> found.fronts["y"].candidates[2].terms
+    ('y', 'x*y')
     """
 
     fronts: Mapping[str, ParetoFront] = field(repr=False)
@@ -100,10 +107,6 @@ def discover(
     the search, in the selection and in the model. terms: by state, all the terms of an equation
     that is known but for its coefficients.
     Raises ValueError for a relation or a term that the library or the states do not have.
-
-    >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    >>> ep.discover(run).model.terms("x")
-    {'x': 0.66..., 'x*y': -0.99...}
     """
     trajectories = trajectories_of(runs)
     library = polynomial(trajectories[0].names, degree=2) if library is None else library

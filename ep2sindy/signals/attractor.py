@@ -74,10 +74,6 @@ def find_cycle(
     it, fits all samples best: white noise averages out. n_harmonics: None takes as many as the
     samples bear (BIC). None is returned for fewer than three periods, or where the waveform
     explains less than half of the variance: chaos, noise, a transient.
-
-    >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    >>> round(1.0 / ep.find_cycle(run.t, run.states).frequency_Hz, 1)
-    15.0
     """
     spread = states.std(axis=0)
     # Rounding on a state that rests is no oscillation.
