@@ -72,7 +72,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Pages called by their titles; Markdown in the cells of HTML tables, as GitHub reads it."""
+    """Pages called by their titles; links and cells of HTML tables, as GitHub reads them."""
+    if page.file.src_uri != "first_steps.md":
+        markdown = markdown.replace(f"({NOTEBOOK})", "(first_steps.md)")
 
     def titled(link: re.Match[str]) -> str:
         target = files.get_file_from_path(link[1])

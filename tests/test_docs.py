@@ -21,7 +21,7 @@ from ep2sindy.app.runner import check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.synthetic.regions import three_regions
-from tests.pages import PAGES, ROOT, arguments, blocks, commands, difference
+from tests.pages import FENCE, PAGES, ROOT, arguments, blocks, commands, difference
 from tests.programs import EXPERIMENTS, composed
 
 CONF = ROOT / "conf"
@@ -159,6 +159,12 @@ def test_choices_and_modules_that_a_page_names_are_there(page: Path) -> None:
         r"`(?:docs|conf/exp|ep2sindy|tests|benchmarks)/[\w/.]+\.(?:py|md|yaml)`", text
     ):
         assert (ROOT / name.strip("`")).is_file() or re.search("NAME|my_", name), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_a_page_links_to_is_there(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", FENCE.sub("", page.read_text("utf-8"))):
+        assert target.startswith("http") or (page.parent / target).is_file(), target
 
 
 def test_pysindys_examples_take_no_more_lines_here() -> None:
