@@ -76,10 +76,10 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.machine.parallel import Dask as Dask
     from ep2sindy.machine.parallel import Loky as Loky
     from ep2sindy.machine.parallel import Serial as Serial
-    from ep2sindy.model.free_run import Bounds as Bounds
     from ep2sindy.model.free_run import FreeRun as FreeRun
-    from ep2sindy.model.free_run import Verdict as Verdict
     from ep2sindy.model.free_run import free_run as free_run
+    from ep2sindy.model.likeness import Bounds as Bounds
+    from ep2sindy.model.likeness import Verdict as Verdict
     from ep2sindy.model.model import SparseModel as SparseModel
     from ep2sindy.model.model import coef_matrix as coef_matrix
     from ep2sindy.model.rollout import Rollout as Rollout
@@ -241,7 +241,8 @@ _FACE = {
     "library.library": "Library polynomial named_terms",
     "machine.parallel": "Serial Loky Dask",
     "library.units": "Clock",
-    "model.free_run": "Bounds FreeRun Verdict free_run",
+    "model.free_run": "FreeRun free_run",
+    "model.likeness": "Bounds Verdict",
     "model.model": "SparseModel coef_matrix",
     "model.rollout": "Rollout",
     "model.scores": "r2",
