@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: breathing test test-slow lint benchmark clean
+.PHONY: breathing test test-slow lint docs benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -25,6 +25,10 @@ test: lint
 test-slow: lint
 	$(BIN)/python -m pytest -q
 
+# The site, into ./site; a warning is an error. Its notebook is run on the way.
+docs: .venv/installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+
 benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.search
@@ -40,4 +44,4 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.trajectory_scores
 
 clean:
-	rm -rf .venv .cache .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv site .cache .mypy_cache .ruff_cache .pytest_cache

@@ -167,6 +167,10 @@ def inspect(path: str | Path) -> Inspection:
     experiment; `ep2sindy.open_field(path, variables=found.variables, time=found.time, z=found.z,
     r=found.r, dt_s=found.dt_s)` opens what it found.
     Raises ValueError for a file that is missing, empty, damaged or of no known kind.
+
+    >>> found = ep.inspect("run.nc")
+    >>> found.variables["n_i"].unit
+    'm^-3'
     """
     path = Path(path)
     source = open_source(path)

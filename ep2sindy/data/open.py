@@ -56,6 +56,10 @@ def open_field(
     Raises ValueError, in one answer, for all names that the file does not hold, shapes that do
     not fit their dimensions, and units that cannot be converted; for a file that is missing,
     damaged or of another kind.
+
+    >>> field = ep.open_field("run.nc")  # its names, units and shapes leave no doubt
+    >>> field["n_i"].attrs["units"]
+    'm^-3'
     """
     source = open_source(Path(path))
     axes = {"time": time, "z": z, "r": r}

@@ -36,6 +36,11 @@ class Trajectory:
     clock: the unit that people read its times in; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are
     not finite, repeated names, fewer than two samples, or a state that never changes.
+
+    >>> t = np.linspace(0.0, 1e-3, 101)
+    >>> run = ep.Trajectory(t, np.sin(6e4 * t)[:, None], ["I_d"], units={"I_d": "A"})
+    >>> run.n_samples, run.columns(["I_d"]).shape
+    (101, (101, 1))
     """
 
     # Lengths read `_`, since __post_init__ compares them and says what to do.

@@ -55,6 +55,9 @@ def zone_average(
     of time alone lacks (NaN) are left out for all.
     Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
     value that is not finite in a cell that is not masked.
+
+    >>> field = ep.read_field("run.nc")
+    >>> run = ep.zone_average(field, ep.Zone(z=(0.01, 0.02)), states=["n_i", "n_n"])
     """
     check_field(field)
     columns = {name: [(name, 1)] for name in (*states, *inputs)}
