@@ -81,5 +81,5 @@ def test_a_cut_classic_file_of_64_bit_sizes_is_refused(tmp_path: Path, unlimited
     np.testing.assert_array_equal(values(path), T + 1)
     for n_bytes in (len(whole) - 5, len(whole) // 2, 90, 10):
         path.write_bytes(whole[:n_bytes])
-        with pytest.raises(ValueError, match="a.nc cannot be read: its header"):
+        with pytest.raises(ValueError, match="a.nc cannot be read: "):
             values(path)
