@@ -461,11 +461,11 @@ def test_a_failed_write_leaves_the_old_file(
     field = open_field(npz(tmp_path), **SETTINGS)
     write_field(field, tmp_path / "field.nc")
 
-    def interrupted(self: xr.Dataset, path: Path, engine: str) -> None:
-        path.write_bytes(b"half")
+    def interrupted(path: Path, content: bytes) -> None:
+        path.open("wb").write(content[: len(content) // 2])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", interrupted)
+    monkeypatch.setattr(Path, "write_bytes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_field(field.isel(time=slice(2)), tmp_path / "field.nc")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "field.nc"]

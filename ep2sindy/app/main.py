@@ -22,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ep2sindy.app.typed_only import use_checked_loader
+from ep2sindy.machine.interruption import end_as_interrupted
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -30,6 +31,7 @@ def main() -> None:
     """Errors of the user's making end in one message; all others keep their traceback."""
     gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
     sys.path.insert(0, os.getcwd())  # as `python -m` does: studies and functions of one's own
+    end_as_interrupted()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
     sweeps: list[Path] = []
     failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too

@@ -15,6 +15,8 @@ import xarray as xr
 from ep2sindy.data.readers.source import Source, damage_named
 from ep2sindy.library.names import check_variable
 
+N_LISTED = 100  # names in an error
+
 # `probe[:, 1]`: part of an array, counted from 0.
 PART = re.compile(r"(.+?)\s*\[([\d:,\s-]+)\]")
 
@@ -134,13 +136,15 @@ def _parted(source: Source, name: str) -> tuple[str | None, tuple[int | slice, .
 def listed(source: Source) -> str:
     """Names with shapes and units: `ni (6, 4, 3) cm^-3, t (6)`."""
     texts = []
-    for name in source.names:
+    for name in source.names[:N_LISTED]:
         try:
             array = source.read(name)
-        except (OSError, ValueError, LookupError, TypeError):
+        except Exception:  # a library's, of a damaged array: it is named all the same
             texts.append(name)
             continue
         unit = array.attrs.get("units") or source.units.get(name, "")
         shape = f"({', '.join(map(str, array.shape))})"
         texts.append(f"{name} {shape} {unit}".rstrip())
+    n_more = len(source.names) - len(texts)
+    texts += [f"and {n_more} more"] if n_more else []
     return ", ".join(texts) or "nothing"

@@ -16,13 +16,13 @@ import xarray as xr
 from ep2sindy.data.conversion import conversion, to_si
 from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
+from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.data.placing import place, read_axes
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.readers.source import UNDECODED, Source, damage_named
 from ep2sindy.data.recognition import recognised
-from ep2sindy.machine.files import replacing
 
 
 def open_field(
@@ -156,12 +156,14 @@ def files_of(path: object) -> list[str]:
 
 
 def write_field(field: xr.Dataset, path: str | Path) -> None:
-    """Write a field as NetCDF; the final name appears only when the file is whole."""
+    """Write a field as NetCDF; the final name appears only when the file is whole.
+
+    It is made in memory, which must hold it. Raises OSError where it cannot be written.
+    """
     check_field(field)
     if Path(path).suffix != ".nc":
         raise ValueError(f"a field is written as NetCDF, to a name that ends in .nc: {path} came")
-    with replacing(Path(path)) as temporary:
-        field.drop_encoding().to_netcdf(temporary, engine="h5netcdf")
+    write_netcdf(field.drop_encoding(), Path(path))
 
 
 def read_field(path: str | Path) -> xr.Dataset:

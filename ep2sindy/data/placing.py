@@ -12,19 +12,21 @@ import xarray as xr
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Problems, Variable, read_array
+from ep2sindy.data.numbers import evened
 from ep2sindy.data.readers.source import Source
 
 
 def read_axis(source: Source, axis: str, variable: Variable) -> xr.DataArray:
     """Coordinate of one axis as a float64 vector in SI."""
-    points = read_array(source, axis, str(variable.name)).astype(np.float64)
+    points = read_array(source, axis, str(variable.name))
     if points.ndim != 1:
         points = points.squeeze() if points.size > 1 else xr.DataArray(points.values.ravel())
     if points.ndim != 1:
         raise ValueError(
             f"{axis} must be a vector: {variable.name!r} has shape {points.shape} in {source.path}"
         )
-    return to_si(points, axis, variable.unit)
+    points = points.copy(data=evened(points.values)) if axis == "time" else points
+    return to_si(points.astype(np.float64), axis, variable.unit)
 
 
 def read_axes(

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 import ep2sindy
+from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.discovery.blocks import Kept, blocks_of
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
@@ -85,9 +86,7 @@ class Study:
         found = regimes(result, rng=rng, max_regimes=self.max_regimes)
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
-        run.write(
-            "pointwise.nc", lambda path: result.to_netcdf(path, engine="h5netcdf", encoding=packed)
-        )
+        write_netcdf(result, run.folder.path / "pointwise.nc", encoding=packed)
         kept.clear()
         return Outcome(result, found, self.outline, wall_s=wall_s, n_before=n_before)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,12 +11,10 @@ from typing import Any, Literal
 import xarray as xr
 
 from ep2sindy.data.fields import channel_length_m
+from ep2sindy.data.readers.limits import ALWAYS, check_declared
 
 # Time stays a number, whatever its attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
-
-# What the parsing libraries raise on damaged files beyond ValueError and OSError.
-LIBRARY_ERRORS = (zipfile.BadZipFile, zlib.error)
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -109,9 +105,10 @@ def damage_named(path: Path) -> Iterator[None]:
     """Turn what the parsing libraries raise into one error that names the file."""
     try:
         yield
-    except (OSError, EOFError, ValueError, LookupError, TypeError, *LIBRARY_ERRORS) as error:
+    except Exception as error:  # of a damaged file a library may raise anything
+        said = str(error).strip().removesuffix(".") or type(error).__name__
         raise ValueError(
-            f"{path} cannot be read: {error}; the file may be cut short, or of another kind"
+            f"{path} cannot be read: {said}; the file may be cut short, or of another kind"
         ) from error
 
 
@@ -119,7 +116,15 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
     """Variables of a dataset whose dimensions the file names."""
     names = [str(name) for name in dataset.variables]
     length = channel_length_m(dataset.attrs)
-    return Source(path, names, lambda name: dataset[name], dims_named=True, channel_m=length)
+
+    def read(name: str) -> xr.DataArray:
+        array = dataset[name]
+        check_declared(repr(name), array.nbytes, path)
+        if array.nbytes <= ALWAYS:
+            array.compute()  # damage is told here, with the file's name; the array stays on disk
+        return array
+
+    return Source(path, names, read, dims_named=True, channel_m=length)
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:
