@@ -92,3 +92,50 @@ def test_a_cache_that_cannot_be_written_costs_no_simulation(tmp_path, monkeypatc
     monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
     with pytest.raises(OSError, match="a folder they can be kept in.*choose another cache"):
         simulate_cached(Thruster(), POINT, cache=tmp_path / "taken", **BRIEF)
+
+
+def changed_value(field: xr.Dataset) -> xr.Dataset:
+    field["n_i"][0, 0] *= 1.0 + 1e-6
+    return field
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (changed_value, "its checksum does not fit"),
+        (lambda field: field.assign_attrs(status="steady "), "its checksum does not fit"),
+        (lambda field: field.drop_vars("n_n"), "its checksum does not fit"),
+        (lambda field: field.assign_attrs(kept_for="{}"), "it is of other parameters"),
+    ],
+)
+def test_a_kept_run_that_is_another_is_simulated_again(tmp_path, capsys, change, reason):
+    first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    (path,) = tmp_path.iterdir()
+    cache.write(change(cache.read(path)), path)
+    again = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    xr.testing.assert_identical(first.drop_attrs(), again.drop_attrs())
+    printed = capsys.readouterr()
+    assert reason in " ".join((printed.out + printed.err).split())
+
+
+def test_a_run_under_the_name_of_another_is_not_taken_for_it(tmp_path):
+    hot = OperatingPoint(300.0, 5.0, neutral_speed=281.0)
+    simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    (path,) = tmp_path.iterdir()
+    expected = simulate_cached(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
+    (other,) = (tmp_path / "other").iterdir()
+    other.write_bytes(path.read_bytes())
+    found = simulate_cached(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
+    xr.testing.assert_identical(found.drop_attrs(), expected.drop_attrs())
+
+
+def test_a_cache_that_takes_no_file_costs_no_simulation(tmp_path, monkeypatch):
+    """A folder that is there, but full or not to be written to."""
+
+    def refuse(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cache, "TemporaryFile", refuse)
+    monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
+    with pytest.raises(OSError, match="No space left on device.*choose another cache"):
+        simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.library.display import library_html, library_text
 from ep2sindy.library.functions import Function
+from ep2sindy.library.size import check_degrees, check_values
 from ep2sindy.library.terms import Factor, Term, Variable, functions_named, product, read_term
 
 
@@ -138,6 +139,7 @@ class Library:
         values: (..., variables), a NumPy array or a torch tensor, in the order of `variables`.
         Returns (..., terms), of the same kind.
         """
+        check_values(len(self), values.shape)
         xp = array_namespace(values)
         columns = xp.concat([values, xp.ones_like(values[..., :1])], axis=-1)
         columns = self.with_functions(columns, axis=-1)
@@ -283,13 +285,8 @@ def polynomial(
     Ordered by degree, then by the order of the variables, functions last: 1, x, y, sin(x), x^2, ...
     Raises ValueError for a wrong degree, or a variable or a function that is unknown.
     """
-    if not isinstance(degree, int) or degree < 0:
-        raise ValueError(f"degree must be a whole number, zero or more: {degree!r} came")
-    if not isinstance(function_degree, int) or function_degree < 1:
-        raise ValueError(f"function_degree must be one or more: {function_degree!r} came")
-    if function_degree > 1 and not functions:
-        raise ValueError(f"function_degree={function_degree} needs functions, such as ['sin']")
     n, factors = len(variables), functions_named(functions, variables)
+    check_degrees(degree, function_degree, n, len(factors))
     rows = [
         np.bincount(combination, minlength=n + len(factors))
         for k in range(max(degree, function_degree if factors else 0) + 1)

@@ -8,6 +8,7 @@ from typing import Any
 
 from ep2sindy.library.functions import Function, function_names, function_of
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
+from ep2sindy.library.size import LARGEST_DEGREE
 from ep2sindy.library.units import unit_product
 
 
@@ -100,6 +101,11 @@ def read_factors(name: str, variables: Sequence[str]) -> dict[Factor, int]:
                 f"{list(variables)}"
             )
         powers[factor] = powers.get(factor, 0) + power
+    if sum(powers.values()) > LARGEST_DEGREE:
+        raise ValueError(
+            f"a term may have up to {LARGEST_DEGREE} factors: {name!r:.60} has "
+            f"{sum(powers.values())}, whose values no number holds"
+        )
     return powers
 
 

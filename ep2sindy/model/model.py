@@ -62,6 +62,8 @@ class SparseModel:
         units = {name: self.units.get(name, "1") for name in names}
         object.__setattr__(self, "units", MappingProxyType(units))
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        if len(set(self.states)) < len(self.states):
+            raise ValueError(f"states must be unique: {list(self.states)} came")
         if self.coef.shape != (len(self.library), len(self.states)):
             raise ValueError(
                 "coef must have one row per term and one column per equation: shape "

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +15,8 @@ from ep2sindy.library.library import Library, named_terms
 FORMAT = "ep2sindy.SparseModel/1"
 
 Model = TypeVar("Model")
+
+ROUNDING = 1e-6  # of a correlation
 
 
 def model_text(
@@ -49,20 +51,62 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
         content = json.loads(text)
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
+        states, equations = _names(content["states"]), content["equations"]
+        if sorted(equations) != sorted(states):
+            raise ValueError(f"equations of {sorted(equations)}, but the states {states}")
         covariance = content.get("covariance")  # files of version 0.1 have none
         return make(
-            named_terms(content["variables"], content["library"]),
-            {state: content["equations"][state] for state in content["states"]},
-            units=content["units"],
-            provenance=content["provenance"],
-            covariance=None if covariance is None else _square(covariance),
+            named_terms(_names(content["variables"]), _names(content["library"])),
+            {state: _numbers(equations[state], state) for state in states},
+            units=_texts(content["units"], "units"),
+            provenance=_texts(content["provenance"], "provenance"),
+            covariance=None if covariance is None else _covariance(covariance),
         )
     except UnknownFunctionError:
         raise  # the file is sound: a function must be registered before it is read
-    except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
+    except KeyError as error:
+        raise ValueError(f"a model file must hold {FORMAT} JSON: {error} is missing") from error
+    except (TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
 
 
-def _square(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "_ _"]:
-    """Rows of a stored matrix, which may be empty."""
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
+def _names(value: Any) -> list[str]:
+    """A list of texts, each once."""
+    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+        raise ValueError(f"a list of names was to come, and not {value!r:.80}")
+    if len(set(value)) < len(value):
+        raise ValueError(f"names that come more than once, in {value}")
+    return value
+
+
+def _numbers(terms: Any, state: str) -> dict[str, float]:
+    """Coefficients by term, finite ones."""
+    for name, value in terms.items():
+        if type(value) not in (int, float) or not np.isfinite(float(value)):
+            raise ValueError(
+                f"the coefficient of {name} in {state}' is no finite number: {value!r}"
+            )
+    return {name: float(value) for name, value in terms.items()}
+
+
+def _texts(value: Any, what: str) -> dict[str, str]:
+    if not isinstance(value, dict) or not all(isinstance(each, str) for each in value.values()):
+        raise ValueError(f"{what} that are no texts by name: {value!r:.80}")
+    return value
+
+
+def _covariance(rows: Any) -> Float[np.ndarray, "_ _"]:
+    """Rows of a stored matrix, which may be empty, and must be one that a covariance can be."""
+    found = np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
+    variances = np.diag(found)
+    if not np.isfinite(found).all() or (variances < 0.0).any():
+        raise ValueError("a covariance that is not finite, or has a variance below zero")
+    std = np.sqrt(variances)
+    scale = np.outer(std, std)
+    known = scale > 0.0
+    correlation = np.divide(found, scale, out=np.zeros_like(found), where=known)
+    if (found[~known] != 0.0).any() or not np.allclose(correlation, correlation.T, atol=ROUNDING):
+        raise ValueError("a covariance that is not symmetric, or of what does not vary")
+    if len(found) and np.linalg.eigvalsh(correlation).min() < -ROUNDING * len(found):
+        raise ValueError("a covariance that gives a combination of coefficients no variance")
+    return found

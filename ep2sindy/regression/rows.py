@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, read_only
 from ep2sindy.library.library import Library
+from ep2sindy.machine.memory import check_memory
 
 ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the cache
 
@@ -151,7 +152,16 @@ class Regression:
         product; blocks of rows keep those products small.
         """
         rows = self.train_rows
-        first, second = np.triu_indices(rows.shape[1])
+        n_columns = rows.shape[1]
+        each = 8.0 * 5.0 * n_columns**2  # whole, and what is scaled of it
+        products_of_rows = 3.0 * 4.0 * n_columns**2 * min(ROW_BLOCK, len(rows))
+        check_memory(
+            each * len(weights) + products_of_rows,
+            f"Gram matrices of {len(self.library)} terms in {len(weights)} bootstraps",
+            way_out="lower bootstraps.n, take fewer terms, or a lower degree",
+            each=each,
+        )
+        first, second = np.triu_indices(n_columns)
         sums = np.zeros((len(weights), len(first)))
         for start in range(0, len(rows), ROW_BLOCK):
             columns = np.ascontiguousarray(rows[start : start + ROW_BLOCK].T)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import xarray as xr
 from tqdm import tqdm
@@ -16,6 +17,7 @@ from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.simulate import as_start, simulate_as
 from ep2sindy.thruster.axial.starts import Start
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.seal import sealed, unsealed
 
 
 def simulate_cached(
@@ -62,25 +64,28 @@ def simulate_cached(
 def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
     """What `run` returns, read from the file that is named by a stem and a hash, or run and kept.
 
+    The file says what it was made of and holds a checksum; one that does not fit is run again.
     Raises OSError if the folder cannot be written, before anything runs.
     """
     key = fingerprint(parameters, sources=Path(__file__).parent)
     path = stem.with_name(f"{stem.name}_{key}.nc")
     if path.exists():
         try:
-            return read(path)
+            return unsealed(read(path), parameters)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             tqdm.write(f"{path} cannot be read ({error}); simulating it again")
     try:  # now, not after the simulation
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent)
+        with TemporaryFile(dir=path.parent):
+            pass
     except OSError as error:
         raise OSError(
             f"simulations need a folder they can be kept in: {path.parent} failed with "
             f"{error.strerror!r}; choose another cache"
         ) from error
     field = run()
-    write(field, path)
+    write(sealed(field, parameters), path)
     return field
 
 

@@ -1,0 +1,104 @@
+"""A model file from someone else, and libraries that no machine holds."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.machine import memory
+
+MODEL = json.loads(ep.lorenz().model.to_json())
+EQUATIONS = MODEL["equations"]
+N = sum(map(len, EQUATIONS.values()))
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"states": ["x", "x", "y", "z"]}, "more than once"),
+    ({"states": ["x", "y"]}, "equations of .*'z'.* but the states"),
+    ({"states": "xyz"}, "a list of names"),
+    ({"states": [1, 2, 3]}, "a list of names"),
+    ({"equations": {**EQUATIONS, "w": {"x": 1.0}}}, "equations of .*'w'"),
+    ({"equations": {**EQUATIONS, "x": {"x": float("nan")}}}, "no finite number"),
+    ({"equations": {**EQUATIONS, "x": {"x": float("inf")}}}, "no finite number"),
+    ({"equations": {**EQUATIONS, "x": {"x": "1"}}}, "no finite number"),
+    ({"equations": {**EQUATIONS, "x": {"x": True}}}, "no finite number"),
+    ({"equations": {**EQUATIONS, "x": [1.0]}}, "must hold"),
+    ({"variables": "xyz"}, "a list of names"),
+    ({"variables": ["x", "x", "y", "z"]}, "more than once"),
+    ({"library": [*MODEL["library"], "x"]}, "more than once"),
+    ({"library": [*MODEL["library"], "x^999999999"]}, "may have up to 100 factors"),
+    ({"library": [*MODEL["library"], "x^" + "9" * 40]}, "may have up to 100 factors"),
+    ({"library": [*MODEL["library"], "__import__('os')"]}, "a term is variables joined by"),
+    ({"units": [1]}, "units that are no texts"),
+    ({"units": {"x": 5}}, "units that are no texts"),
+    ({"provenance": {"a": {}}}, "provenance that are no texts"),
+    ({"covariance": [[float("nan")] * N] * N}, "not finite"),
+    ({"covariance": (-np.eye(N)).tolist()}, "a variance below zero"),
+    ({"covariance": (np.eye(N) + 0.5 * np.eye(N, k=1)).tolist()}, "not symmetric"),
+    ({"covariance": (2.0 * np.ones((N, N)) - np.eye(N)).tolist()}, "no variance"),
+    ({"covariance": np.eye(N - 1).tolist()}, "a row and a column per coefficient"),
+    ({"covariance": [[1.0]] * N}, "must hold"),
+    ({"covariance": 5}, "must hold"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD)
+def test_a_model_that_cannot_be_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=r"a model file must hold .* JSON: .*") as caught:
+        ep.SparseModel.from_json(json.dumps(MODEL | change))
+    assert caught.match(message)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "null", "1", "[" * 100_000, "9" * 100_000, "{}", "\0"])
+def test_text_that_is_no_model_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="a model file must hold"):
+        ep.SparseModel.from_json(text)
+
+
+def test_a_model_with_its_covariance_comes_back_exactly() -> None:
+    root = np.random.default_rng(0).standard_normal((N, 3))  # of rank 3: as of constrained fits
+    scale = np.diag(10.0 ** np.arange(-20.0, -20.0 + 4 * N, 4))
+    text = json.dumps(MODEL | {"covariance": (scale @ root @ root.T @ scale).tolist()})
+    found = ep.SparseModel.from_json(text)
+    assert json.loads(found.to_json()) == json.loads(text)
+
+
+TOO_LARGE: list[tuple[Callable[[], object], str]] = [
+    (lambda: ep.polynomial(["x"], degree=300), "degree must be 100 or less: 300 came"),
+    (lambda: ep.polynomial(["x", "y", "z"], degree=90), "1.298e\\+05; degree=47 makes 19600"),
+    (lambda: ep.polynomial(list("abcdefgh"), degree=99), "degree=8 makes 12870"),
+    (
+        lambda: ep.polynomial(list("xyz"), degree=2, functions=["sin"], function_degree=50),
+        "function_degree=50 of 6 variables and functions .*; function_degree=12 makes 18564",
+    ),
+    (lambda: ep.named_terms(["x"], ["x^200"]), "a term may have up to 100 factors"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), TOO_LARGE)
+def test_a_library_is_counted_before_it_is_made(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_gram_matrices_are_counted_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1771 terms in 32 bootstraps: 4 GB, where 2 GB are free."""
+    monkeypatch.setattr(memory, "free_bytes", lambda: 2_000_000_000)
+    run = ep.lorenz().trajectory(noise=0.05, rng=0)
+    recipe = ep.Recipe(ep.Differential(), ep.STLSQ(), ep.Bootstraps(n=32), ep.Knee())
+    library = ep.polynomial(["x", "y", "z"], degree=20)
+    assert len(library) == 1771
+    with pytest.raises(ValueError, match=r"Gram matrices of 1771 terms in 32 boot.* GB are free"):
+        ep.discover(run, library, recipe)
+
+
+def test_values_are_counted_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "free_bytes", lambda: 1_000_000)
+    samples = np.broadcast_to(np.ones(3), (10_000_000, 3))
+    with pytest.raises(ValueError, match=r"10 terms at 10000000 samples .*which hold 4166; take"):
+        ep.polynomial(["x", "y", "z"], degree=2).evaluate(samples)
+
+
+def test_free_memory_is_a_number_of_this_machine() -> None:
+    assert 1e6 < memory.free_bytes() < 1e14
