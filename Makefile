@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: breathing test test-slow lint docs benchmark clean
+.PHONY: attack breathing test test-slow lint docs benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -42,6 +42,11 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.regimes
 	$(BIN)/python -m benchmarks.joint
 	$(BIN)/python -m benchmarks.trajectory_scores
+
+# Mutated files, killed runs, failing writes: minutes, goes on where it was broken off, and prints
+# the table of docs/trust.md. More of each: ARGS="--files 5000 --kills 200 --writes 60".
+attack: .venv/installed
+	$(BIN)/python -m tests.attack $(ARGS)
 
 clean:
 	rm -rf .venv site .cache .mypy_cache .ruff_cache .pytest_cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -99,8 +99,8 @@ def _times(column: pd.Series) -> np.ndarray:
 
 
 def _from_arrays(t: object, x: object) -> Trajectory:
-    times: np.ndarray = np.ma.asanyarray(t)
-    states: np.ndarray = np.ma.asanyarray(x)
+    times: Any = np.ma.asanyarray(t)
+    states: Any = np.ma.asanyarray(x)
     if times.ndim != 1 or states.ndim not in (1, 2) or len(times) != len(states):
         raise ValueError(
             "arrays (t, x) must have shapes (samples,) and (samples,) or (samples, n_states): "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Shaped
 
@@ -14,8 +16,8 @@ def real_numbers(values: object, what: str) -> np.ndarray:
 
     Raises ValueError for complex numbers, truth values, text, dates and other objects.
     """
-    mask = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
-    array = np.ma.getdata(values) if mask is not None else np.asarray(values)
+    masked: Any = values if isinstance(values, np.ma.MaskedArray) else None
+    array = np.asarray(values) if masked is None else masked.data
     if array.dtype.kind not in "iuf":
         ways = {
             "c": "give real and imaginary parts as variables of their own",
@@ -25,8 +27,8 @@ def real_numbers(values: object, what: str) -> np.ndarray:
         way_out = ways.get(array.dtype.kind, "convert them first")
         raise ValueError(f"{what} must hold real numbers: {array.dtype} came; {way_out}")
     copy = np.array(array, dtype=np.float64, order="C")
-    if mask is not None:
-        copy[mask] = np.nan
+    if masked is not None:
+        copy[np.ma.getmaskarray(masked)] = np.nan
     return copy
 
 

@@ -21,7 +21,7 @@ from ep2sindy.data.placing import place, read_axes
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import open_source, reader_of
-from ep2sindy.data.readers.source import UNDECODED, Source, damage_named
+from ep2sindy.data.readers.source import UNDECODED, Source, damage_named, file_named
 from ep2sindy.data.recognition import recognised
 
 
@@ -68,7 +68,8 @@ def open_field(
         found.check(source)
         variables, dt_s = found.variables, found.dt_s
         axes = {axis: given or found.axes.get(axis) for axis, given in axes.items()}
-    field = _field(source, variables, axes, dt_s, mask, chunks)
+    with file_named(source.path):
+        field = _field(source, variables, axes, dt_s, mask, chunks)
     if (length := channel_m or source.channel_m) is not None:
         field.attrs["channel_m"] = length
     field.attrs["file"] = str(path)

@@ -61,7 +61,8 @@ def _end(header: _Header) -> int:
         header.skip(header.number())
         lengths.append(header.number())
     header.attributes()
-    fixed, by_record = [], []
+    fixed: list[tuple[int, int]] = []
+    by_record: list[tuple[int, int]] = []
     for _ in range(header.count()):
         header.skip(header.number())
         shape = [lengths[header.number()] for _ in range(header.number())]

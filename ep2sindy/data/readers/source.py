@@ -112,6 +112,17 @@ def damage_named(path: Path) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def file_named(path: Path) -> Iterator[None]:
+    """Let what is wrong with a file's values say which file it was."""
+    try:
+        yield
+    except ValueError as error:
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"{path}: {error}") from error
+
+
 def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
     """Variables of a dataset whose dimensions the file names."""
     names = [str(name) for name in dataset.variables]
