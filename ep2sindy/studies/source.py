@@ -26,12 +26,17 @@ class FieldSource:
     prepare: Sequence[Step] = ()
 
     def field(self) -> xr.Dataset:
-        """Raises DivergedError for a simulation that broke before it could be studied."""
+        """Raises DivergedError for a simulation that broke before it could be studied.
+
+        What the data say of themselves stays, whatever a step makes of them: arithmetic of
+        xarray drops it, and a run that diverged would be silent.
+        """
         field: xr.Dataset = self.data.build()
         check_recorded(field)
+        said = dict(field.attrs)
         for step in self.prepare:
             field = step(field)
-        return field
+        return field.assign_attrs(said | field.attrs)
 
 
 @runtime_checkable
