@@ -47,8 +47,7 @@ def open_field(
     time, z, r: the coordinates; None, or name None, where the file has none.
     dt_s: time step, for a file without time; taken instead of `time` where given.
     mask: nonzero where there is plasma; elsewhere values become NaN.
-    channel_m: length of the thruster's channel from z = 0, kept in the field's attributes, which
-        say the file as well; None: as the file says.
+    channel_m: length of the channel from z = 0, for the field's attributes; None: the file's.
     chunks: our dimension -> length, to stream what exceeds memory (needs dask; NetCDF, Zarr).
     NetCDF and Zarr are read when values are asked for, variables in SI without a mask even
     without dask; the other kinds are read at once.

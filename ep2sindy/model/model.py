@@ -294,13 +294,8 @@ def coef_matrix(
 
 
 def model_of(
-    library: Library,
-    equations: Mapping[str, Mapping[str, float]],
-    *,
-    units: Mapping[str, str],
-    provenance: Mapping[str, str],
-    covariance: Float[np.ndarray, "_ _"] | None,
+    library: Library, equations: Mapping[str, Mapping[str, float]], **rest: Any
 ) -> SparseModel:
-    """A model from its coefficients by state and term name."""
+    """A model from its coefficients by state and term name, and the rest of its fields."""
     coef = coef_matrix(library, list(equations.values()))
-    return SparseModel(library, list(equations), coef, units, provenance, covariance)
+    return SparseModel(library, list(equations), coef, **rest)

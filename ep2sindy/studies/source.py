@@ -59,10 +59,13 @@ class FieldSource:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtfulUnit)  # said of the data that are used
             field: xr.Dataset = data.build()
+        # What the data say of themselves stays, whatever a step makes of them: arithmetic of
+        # xarray drops it, and a run that diverged would be silent.
         check_recorded(field)
+        said = dict(field.attrs)
         for step in self.prepare:
             field = step(field)
-        return field
+        return field.assign_attrs(said | field.attrs)
 
 
 @runtime_checkable

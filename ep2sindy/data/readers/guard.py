@@ -28,7 +28,7 @@ def look_through_first(path: Path) -> None:
     """
     stat = path.stat()
     if said := _verdict(path.absolute(), stat.st_size, stat.st_mtime_ns):
-        raise ValueError(said)
+        raise ValueError(f"a file must be readable to its end: {said}")
 
 
 @cache

@@ -1,0 +1,62 @@
+"""A simulation that diverges or does not oscillate says so, whatever is done to it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
+from ep2sindy.studies.source import FieldSource, Step
+
+
+def simulation(status: str, n_samples: int = 2000) -> xr.Dataset:
+    said = {"status": status, "I_d_mean": 1.0, "I_d_std": 0.0, "parameters": "{}", "f_kHz": 80.0}
+    time_s, z = 1e-6 * np.arange(n_samples), np.array([0.01, 0.02])
+    n_i = 1e17 + 1e16 * np.random.default_rng(0).random((n_samples, 2))
+    data = {"n_i": (("time", "z"), n_i, {"units": "m^-3"})}
+    return xr.Dataset(data, coords={"time": time_s, "z": z}, attrs=said)
+
+
+@dataclass
+class Data:
+    """What a config names: built when it is asked for."""
+
+    made: xr.Dataset
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def build(self) -> xr.Dataset:
+        return self.made
+
+    def changed(self, places: Any, more: Any = None) -> "Data":
+        return self
+
+
+STEPS: list[Step] = [
+    lambda field: field / 2,
+    lambda field: field.drop_attrs(),
+    lambda field: ep.crop(field, stop_s=4e-5),
+    lambda field: ep.decimate(field, factor=2),
+    lambda field: ep.low_pass(field, cutoff_Hz=1e5),
+    lambda field: ep.derive(field, name="twice", expression="2*n_i", units="m^-3"),
+    lambda field: ep.keep_where(field, condition="z > 0.015"),
+    lambda field: xr.Dataset({"n_i": field["n_i"]}),
+]
+
+
+@pytest.mark.parametrize("status", ["diverged", "steady", "decaying", "transit"])
+@pytest.mark.parametrize("k", range(len(STEPS)))
+def test_no_step_makes_a_simulation_silent(status: str, k: int) -> None:
+    field = FieldSource(Data(simulation(status)), [STEPS[k]]).field()
+    assert is_simulation(field.attrs)
+    assert amiss(field.attrs)
+
+
+def test_a_run_that_broke_at_once_is_no_data() -> None:
+    with pytest.raises(DivergedError, match="it diverged after 3; try shorter steps"):
+        FieldSource(Data(simulation("diverged", 3))).field()
