@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: breathing test test-slow lint benchmark clean
+.PHONY: attack breathing test test-slow lint docs benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -25,6 +25,10 @@ test: lint
 test-slow: lint
 	$(BIN)/python -m pytest -q
 
+# The site, into ./site; a warning is an error. Its notebook is run on the way.
+docs: .venv/installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+
 benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.search
@@ -39,5 +43,10 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.joint
 	$(BIN)/python -m benchmarks.trajectory_scores
 
+# Mutated files, killed runs, failing writes: minutes, goes on where it was broken off, and prints
+# the table of docs/trust.md. More of each: ARGS="--files 5000 --kills 200 --writes 60".
+attack: .venv/installed
+	$(BIN)/python -m tests.attack $(ARGS)
+
 clean:
-	rm -rf .venv .cache .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv site .cache .mypy_cache .ruff_cache .pytest_cache

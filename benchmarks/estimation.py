@@ -34,10 +34,11 @@ def judged(system: System, found: ep.Estimate, cpu_s: float) -> dict[str, float]
     row = {"right": float(right), "misfit": float(bool(found.misfit)), "cpu_s": cpu_s}
     if right:
         used = true.T != 0.0
-        std = np.sqrt(np.diag(found.model.covariance))
         off = (coef - true).T[used]
         row["error"] = float(np.median(np.abs(off / true.T[used])))
-        row["inside"] = float((np.abs(off) <= 1.96 * std).mean())
+        if found.model.covariance is not None:  # a misfit has no intervals
+            std = np.sqrt(np.diag(found.model.covariance))
+            row["inside"] = float((np.abs(off) <= 1.96 * std).mean())
     return row
 
 
@@ -60,7 +61,8 @@ def _line(rows: Sequence[dict[str, float]]) -> str:
     flagged = f"{sum(r['misfit'] for r in wrong):.0f}/{len(wrong)} "
     flagged += f"{sum(r['misfit'] for r in right):.0f}/{len(right)}"
     error = 100.0 * np.median([row["error"] for row in right]) if right else np.nan
-    inside = 100.0 * np.mean([row["inside"] for row in right]) if right else np.nan
+    known = [row["inside"] for row in right if "inside" in row]
+    inside = 100.0 * np.mean(known) if known else np.nan
     return (
         f"{len(right):3d}/{len(rows)}  {flagged:>18}  {np.median(cpu):11.2f} {max(cpu):5.2f}"
         f"  {error:7.2f}  {inside:7.1f}"

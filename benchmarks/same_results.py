@@ -26,8 +26,11 @@ HERE = Path(__file__).resolve().parents[1]
 TIMES = {"cpu_s", "wall_s", "points_per_s", "cpu_s_per_search"}
 ON_FILE = ["data=file", "data.variables.R_ion.name=R_ion", "data.variables.u_iz.name=u_iz"]
 LINE, GRID = "data.path={line}", "data.path={grid}"
+ZONE = "trajectory.zone.z=[0.015,0.025]"
 TOYS: dict[str, list[str]] = {
-    "breathing": ["+exp=breathing", *ON_FILE, LINE, "bootstraps.n=8", "search=adaptive_lasso"],
+    "breathing": [
+        "+exp=breathing", *ON_FILE, LINE, ZONE, "bootstraps.n=8", "search=adaptive_lasso",
+    ],
     "discover": [
         "+exp=discover", *ON_FILE, LINE, "trajectory.states=[n_i,n_n]", "formulation=weighted_weak",
         "search=best_subset", "selection=ebic",
@@ -36,7 +39,7 @@ TOYS: dict[str, list[str]] = {
         "+exp=benchmark", "variants=[STLSQ,BALASSO,wALASSO,ours]", "n_realizations=2",
         "systems=[oscillator,lotka_volterra]", "noises=[0.0,0.05]", "parallel=serial",
     ],
-    "weak": ["+exp=weak", *ON_FILE, LINE, "n_windows=500", "n_points=[10,50]"],
+    "weak": ["+exp=weak", *ON_FILE, LINE, ZONE, "n_windows=500", "n_points=[10,50]"],
     "weak_windows": [
         "+exp=weak_windows", "n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]",
         "n_realizations=2", "parallel=serial",
@@ -45,9 +48,9 @@ TOYS: dict[str, list[str]] = {
         "+exp=frontier", "variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]",
         "parallel=serial",
     ],
-    "constrained": ["+exp=constrained", *ON_FILE, LINE],
+    "constrained": ["+exp=constrained", *ON_FILE, LINE, ZONE],
     "ils": [
-        "+exp=ils", *ON_FILE, LINE, "n_windows=8", "windows=[30,60]",
+        "+exp=ils", *ON_FILE, LINE, ZONE, "n_windows=8", "windows=[30,60]",
         "weak.test_functions.n_windows=500", "weak.test_functions.n_points=50",
     ],
     "parametric": [

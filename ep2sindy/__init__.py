@@ -15,19 +15,28 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.constraints.relations import Relation as Relation
     from ep2sindy.constraints.relations import constraint as constraint
     from ep2sindy.constraints.relations import relations_from_matrix as relations_from_matrix
-    from ep2sindy.data.open import Variable as Variable
+    from ep2sindy.data.extent import Zone as Zone
+    from ep2sindy.data.gaps import MissingSamples as MissingSamples
+    from ep2sindy.data.in_time import crop as crop
+    from ep2sindy.data.in_time import decimate as decimate
+    from ep2sindy.data.in_time import delay as delay
+    from ep2sindy.data.in_time import derivative as derivative
+    from ep2sindy.data.in_time import detrend as detrend
+    from ep2sindy.data.in_time import interpolate as interpolate
+    from ep2sindy.data.in_time import low_pass as low_pass
+    from ep2sindy.data.in_time import resample as resample
+    from ep2sindy.data.inspection import Inspection as Inspection
+    from ep2sindy.data.inspection import inspect as inspect
+    from ep2sindy.data.mapping import Variable as Variable
     from ep2sindy.data.open import open_field as open_field
     from ep2sindy.data.open import read_field as read_field
     from ep2sindy.data.open import write_field as write_field
-    from ep2sindy.data.prepare import crop as crop
-    from ep2sindy.data.prepare import decimate as decimate
     from ep2sindy.data.prepare import derive as derive
     from ep2sindy.data.prepare import keep_where as keep_where
-    from ep2sindy.data.prepare import low_pass as low_pass
     from ep2sindy.data.prepare import radial_from_middle as radial_from_middle
+    from ep2sindy.data.quantities import DoubtfulUnit as DoubtfulUnit
     from ep2sindy.data.trajectory import Trajectory as Trajectory
     from ep2sindy.data.zones import GridPoint as GridPoint
-    from ep2sindy.data.zones import Zone as Zone
     from ep2sindy.data.zones import ZoneAverage as ZoneAverage
     from ep2sindy.data.zones import point as point
     from ep2sindy.data.zones import zone_average as zone_average
@@ -68,10 +77,10 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.machine.parallel import Dask as Dask
     from ep2sindy.machine.parallel import Loky as Loky
     from ep2sindy.machine.parallel import Serial as Serial
-    from ep2sindy.model.free_run import Bounds as Bounds
     from ep2sindy.model.free_run import FreeRun as FreeRun
-    from ep2sindy.model.free_run import Verdict as Verdict
     from ep2sindy.model.free_run import free_run as free_run
+    from ep2sindy.model.likeness import Bounds as Bounds
+    from ep2sindy.model.likeness import Verdict as Verdict
     from ep2sindy.model.model import SparseModel as SparseModel
     from ep2sindy.model.model import coef_matrix as coef_matrix
     from ep2sindy.model.rollout import Rollout as Rollout
@@ -205,10 +214,16 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
 _FACE = {
     "constraints.fit": "constrained_fit",
     "constraints.relations": "Relation Constraint constraint relations_from_matrix",
-    "data.open": "Variable open_field write_field read_field",
-    "data.prepare": "crop decimate low_pass derive radial_from_middle keep_where",
+    "data.extent": "Zone",
+    "data.gaps": "MissingSamples",
+    "data.in_time": "crop decimate delay derivative detrend interpolate low_pass resample",
+    "data.inspection": "Inspection inspect",
+    "data.mapping": "Variable",
+    "data.open": "open_field write_field read_field",
+    "data.prepare": "derive radial_from_middle keep_where",
+    "data.quantities": "DoubtfulUnit",
     "data.trajectory": "Trajectory",
-    "data.zones": "Zone ZoneAverage GridPoint zone_average point",
+    "data.zones": "ZoneAverage GridPoint zone_average point",
     "discovery.blocks": "Kept",
     "discovery.coefficient_law": "TiedFit tied_fit",
     "discovery.control_law": "ControlLaw control_law",
@@ -229,7 +244,8 @@ _FACE = {
     "machine.own": "for_configs",
     "machine.parallel": "Serial Loky Dask",
     "library.units": "Clock",
-    "model.free_run": "Bounds FreeRun Verdict free_run",
+    "model.free_run": "FreeRun free_run",
+    "model.likeness": "Bounds Verdict",
     "model.model": "SparseModel coef_matrix",
     "model.rollout": "Rollout",
     "model.scores": "r2",

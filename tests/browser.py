@@ -53,13 +53,16 @@ def browser() -> str:
 
 
 def seen(
-    page: Path,
+    page: Path | str,
     width_px: int,
     *,
     questions: dict[str, str] | None = None,
     picture: Path | None = None,
 ) -> Seen:
-    """Open a page at this width. questions: expressions of JavaScript, by name."""
+    """Open a page, a file or an address, at this width.
+
+    questions: expressions of JavaScript, by name.
+    """
     pytest.importorskip("tornado", reason="talks to Chromium; comes with `distributed`")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
@@ -71,14 +74,15 @@ def seen(
             stderr=subprocess.DEVNULL,
         )  # fmt: skip
         try:
-            return asyncio.run(_seen(Path(profile), page, width_px, questions or {}, picture))
+            url = page if isinstance(page, str) else page.resolve().as_uri()
+            return asyncio.run(_seen(Path(profile), url, width_px, questions or {}, picture))
         finally:
             process.kill()
             process.wait()
 
 
 async def _seen(
-    profile: Path, page: Path, width_px: int, questions: dict[str, str], picture: Path | None
+    profile: Path, url: str, width_px: int, questions: dict[str, str], picture: Path | None
 ) -> Seen:
     from tornado.httpclient import AsyncHTTPClient
     from tornado.websocket import websocket_connect
@@ -123,7 +127,7 @@ async def _seen(
         "Emulation.setDeviceMetricsOverride",
         width=width_px, height=900, deviceScaleFactor=1, mobile=width_px < 700,
     )  # fmt: skip
-    await call("Page.navigate", url=page.resolve().as_uri())
+    await call("Page.navigate", url=url)
     for _ in range(300):
         if await value("location.href != 'about:blank' && document.readyState == 'complete'"):
             break

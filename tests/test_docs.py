@@ -1,39 +1,84 @@
-"""The Python of README and docs runs as it stands, block after block of a page."""
+"""README and docs hold: their Python runs, prints what they say, and their commands compose."""
 
+import doctest
+import io
 import re
+import subprocess
+import sys
+import tomllib
+from contextlib import redirect_stdout
+from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 
 import numpy as np
 import pytest
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
+import ep2sindy as ep
+from ep2sindy.app.runner import check_overrides, study_class
+from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.synthetic.regions import three_regions
+from tests.pages import FENCE, PAGES, ROOT, arguments, blocks, commands, difference
+from tests.programs import EXPERIMENTS, composed
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text("utf-8")]
-
-pytestmark = pytest.mark.slow
-
-
-def blocks(page: Path) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+CONF = ROOT / "conf"
+WITH_PYTHON = [page for page in PAGES if any(b.language == "python" for b in blocks(page))]
 
 
+def with_mapping(words: list[str], page: Path) -> list[str]:
+    """`data=run` after `inspect run.h5 --write`: a mapping such as it writes."""
+    written = re.findall(r"ep2sindy inspect (\w+)\.\w+ --write", page.read_text("utf-8"))
+    known = {f"data={name}": ["data=file", f"data.path={name}"] for name in written}
+    return [each for word in words for each in known.get(word, [word])]
+
+
+BASH = [
+    pytest.param(with_mapping(words, page), id=f"{page.name}: {' '.join(words)[:60]}")
+    for page in PAGES
+    for block in blocks(page)
+    if block.language == "bash"
+    for words in commands(block)
+]
+# Pages whose commands are run in the tests, one after the other, in one empty folder.
+RUN_WHOLE = ("tutorial.md", "odes.md")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.name)
-def test_the_python_of_a_page_runs(
+def test_a_page_runs_and_prints_what_it_says(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In an empty folder that holds the files which pages open: run.h5 and grid.nc."""
     monkeypatch.chdir(tmp_path)
-    write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "grid.nc")
-    write_h5(tmp_path / "run.h5")
+    if page.name not in RUN_WHOLE:
+        write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "grid.nc")
+        write_h5(tmp_path / "run.h5")
     known: dict = {}
     threads = torch.get_num_threads()
     for block in blocks(page):
-        exec(compile(block, page.name, "exec"), known)
+        printed = io.StringIO()
+        if block.language == "python":
+            with redirect_stdout(printed):
+                exec(compile(block.text, page.name, "exec"), known)
+        elif block.language == "bash" and page.name in RUN_WHOLE:
+            for words in commands(block):
+                printed.write(run(words))
+        if block.printed is not None:
+            assert not difference(block.printed, printed.getvalue()), block.text
     torch.set_num_threads(threads)
+
+
+def run(words: list[str]) -> str:
+    """What a command of the program prints."""
+    given = arguments(words)
+    assert given is not None, words
+    command = [sys.executable, "-m", "ep2sindy.app.main", *given]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 def write_h5(path: Path) -> None:
@@ -47,6 +92,81 @@ def write_h5(path: Path) -> None:
             file[name] = 1e12 * wave
 
 
+@pytest.mark.parametrize("words", BASH)
+def test_a_command_is_one_that_can_be_given(words: list[str]) -> None:
+    """The program's own are composed and built, but for the data; others are known by name."""
+    given = arguments(words)
+    if given is not None:
+        check_program(given)
+    elif words[:2] == ["python", "-m"]:
+        assert find_spec(words[2]) is not None, words
+    elif words[0] == "python":
+        assert (ROOT / words[1]).is_file(), words
+    elif words[0] == "make":
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M), words
+    elif "pip" in words:
+        check_extras(words)
+    else:
+        assert which(words[0], path=str(Path(sys.executable).parent)), words
+
+
+def check_program(given: list[str]) -> None:
+    if given[0] in ("compare", "inspect"):
+        return
+    is_whole = not any("..." in text for text in given)
+    given = [text for text in given if text != "..."]
+    overrides = [single(text) for text in given if not text.startswith(("-", "hydra"))]
+    for text in given:
+        if text.startswith("hydra/launcher="):
+            name = text.partition("=")[2]
+            assert name == "submitit_local" or (CONF / "hydra/launcher" / f"{name}.yaml").is_file()
+    if not overrides:
+        assert given[0] in ("--help", "--version"), given
+        return
+    config = composed(*overrides)
+    study = study_class(config.study)
+    check_overrides(overrides, used=keys_of(study), experiment=config.experiment)
+    if is_whole:
+        study_of(study, config)
+
+
+def single(text: str) -> str:
+    """The first job of a sweep."""
+    (override,) = OverridesParser.create().parse_overrides([text])
+    if not override.is_sweep_override():
+        return text
+    return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
+
+
+def check_extras(words: list[str]) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for word in words:
+        for extras in re.findall(r"\[(.*?)\]", word):
+            assert set(extras.split(",")) <= set(project["optional-dependencies"]), words
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_choices_and_modules_that_a_page_names_are_there(page: Path) -> None:
+    text = page.read_text("utf-8")
+    groups = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir())
+    for name in set(re.findall(r"\+exp=(\w+)", text)) - {"my_study"}:
+        assert name in EXPERIMENTS, name
+    for group, name in re.findall(rf"`(?:[^`\n]* )?({'|'.join(groups)})=(\w+)(?=[` ])", text):
+        assert (CONF / group / f"{name}.yaml").is_file() or name in ("NAME", "mine"), (group, name)
+    for name in re.findall(r"python -m (benchmarks\.\w+)", text):
+        assert find_spec(name) is not None, name
+    for name in re.findall(
+        r"`(?:docs|conf/exp|ep2sindy|tests|benchmarks)/[\w/.]+\.(?:py|md|yaml)`", text
+    ):
+        assert (ROOT / name.strip("`")).is_file() or re.search("NAME|my_", name), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_a_page_links_to_is_there(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", FENCE.sub("", page.read_text("utf-8"))):
+        assert target.startswith("http") or (page.parent / target).is_file(), target
+
+
 def test_pysindys_examples_take_no_more_lines_here() -> None:
     page = (ROOT / "docs" / "pysindy.md").read_text("utf-8")
     pairs = [re.findall(r"```python\n(.*?)```", row, re.DOTALL) for row in page.split("<tr>")]
@@ -56,3 +176,35 @@ def test_pysindys_examples_take_no_more_lines_here() -> None:
         assert "ps." in theirs or "model." in theirs
         assert "ps." not in ours
         assert len(ours.splitlines()) <= len(theirs.splitlines()), ours
+
+
+@pytest.mark.parametrize(
+    ("came", "is_right"),
+    [
+        ("x' = 0.66 x - 1 (±0.0031) y\nend", True),  # rounded, half-width by less than a half
+        ("x' = 0.66 x - 1 (±0.0031) y\nmore\nend", True),  # `...` is any lines
+        ("x' = 0.5 x - 1 (±0.002) y\nend", False),  # another number
+        ("x' = 0.66 x + 1 (±0.002) y\nend", False),  # another sign
+        ("x' = 0.66 x - 1 (±0.002) z\nend", False),  # another term
+        ("x' = 0.66 x - 1 (±0.002) y", False),  # a line less
+    ],
+)
+def test_what_is_printed_is_compared(came: str, is_right: bool) -> None:
+    assert (not difference("x' = 0.665 x - 1 (±0.002) y\n...\nend", came)) == is_right
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [n for n in ep._MODULES if ">>> " in (getattr(ep, n).__doc__ or "")]
+)
+def test_the_example_of_a_docstring_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a folder that holds run.nc."""
+    monkeypatch.chdir(tmp_path)
+    write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "run.nc")
+    text = getattr(ep, name).__doc__
+    example = doctest.DocTestParser().get_doctest(text, {"ep": ep, "np": np}, name, None, None)
+    said: list[str] = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append)
+    assert not said, "".join(said)

@@ -5,10 +5,11 @@ import pytest
 import xarray as xr
 
 from ep2sindy.data import zones
+from ep2sindy.data.extent import Zone
 from ep2sindy.data.fields import check_field, mask_outside
 from ep2sindy.data.open import read_field, write_field
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.data.zones import GridPoint, Zone, point, zone_average
+from ep2sindy.data.zones import GridPoint, point, zone_average
 from ep2sindy.studies.source import Sampling
 
 T = np.linspace(0.0, 1e-4, 11)
@@ -318,7 +319,7 @@ def test_names_of_any_field_of_science_work() -> None:
         (GOOD.isel(time=[0]), "at least two samples"),
         (GOOD.isel(z=[1, 0]), r"z must be finite and increase: z\[0:2\] = \[1. 0.\] m"),
         (GOOD.assign_coords(z=[0.0, np.nan]), "z must be finite"),
-        (GOOD.astype(int), "n_i must hold real numbers: its type is int64"),
+        (GOOD.astype(complex), "n_i must hold real numbers: its type is complex128"),
         (GOOD.rename(n_i="n i"), "a variable's name must be letters, digits and _: 'n i' came"),
         (GOOD.drop_attrs(), "n_i must name its unit"),
     ],

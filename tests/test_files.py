@@ -69,8 +69,9 @@ def test_figures_are_written_as_png_and_pdf(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path, "x", now=NOW)
     figure = Figure()
     figure.subplots().plot(np.arange(3))
-    path = folder.write_figure("line", figure)
-    assert path.read_bytes().startswith(b"\x89PNG")
+    png = folder.write_figure("line", figure)
+    assert png.startswith(b"\x89PNG")
+    assert (folder.path / "figures" / "line.png").read_bytes() == png
     names = sorted(p.name for p in (folder.path / "figures").iterdir())
     assert names == ["line.pdf", "line.png"]
 

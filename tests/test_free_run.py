@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.free_run import Bounds, Verdict, free_run, samples_in
+from ep2sindy.model.free_run import free_run, samples_in
+from ep2sindy.model.likeness import Bounds, Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.synthetic.systems import lorenz
 
@@ -116,3 +118,13 @@ def test_samples_of_a_duration() -> None:
     assert samples_in(run, float(run.t[10])) == 11
     with pytest.raises(ValueError, match="a window must hold two samples"):
         samples_in(run, 1e-9)
+
+
+@pytest.mark.parametrize("number", [0, 1, 3])
+def test_the_true_model_of_a_chaotic_record_lives_and_a_wrong_one_does_not(number: int) -> None:
+    """Rossler's frequency and waveform wander: no run lies closer than the data's own parts."""
+    system, run = noisy("rossler", 0.05, number)
+    assert free_run(system.model, run).verdict is Verdict.LIVES
+    coef = system.model.coef
+    periodic = replace(system.model, coef=np.where(coef == -5.7, -3.0, coef))
+    assert free_run(periodic, run).verdict is Verdict.WRONG_CYCLE

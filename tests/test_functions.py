@@ -174,9 +174,9 @@ def test_a_share_of_the_terms_keeps_only_the_functions_it_needs() -> None:
 def test_equations_are_written_in_every_language() -> None:
     terms = {"x": 1.0, "x*sin(2*v)/(0.5+n_i)^2": -2.0, "1/x": 3.0}
     assert equation_text("x", terms) == "x' = 1 x - 2 x sin(2 v)/(0.5+n_i)^2 + 3/x"
-    latex = r"\frac{x \sin(2 \, v)}{(0.5+n_{i})^{2}}"
+    latex = r"\frac{x \, \sin(2 \, v)}{(0.5+n_{i})^{2}}"
     assert latex_term_name("x*sin(2*v)/(0.5+n_i)^2") == latex
-    assert latex_term_name("sqrt(x)*abs(v)*tanh(x)") == r"\sqrt{x} |v| \mathrm{tanh}(x)"
+    assert latex_term_name("sqrt(x)*abs(v)*tanh(x)") == r"\sqrt{x} \, |v| \, \mathrm{tanh}(x)"
     assert "sin(2 <i>v</i>) / (0.5+<i>n</i><sub>i</sub>)<sup>2</sup>" in equation_html("x", terms)
     sympy = pytest.importorskip("sympy")
     x, v, n = sympy.symbols("x v n_i")
@@ -204,7 +204,7 @@ def test_greek_names_are_written_as_letters() -> None:
     model = ep.pendulum().model
     assert r"\dot{\theta} &= 1 \, w" in model.latex()
     assert r"- 9.81 \, \sin(\theta)" in model.latex()
-    assert latex_term_name("omega_c*x") == r"\omega_{c} x"
+    assert latex_term_name("omega_c*x") == r"\omega_{c} \, x"
     assert "sin(<i>&theta;</i>)" in equation_html("w", {"sin(theta)": 1.0})
 
 

@@ -46,7 +46,7 @@ def test_a_list_holds_several_runs_of_any_kind() -> None:
         (pd.DataFrame({"x": T}), r"must have one time column, .* its columns are \['x'\]"),
         (pd.DataFrame({"t": T, "time": T, "x": T}), "must have one time column"),
         (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': .*; drop"),
-        (pd.DataFrame({"t": pd.to_datetime(T), "x": T}), "{'t': 'datetime.* give time in s"),
+        (pd.DataFrame({"t": T > 0, "x": T}), "{.t.: .bool.} came; give time in s, as numbers or"),
         ((T, X.T), r"must have shapes .*: \(31,\) and \(2, 31\) came"),
         ((T, X + 1j), "must hold real numbers: float64 and complex128 came"),
     ],

@@ -11,11 +11,13 @@ from hydra.utils import instantiate
 from scipy.io import savemat
 
 from ep2sindy.data.conversion import conversion, same_unit
-from ep2sindy.data.open import Variable, open_field, read_field, write_field
+from ep2sindy.data.extent import Zone
+from ep2sindy.data.mapping import Variable
+from ep2sindy.data.open import open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
 from ep2sindy.data.readers.registry import READERS, reader_of
 from ep2sindy.data.readers.source import look_at
-from ep2sindy.data.zones import Zone, zone_average
+from ep2sindy.data.zones import zone_average
 
 ROOT = Path(__file__).resolve().parents[1]
 RNG = np.random.default_rng(3)
@@ -320,7 +322,7 @@ def npz(path: Path, **changes: np.ndarray) -> Path:
         (
             {},
             {"variables": {"n_i": Variable("nii", "m^-3")}},
-            r"no variable 'nii' \(wanted as n_i\); it holds \['t', 'z', 'r', 'ni', 'Te', 'Id'\]",
+            r"no variable 'nii' \(wanted as n_i\), but 'ni'; it holds t \(6\), z \(4\), r \(3\), ",
         ),
         ({}, {"z": Variable("x", "m")}, r"has no variable 'x' \(wanted as z\)"),
         ({}, {"variables": {"n_i": Variable(None, "m^-3")}}, "none of .* has a name"),
@@ -395,7 +397,7 @@ def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -
 
 def test_what_is_no_known_kind_hears_all_of_them(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_text("text")
-    kinds = r"NetCDF, HDF5, MATLAB \(v5, v7.3\) or npz, or end in .csv, .json or .zarr: "
+    kinds = r"NetCDF, HDF5, MATLAB \(v5, v7.3\) or npz, or end in .csv, .tsv, .* or .zarr: "
     with pytest.raises(ValueError, match=f"a file must be {kinds}"):
         open_field(tmp_path / "a.xyz", **SETTINGS)
 
@@ -410,7 +412,7 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
         open_field(tmp_path, **SETTINGS)
 
 
-@pytest.mark.parametrize("name", ["a.nc", "a.h5", "a.mat", "a.npz", "a.dat"])
+@pytest.mark.parametrize("name", ["a.nc", "a.h5", "a.mat", "a.npz"])
 def test_text_under_another_name_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("t,ni\n0,1\n")
     with pytest.raises(ValueError, match=rf"{name} begins with b't,ni"):
@@ -429,7 +431,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path, name: str, share: float) ->
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("a.json", '{"output": {"frames": [{"t": 0.0'), ("a.csv", ""), ("b.csv", "\0")],
+    [("a.json", '{"output": {"frames": [{"t": 0.0'), ("b.csv", "\0")],
 )
 def test_damaged_text_is_refused(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
@@ -459,11 +461,11 @@ def test_a_failed_write_leaves_the_old_file(
     field = open_field(npz(tmp_path), **SETTINGS)
     write_field(field, tmp_path / "field.nc")
 
-    def interrupted(self: xr.Dataset, path: Path, engine: str) -> None:
-        path.write_bytes(b"half")
+    def interrupted(path: Path, content: bytes) -> None:
+        path.open("wb").write(content[: len(content) // 2])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", interrupted)
+    monkeypatch.setattr(Path, "write_bytes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_field(field.isel(time=slice(2)), tmp_path / "field.nc")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "field.nc"]

@@ -47,6 +47,7 @@ HEAVY = {
     "omegaconf": ("app",),
     "matplotlib": ("figures", "report", "studies", "app"),
     "h5py": (),
+    "tensorboard": (),
     "pandas": ("data", "thruster", "synthetic", "discovery", "figures", "report", "studies", "app"),
     "xarray": ("data", "thruster", "synthetic", "discovery", "figures", "studies", "app"),
 }

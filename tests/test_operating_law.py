@@ -17,7 +17,7 @@ from ep2sindy.discovery.operating_points import (
     measured_left_out,
 )
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.free_run import Verdict
+from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
 
 STATES = ("x", "y")

@@ -1,4 +1,5 @@
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -7,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from distributed import LocalCluster
 from threadpoolctl import threadpool_info
@@ -154,3 +156,39 @@ def test_an_address_must_be_one() -> None:
 def test_a_number_of_processes_must_be_one() -> None:
     with pytest.raises(ValueError, match="n_jobs must be a number of processes"):
         Loky(n_jobs=0)
+
+
+KILLED = """
+import os, sys, time
+from ep2sindy.machine.interruption import end_as_interrupted
+from ep2sindy.machine.parallel import Loky
+
+def slow(piece):
+    os.write(1, f"{os.getpid()}\\n".encode())
+    time.sleep(60)
+
+if __name__ == "__main__":
+    end_as_interrupted()
+    try:
+        list(Loky(2).run(slow, range(2)))
+    except KeyboardInterrupt as error:
+        print(f"interrupted by {error}", flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGKILL"])
+def test_workers_end_with_their_run(tmp_path: Path, name: str) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(KILLED)
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as run:
+        assert run.stdout is not None
+        workers = [int(run.stdout.readline()) for _ in range(2)]
+        assert all(map(psutil.pid_exists, workers))
+        run.send_signal(getattr(signal, name))
+        said = run.stdout.read()  # to the end, which comes when the last of them has ended
+    assert said == ("" if name == "SIGKILL" else f"interrupted by {name}\n")
+    _, alive = psutil.wait_procs(map(psutil.Process, filter(psutil.pid_exists, workers)), timeout=5)
+    assert not alive

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.data.prepare import crop, decimate, derive, keep_where, low_pass, radial_from_middle
+from ep2sindy.data.in_time import crop, decimate, low_pass
+from ep2sindy.data.prepare import derive, keep_where, radial_from_middle
 from ep2sindy.thruster import propellants
 from ep2sindy.thruster.ionization import ionization_rate, read_rate_table
+from ep2sindy.thruster.propellant_files import propellant
 
 DT = 1e-6
 N = 2000
@@ -251,3 +253,24 @@ def test_radial_velocity_counts_from_mid_radius(
 def test_mid_radius_without_a_radial_velocity_is_refused() -> None:
     with pytest.raises(ValueError, match=r"needs u_ir on r: .* \['I_d'\] on \['time'\]"):
         radial_from_middle(ramp())
+
+
+@pytest.mark.parametrize("gas", ["krypton", "argon"])
+def test_other_gases_have_rates_of_their_own(gas: str) -> None:
+    after = ionization_rate(warm(), gas=gas)
+    T = warm()["T_e_eV"].values
+    known = propellant(gas)
+    expected = np.interp(T, known.T_e_eV, known.ionization_rate)
+    np.testing.assert_array_equal(after["R_ion"].values[np.isfinite(T)], expected[np.isfinite(T)])
+    assert after["R_ion"].attrs["units"] == "m^3/s"
+
+
+def test_a_gas_has_its_range_and_its_own_table(tmp_path: Path) -> None:
+    hot = warm().assign(T_e_eV=20 * warm()["T_e_eV"].assign_attrs(units="eV"))
+    hot["T_e_eV"].attrs["units"] = "eV"
+    with pytest.raises(ValueError, match="T_e_eV must stay in the rate table, 0 to 100 eV"):
+        ionization_rate(hot, gas="krypton")
+    with pytest.raises(ValueError, match="there are the propellants .*: 'neon' came"):
+        ionization_rate(warm(), gas="neon")
+    with pytest.raises(ValueError, match="gas='argon' came beside"):
+        ionization_rate(warm(), gas="argon", table=tmp_path / "rates.csv")

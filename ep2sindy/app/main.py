@@ -1,6 +1,7 @@
 """The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
 `ep2sindy compare RUN RUN` sets run folders side by side instead.
+`ep2sindy inspect PATH` looks into files instead.
 
 Only Hydra is imported here: `--help` must not wait for the numerics.
 """
@@ -21,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ep2sindy.app.typed_only import use_checked_loader
+from ep2sindy.machine.interruption import end_as_interrupted
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -29,6 +31,7 @@ def main() -> None:
     """Errors of the user's making end in one message; all others keep their traceback."""
     gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
     sys.path.insert(0, os.getcwd())  # as `python -m` does: studies and functions of one's own
+    end_as_interrupted()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
     sweeps: list[Path] = []
     failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
@@ -38,6 +41,11 @@ def main() -> None:
             from ep2sindy.app.compare import main as compare_runs
 
             compare_runs(sys.argv[2:])
+            return
+        if sys.argv[1:2] == ["inspect"]:
+            from ep2sindy.app.inspection import main as inspect_files
+
+            inspect_files(sys.argv[2:], conf)
             return
         prepare_arguments(conf)
         use_checked_loader()

@@ -156,6 +156,11 @@ def constraint(
     The one of the largest factor goes; of equals the one that the relations name last.
     Raises ValueError, with the relation, for one that contradicts or repeats the earlier ones
     or names an unknown state or term, or one outside the support.
+
+    >>> library = ep.polynomial(["x", "y"], degree=2)
+    >>> support = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
+    >>> ep.constraint(library, support, ["x: x*y == -1 * y: x*y"]).C.shape
+    (4, 3)
     """
     coefficients = tuple(
         (state, library.names[j])

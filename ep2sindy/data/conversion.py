@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import COORDINATE_UNITS
-from ep2sindy.library.units import PLAIN, check_unit, registry, unit_errors, unit_product
+from ep2sindy.library.units import (
+    PLAIN,
+    check_unit,
+    netcdf_powers,
+    registry,
+    unit_errors,
+    unit_product,
+)
 
 # What our usual names mean: a unit of another kind is a mistake in the mapping.
 KNOWN_UNITS = {
@@ -23,13 +29,14 @@ NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
 SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
 
 
-def to_si(array: xr.DataArray, ours: str, unit: str) -> xr.DataArray:
+def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = False) -> xr.DataArray:
     """Convert to SI, or to the unit of the name's suffix; a unit that fits already costs nothing.
 
+    is_variable: a z is then a quantity of one's own, not the coordinate.
     Raises ValueError for an unknown unit, one that the suffix cannot hold, or one that
     contradicts the file's own attribute.
     """
-    factor, offset, target = conversion(ours, unit)
+    factor, offset, target = conversion(ours, unit, is_variable=is_variable)
     stated = str(array.attrs.get("units", ""))
     if stated not in ("", "1") and not same_unit(unit, stated):
         raise ValueError(
@@ -41,15 +48,18 @@ def to_si(array: xr.DataArray, ours: str, unit: str) -> xr.DataArray:
     return array.drop_attrs().assign_attrs(units=target)
 
 
-def conversion(ours: str, unit: str) -> tuple[float, float, str]:
+def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[float, float, str]:
     """Factor, offset and target unit that take numbers in `unit` to the unit our name means."""
     suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
-    target = (COORDINATE_UNITS | KNOWN_UNITS).get(ours) or next(suffixes, None)
+    known = KNOWN_UNITS if is_variable else COORDINATE_UNITS | KNOWN_UNITS
+    target = known.get(ours) or next(suffixes, None)
     if unit == (target or "1") and unit in PLAIN | {"1"}:
         return 1.0, 0.0, unit
     try:
         given = _ruler(unit)
-        ruler = given.to(target) if target else given.to_base_units()
+        given = given.to("kelvin") if target and given.check("[temperature]") else given
+        # k_B T for a temperature that counts in eV
+        ruler = given.to(target, "boltzmann") if target else given.to_base_units()
     except unit_errors() as error:
         raise ValueError(
             f"the unit of {ours} must be one that converts to {target or 'SI'}: {unit!r} came "
@@ -83,6 +93,5 @@ def same_unit(unit: str, stated: str) -> bool:
 def _ruler(unit: str) -> Any:
     """0, 1 and 2 of a unit, which show its factor, its offset and whether it is linear."""
     check_unit(unit)
-    plain = re.sub(r"\b([A-Za-zµ]+)(-?\d+)\b", r"\1^\2", unit)  # netCDF writes m-3 for m^-3
-    one: Any = registry().Quantity(plain)
+    one: Any = registry().Quantity(netcdf_powers(unit))
     return registry().Quantity(np.arange(3.0) * one.magnitude, one.units)

@@ -9,6 +9,10 @@ refused, since an average over a changing set of cells is no observable.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
@@ -46,7 +50,7 @@ def check_field(field: xr.Dataset) -> None:
     for name, variable in field.data_vars.items():
         if not str(name).isidentifier():
             raise ValueError(f"a variable's name must be letters, digits and _: {name!r} came")
-        if variable.dtype.kind != "f":
+        if variable.dtype.kind not in "fiu":  # what counts is read as real numbers
             raise ValueError(f"{name} must hold real numbers: its type is {variable.dtype}")
         if "units" not in variable.attrs:
             raise ValueError(f"{name} must name its unit in the attribute 'units' ('1' for none)")
@@ -65,6 +69,17 @@ def _check_axis(axis: str, points: Float[np.ndarray, " points"]) -> None:
             f"{axis} must be finite and increase: {axis}[{k}:{k + 2}] = {points[k : k + 2]} m; "
             "sort the grid first"
         )
+
+
+def channel_length_m(attributes: Mapping[str, Any]) -> float | None:
+    """Of a field that says it: one opened with `channel_m`, or a simulation's own."""
+    if "channel_m" in attributes:
+        return float(attributes["channel_m"])
+    try:
+        length = json.loads(attributes["parameters"])["thruster"]["channel_length"]
+    except (KeyError, TypeError, ValueError):
+        return None
+    return float(length)
 
 
 def grid_points(field: xr.Dataset, axis: str) -> Float[np.ndarray, " points"]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
+from ep2sindy.data.gaps import MissingSamples, gap_words, present_rows
+from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -26,7 +29,8 @@ def trajectories_of(runs: object) -> list[Trajectory]:
     """One run or a list of them as trajectories.
 
     A run is a Trajectory; a pandas DataFrame with a column of times in s (`time`, `t`, `time_s`,
-    `t_s`) or an index of that name, its other columns being states; or a tuple (t, x) of times
+    `t_s`) or an index of that name, its other columns being states, and rows that hold a NaN left
+    out with the warning `MissingSamples`; or a tuple (t, x) of times
     (samples,) and states (samples,) or (samples, n_states), which are then called x, or x0, x1 ...
     Raises ValueError for anything else, and as Trajectory does.
     """
@@ -74,24 +78,38 @@ def _from_table(table: pd.DataFrame) -> Trajectory:
     states = [name for name in table.columns if name != times[0]]
     kinds = {str(name): table[name].dtype for name in (times[0], *states)}
     wrong = {name: str(kind) for name, kind in kinds.items() if kind.kind not in "iuf"}
+    if kinds[str(times[0])].kind in "mM":
+        del wrong[str(times[0])]
     if wrong:
-        way_out = "give time in s, as numbers" if str(times[0]) in wrong else "drop them"
+        way_out = "give time in s, as numbers or dates" if str(times[0]) in wrong else "drop them"
         raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
     values = table[states].to_numpy(dtype=np.float64)
-    return Trajectory(table[times[0]].to_numpy(dtype=np.float64), values, list(map(str, states)))
+    t = seconds(_times(table[times[0]]))
+    if np.isnan(values).any():
+        present = present_rows(dict(zip(map(str, states), values.T, strict=True)))
+        t, values = t[present], values[present]
+        warnings.warn(gap_words(t, len(table)), MissingSamples, stacklevel=5)
+    return Trajectory(t, values, list(map(str, states)))
+
+
+def _times(column: pd.Series) -> np.ndarray:
+    """Dates of any zone as dates alone; numbers as they are stored."""
+    kind = column.dtype.kind
+    return column.to_numpy(dtype="datetime64[ns]") if kind == "M" else column.to_numpy()
 
 
 def _from_arrays(t: object, x: object) -> Trajectory:
-    times, states = np.asarray(t), np.asarray(x)
+    times: Any = np.ma.asanyarray(t)
+    states: Any = np.ma.asanyarray(x)
     if times.ndim != 1 or states.ndim not in (1, 2) or len(times) != len(states):
         raise ValueError(
             "arrays (t, x) must have shapes (samples,) and (samples,) or (samples, n_states): "
             f"{times.shape} and {states.shape} came"
         )
-    if times.dtype.kind not in "iuf" or states.dtype.kind not in "iuf":
+    if times.dtype.kind not in "iufmM" or states.dtype.kind not in "iuf":
         raise ValueError(
             f"arrays (t, x) must hold real numbers: {times.dtype} and {states.dtype} came"
         )
-    if states.ndim == 1:
-        return Trajectory(times, states[:, None], ["x"])
-    return Trajectory(times, states, [f"x{k}" for k in range(states.shape[1])])
+    columns = real_numbers(states[:, None] if states.ndim == 1 else states, "states")
+    names = ["x"] if states.ndim == 1 else [f"x{k}" for k in range(states.shape[1])]
+    return Trajectory(seconds(times), columns, names)

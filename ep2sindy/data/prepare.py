@@ -1,5 +1,6 @@
-"""Preparation of fields before they are averaged: plain functions, field -> field.
+"""Preparation of fields, of their variables and places: plain functions, field -> field.
 
+`in_time` has those that work along time.
 A config lists them as steps. None changes its argument, and units stay with the variables.
 """
 
@@ -11,18 +12,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import xarray as xr
-from scipy import signal
 
-from ep2sindy.data.fields import (
-    DIMS,
-    SPACE,
-    check_field,
-    check_samples,
-    grid_points,
-    grid_values,
-    mask_outside,
-    masked_cells,
-)
+from ep2sindy.data.fields import SPACE, check_field, grid_points, mask_outside
 from ep2sindy.library.names import check_variable
 
 OPERATORS: Mapping[type, Callable] = {
@@ -41,84 +32,6 @@ OPERATORS: Mapping[type, Callable] = {
 }
 
 FUNCTIONS: Mapping[str, Callable] = {"abs": np.abs, "exp": np.exp, "log": np.log, "sqrt": np.sqrt}
-
-
-def crop(
-    field: xr.Dataset, *, start_s: float | None = None, stop_s: float | None = None
-) -> xr.Dataset:
-    """Keep the samples from `start_s` to `stop_s`, ends included; None is the field's own end."""
-    t = grid_points(field, "time")
-    start = t[0] if start_s is None else start_s
-    stop = t[-1] if stop_s is None else stop_s
-    keep = np.flatnonzero((t >= start) & (t <= stop))
-    if len(keep) < 2:
-        raise ValueError(
-            f"a crop must leave two samples or more: {start:g} to {stop:g} s leaves {len(keep)} "
-            f"of {len(t)}, which run from {t[0]:g} to {t[-1]:g} s"
-        )
-    return field.isel(time=slice(int(keep[0]), int(keep[-1]) + 1))
-
-
-def decimate(field: xr.Dataset, *, factor: int) -> xr.Dataset:
-    """Keep every `factor`-th sample, from the first on.
-
-    Plain subsampling: what oscillates faster than half the new rate is folded onto lower
-    frequencies, so apply `low_pass` below that rate first.
-    """
-    n_samples = field.sizes["time"]
-    if factor < 1 or n_samples <= factor:
-        raise ValueError(
-            f"factor must be 1 or more and leave two samples or more: {factor} came with "
-            f"{n_samples} samples"
-        )
-    return field.isel(time=slice(None, None, factor))
-
-
-def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Dataset:
-    """Remove what oscillates faster than `cutoff_Hz`, without shifting phases.
-
-    A Butterworth filter of the given order run forwards and backwards: amplitudes halve at
-    the cutoff and fall by 12 * order dB per octave above it. Variables without time and masked
-    cells stay as they are. Loads the field.
-    Raises ValueError for unequal time steps (beyond 1e-3 of a step), a cutoff not between 0
-    and half the sampling rate, or a record shorter than the filter's edges.
-    """
-    dt_s = _uniform_step(field)
-    n_edge = 3 * (order + 1)
-    if not 0 < cutoff_Hz < 0.5 / dt_s:
-        raise ValueError(
-            f"cutoff_Hz must lie between 0 and half the sampling rate, {0.5 / dt_s:g} Hz: "
-            f"{cutoff_Hz:g} came"
-        )
-    if field.sizes["time"] <= n_edge:
-        raise ValueError(
-            f"a low-pass of order {order} needs more than {n_edge} samples: "
-            f"{field.sizes['time']} came; lower the order or leave it out"
-        )
-    sos = signal.butter(order, cutoff_Hz, fs=1 / dt_s, output="sos")
-    filtered = {}
-    for name, array in field.data_vars.items():
-        if "time" not in array.dims:
-            continue
-        values = grid_values(array)
-        check_samples(array, values, masked_cells(array))
-        smooth = signal.sosfiltfilt(sos, values, axis=0, padlen=n_edge)
-        ordered = array.transpose(*[axis for axis in DIMS if axis in array.dims])
-        filtered[name] = ordered.copy(data=smooth.reshape(ordered.shape))
-    return field.assign(filtered)
-
-
-def _uniform_step(field: xr.Dataset) -> float:
-    """Time step in s."""
-    steps = np.diff(grid_points(field, "time"))
-    dt_s = float(steps.mean())
-    if np.ptp(steps) > 1e-3 * dt_s:
-        k = int(np.argmax(np.abs(steps - dt_s)))
-        raise ValueError(
-            f"a low-pass needs equal time steps: t[{k + 1}] - t[{k}] = {steps[k]:g} s, the mean "
-            f"is {dt_s:g} s; interpolate the field onto equal steps first"
-        )
-    return dt_s
 
 
 def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.Dataset:

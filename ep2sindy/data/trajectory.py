@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.machine.screen import html_table, one_screen, text_table
 
@@ -30,12 +31,18 @@ class ConstantStateError(ValueError):
 class Trajectory:
     """Time series of the modelled states and of the inputs that drive them.
 
-    t: (samples,) in s, increasing; steps may be unequal.
+    t: (samples,) in s, increasing; steps may be unequal. Dates are counted from the first, in s.
     states: (samples, n_states). inputs: (samples, n_inputs), by default none.
     units: name -> unit for any of the variables; a missing one reads "1".
     clock: the unit that people read its times in; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are
-    not finite, repeated names, fewer than two samples, or a state that never changes.
+    not finite (what is masked, too), not real numbers or of a size beyond 1e-50 to 1e50, repeated
+    names, fewer than two samples, or a state that never changes.
+
+    >>> t = np.linspace(0.0, 1e-3, 101)
+    >>> run = ep.Trajectory(t, np.sin(6e4 * t)[:, None], ["I_d"], units={"I_d": "A"})
+    >>> run.n_samples, run.columns(["I_d"]).shape
+    (101, (101, 1))
     """
 
     # Lengths read `_`, since __post_init__ compares them and says what to do.
@@ -49,11 +56,12 @@ class Trajectory:
     clock: Clock = SECONDS
 
     def __post_init__(self) -> None:
-        inputs = self.inputs if self.input_names or self.inputs.size else np.empty((len(self.t), 0))
+        empty = not self.input_names and not np.size(self.inputs)
+        inputs = np.empty((len(self.t), 0)) if empty else self.inputs
         for name, value in {
-            "t": read_only(self.t),
-            "states": read_only(self.states),
-            "inputs": read_only(inputs),
+            "t": read_only(seconds(self.t)),
+            "states": read_only(real_numbers(self.states, "states")),
+            "inputs": read_only(real_numbers(inputs, "inputs")),
             "state_names": tuple(self.state_names),
             "input_names": tuple(self.input_names),
             "units": MappingProxyType({n: self.units.get(n, "1") for n in self.names}),
@@ -62,6 +70,7 @@ class Trajectory:
         self._check_shapes()
         check_time(self.t)
         check_finite(self.t, self.values, self.names)
+        check_magnitude(self.values, self.names)
         self._check_variation()
 
     @property
@@ -128,7 +137,7 @@ class Trajectory:
 
     def _headline(self) -> str:
         steps = np.diff(self.t)
-        even = np.ptp(steps) <= 1e-6 * self.dt_s
+        even = np.ptp(steps) <= max(1e-6 * self.dt_s, 2 * rounding_s(self.t))
         step = f"{self.dt_s:.4g}" if even else f"{steps.min():.4g} to {steps.max():.4g}"
         label = f" {self.label!r}" if self.label else ""
         return (

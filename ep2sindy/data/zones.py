@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.extent import Zone, in_numbers, zone_slices, zone_words
 from ep2sindy.data.fields import (
     SPACE,
     cell_edges,
@@ -22,62 +24,13 @@ from ep2sindy.data.fields import (
     grid_values,
     masked_cells,
 )
+from ep2sindy.data.gaps import without_gaps
+from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.units import unit_product
 
 SLAB_VALUES = 2**22  # 32 MB of float64: what one variable may take while a zone is averaged
-
-
-@dataclass(frozen=True)
-class Zone:
-    """Part of the grid: (from, to) in z and r, in m, ends included; None is the whole axis."""
-
-    z: Sequence[float] | None = None
-    r: Sequence[float] | None = None
-
-    def __post_init__(self) -> None:
-        for axis in SPACE:
-            bounds = getattr(self, axis)
-            if bounds is None:
-                continue
-            if len(bounds) != 2 or not bounds[0] < bounds[1]:
-                raise ValueError(
-                    f"a zone's {axis} must be two increasing numbers in m: {list(bounds)} came"
-                )
-            object.__setattr__(self, axis, (float(bounds[0]), float(bounds[1])))
-
-
-def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
-    """Grid points inside the zone, per axis of the field.
-
-    Raises ValueError if the zone bounds an axis the field lacks, holds no grid point, or
-    reaches beyond the grid by more than one cell (a sign of cm taken for m).
-    """
-    slices = {}
-    for axis in SPACE:
-        bounds = getattr(zone, axis)
-        if bounds is None:
-            continue
-        if axis not in field.dims:
-            raise ValueError(
-                f"a zone may bound only the axes of its field: {axis} came, the field has "
-                f"{list(field.dims)}; leave {axis} out of the zone"
-            )
-        points = grid_points(field, axis)
-        rounding = 1e-6 * np.ptp(points)  # a grid stored as float32 must not lose its end points
-        start = int(np.searchsorted(points, bounds[0] - rounding, side="left"))
-        stop = int(np.searchsorted(points, bounds[1] + rounding, side="right"))
-        steps = np.diff(points) if len(points) > 1 else np.array([np.inf])
-        beyond = max(points[0] - bounds[0] - steps[0], bounds[1] - points[-1] - steps[-1])
-        if start >= stop or beyond > rounding:
-            raise ValueError(
-                f"a zone must hold grid points and stay on the grid: {axis} from {bounds[0]:g} to "
-                f"{bounds[1]:g} m came, the grid has {len(points)} points from {points[0]:g} to "
-                f"{points[-1]:g} m"
-            )
-        slices[axis] = slice(start, stop)
-    return slices
 
 
 def zone_average(
@@ -98,24 +51,27 @@ def zone_average(
     `<n_i*n_n*R_ion>` with the average of the product, which is not the product of averages. A
     variable whose attribute `average_of` names the product is taken for it: a simulation's samples
     are averages in time, and so is that.
-    Sums run in float64 and slab by slab in time, whatever the storage.
+    Sums run in float64 and slab by slab in time, whatever the storage. Samples that a variable
+    of time alone lacks (NaN) are left out for all.
     Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
     value that is not finite in a cell that is not masked.
+
+    >>> field = ep.read_field("run.nc")
+    >>> run = ep.zone_average(field, ep.Zone(z=(0.01, 0.02)), states=["n_i", "n_n"])
     """
     check_field(field)
     columns = {name: [(name, 1)] for name in (*states, *inputs)}
     columns |= {f"<{p.replace(' ', '')}>": _averaged(field, split_factors(p)) for p in products}
     used = list(dict.fromkeys(name for factors in columns.values() for name, _ in factors))
     _check_names(field, used, [*states, *inputs, *products])
-    slices = zone_slices(field, zone or Zone())
+    slices = zone_slices(field, in_numbers(zone, field))
     part = field[used].assign_coords({axis: field[axis] for axis in field.dims}).isel(slices)
+    part = without_gaps(part)
     masks = {name: masked_cells(part[name]) for name in used}
     weights = _zone_weights(field, slices, masks, axisymmetric=axisymmetric)
-    n_slab = max(1, SLAB_VALUES // weights.size)
-    slabs = (part.isel(time=slice(k, k + n_slab)) for k in range(0, part.sizes["time"], n_slab))
-    means = np.concatenate([_slab_means(s, masks, weights, list(columns.values())) for s in slabs])
+    means = _means(part, masks, weights, list(columns.values()))
     return Trajectory(
-        t=grid_points(field, "time"),
+        t=grid_points(part, "time"),
         states=means[:, : len(states)],
         state_names=states,
         inputs=means[:, len(states) :],
@@ -149,6 +105,11 @@ class ZoneAverage:
             label=label,
         )
 
+    def place(self, field: xr.Dataset) -> str:
+        """What of the field's grid it averages over, in words."""
+        words = zone_words(self.zone, field)
+        return f"average over {words}" if words else ""
+
 
 @dataclass(frozen=True)
 class GridPoint:
@@ -161,6 +122,12 @@ class GridPoint:
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
         return point(field, z=self.z, r=self.r, states=self.states, inputs=inputs, label=label)
+
+    def place(self, field: xr.Dataset) -> str:
+        """The grid point that it takes, in words."""
+        places = _nearest(field, z=self.z, r=self.r)
+        texts = [f"{a} = {1e3 * grid_points(field, a)[k]:.4g} mm" for a, (k,) in places.items()]
+        return f"the grid point at {', '.join(texts)}" if texts else ""
 
 
 def point(
@@ -177,6 +144,12 @@ def point(
     Raises ValueError for a place outside the grid's cells or without plasma.
     """
     check_field(field)
+    nearest = _nearest(field, z=z, r=r)
+    return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
+
+
+def _nearest(field: xr.Dataset, *, z: float | None, r: float | None) -> dict[str, list[int]]:
+    """The grid point nearest to a place, by axis."""
     places = {axis: value for axis, value in (("z", z), ("r", r)) if value is not None}
     axes = [axis for axis in SPACE if axis in field.dims]
     if sorted(places) != sorted(axes):
@@ -191,7 +164,7 @@ def point(
                 f"from {ends[0]:g} to {ends[1]:g} m"
             )
         nearest[axis] = [int(np.argmin(np.abs(points - place)))]
-    return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
+    return nearest
 
 
 Factors = list[tuple[str, int]]
@@ -209,7 +182,17 @@ def _averaged(field: xr.Dataset, factors: Factors) -> Factors:
 def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str]) -> None:
     unknown = [name for name in used if name not in field.data_vars]
     if unknown:
-        raise ValueError(f"unknown variables {unknown}; this field has {list(field.data_vars)}")
+        made = [(n, *MADE_FROM[n]) for n in unknown if n in MADE_FROM]
+        hints = [
+            f"; {name} is made from {source}: 'prepare=[{{_target_:{step}}}]'"
+            for name, source, step in made
+            if source in field
+        ]
+        near = get_close_matches(unknown[0], list(map(str, field.data_vars)), n=1)
+        hints += [f"; did you mean {near[0]!r}?"] if near and not hints else []
+        raise ValueError(
+            f"unknown variables {unknown}; this field has {list(field.data_vars)}{''.join(hints)}"
+        )
     if len(set(columns)) < len(columns):
         raise ValueError(f"states, inputs and products must differ: {list(columns)} came")
 
@@ -238,6 +221,18 @@ def _zone_weights(
             "sample that is empty"
         )
     return weights / weights.sum()
+
+
+def _means(
+    part: xr.Dataset,
+    masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
+    weights: Float[np.ndarray, "z r"],
+    columns: Sequence[Sequence[tuple[str, int]]],
+) -> Float[np.ndarray, "samples columns"]:
+    """Weighted means over the cells at all times, slab by slab."""
+    n_slab = max(1, SLAB_VALUES // weights.size)
+    slabs = (part.isel(time=slice(k, k + n_slab)) for k in range(0, part.sizes["time"], n_slab))
+    return np.concatenate([_slab_means(slab, masks, weights, columns) for slab in slabs])
 
 
 def _slab_means(

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import SPACE
-from ep2sindy.machine.files import replacing
+from ep2sindy.machine.files import WriteError, replacing, sweep
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,9 @@ class Kept:
 
     folder: Path
 
+    def __post_init__(self) -> None:
+        sweep(self.folder)
+
     def holds(self, block: Block) -> bool:
         return self._path(block).exists()
 
@@ -71,10 +74,10 @@ class Kept:
         try:
             with replacing(self._path(block)) as temporary:
                 np.savez(temporary, **done)  # type: ignore[arg-type]
-        except OSError as error:
+        except WriteError as error:
             raise OSError(
                 f"a finished block must be kept on disk: writing to {self.folder} failed with "
-                f"{error.strerror or error!r}; the blocks before it are kept: mend that, and start "
+                f"{error.reason!r}; the blocks before it are kept: mend that, and start "
                 "the same run again"
             ) from error
 

@@ -41,6 +41,13 @@ class Discovery:
     note: how a rule that judges whole systems of equations came to its model, how sure a joint
     search is, or that a model leaves more than noise; else empty.
     estimate: of states and coefficients together, where the search was joint.
+
+    >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    >>> found = ep.discover(run)
+    >>> found.model.terms("x")
+    {'x': 0.66..., 'x*y': -0.99...}
+    >>> found.fronts["y"].candidates[2].terms
+    ('y', 'x*y')
     """
 
     fronts: Mapping[str, ParetoFront] = field(repr=False)

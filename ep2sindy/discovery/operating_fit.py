@@ -20,7 +20,8 @@ from ep2sindy.discovery.operating_points import (
 )
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Serial, Workers
-from ep2sindy.model.free_run import Bounds, FreeRun, deviation, free_run
+from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.likeness import Bounds, deviation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many

@@ -109,6 +109,11 @@ class Recipe:
     regression. bootstraps: None means none. selection: None means Evidence(), or EBIC() for one.
     depth: candidates kept per size: 3 lets a true support win that noise has put second or third.
     Raises ValueError for a rule that does not go with the search.
+
+    >>> thesis = ep.Recipe(ep.Differential(), ep.AdaptiveLasso(), ep.Bootstraps(), ep.Knee())
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> list(ep.discover(run, recipe=thesis, seed=0).model.terms("x"))
+    ['x', 'x*y']
     """
 
     formulation: Formulation = None  # type: ignore[assignment]  # __post_init__ sets all of them

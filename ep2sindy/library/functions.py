@@ -210,6 +210,10 @@ def register_function(
     the new function from then on.
     Raises ValueError for a name that is no plain word or that is built in, a domain that is no
     interval, values of another shape or not finite, or a derivative that is not that of the value.
+
+    >>> ep.register_function("tanh", np.tanh, lambda x: 1.0 - np.tanh(x) ** 2)
+    >>> ep.polynomial(["x"], degree=1, functions=["tanh"]).names
+    ('1', 'x', 'tanh(x)')
     """
     if not re.fullmatch(r"[^\W\d]\w*", name) or name == INVERSE:
         raise ValueError(f"a function's name must be a plain word, such as 'tanh': {name!r} came")

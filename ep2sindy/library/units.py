@@ -75,6 +75,24 @@ def _powers(unit: str) -> dict[str, float]:
     return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}  # type: ignore[arg-type]
 
 
+@cache
+def unit_like(text: str, like: str | None = None) -> bool:
+    """Whether a text is a unit, `like`: of the same kind as this one."""
+    try:
+        check_unit(text)
+        parsed = registry().parse_units(netcdf_powers(text)) if text.strip() else None
+    except unit_errors():
+        return False
+    if parsed is None or like is None:
+        return parsed is not None
+    return parsed.is_compatible_with(like)
+
+
+def netcdf_powers(unit: str) -> str:
+    """`m-3`, as netCDF writes it, as `m^-3`."""
+    return re.sub(r"\b([A-Za-zµ]+)(-?\d+)\b", r"\1^\2", unit)
+
+
 def unit_product(factors: Iterable[tuple[str, int | float]]) -> str:
     """Multiply units raised to powers: [("m^-3", 2), ("m^3/s", 1)] -> "m^-3 s^-1"."""
     total: dict[str, float] = {}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import cache
+from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,15 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     kept: Any = getattr(kernel._cache, "_cache_file", None)
     if hasattr(kept, "_source_stamp"):  # numba has no public way
         kept._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+    if hasattr(kernel._cache, "save_overload"):
+        kernel._cache.save_overload = partial(_kept_if_room, kernel._cache.save_overload)
     return kernel
+
+
+def _kept_if_room(save: Callable, *compiled: Any) -> None:
+    """A disk that takes no more costs the next run half a minute, not this one its results."""
+    with suppress(OSError):
+        save(*compiled)
 
 
 @cache

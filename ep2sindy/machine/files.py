@@ -6,11 +6,38 @@ import hashlib
 import json
 import math
 import os
+import platform
+import re
 import uuid
+import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+import psutil
+
+
+class WriteError(OSError):
+    """A file could not be written: which, why, and the way out."""
+
+    def __init__(self, path: Path, reason: OSError | str) -> None:
+        self.reason = getattr(reason, "strerror", None) or str(reason) or type(reason).__name__
+        super().__init__(
+            f"{path} could not be written ({self.reason}); what was written before it is whole: "
+            "make room there, or write elsewhere"
+        )
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Let an error of the operating system say which file could not be written."""
+    try:
+        yield
+    except WriteError:
+        raise
+    except OSError as error:
+        raise WriteError(path, error) from error
 
 
 @contextmanager
@@ -18,15 +45,44 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary name beside `path`; it takes the final name only if the block succeeds.
 
     The temporary keeps the suffix, since writers tell formats by it. Whatever ends the block
-    early (an error, Ctrl-C) leaves the final name as it was.
+    early (an error, Ctrl-C) leaves the final name as it was. Raises WriteError, an OSError.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}-{uuid.uuid4().hex[:8]}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    temporary = path.with_name(f".{path.stem}-{_maker()}-{uuid.uuid4().hex[:8]}{path.suffix}")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def _maker() -> str:
+    """Machine and process, by which it is told whose a temporary file is."""
+    return f"{zlib.crc32(platform.node().encode()):08x}-{os.getpid()}"
+
+
+TEMPORARY = re.compile(r"\..+-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}(\.\w+)?")
+
+
+def sweep(folder: Path) -> None:
+    """Remove what processes of this machine that were killed left half-written in a folder.
+
+    Its folders are swept as well. A file of a living process, or of another machine, stays.
+    """
+    ours = _maker().partition("-")[0]
+    for place, _, names in os.walk(folder):
+        for name in names:
+            found = TEMPORARY.fullmatch(name)
+            if found and found[1] == ours and not psutil.pid_exists(int(found[2])):
+                with suppress(OSError):  # another start may sweep at the same time
+                    os.unlink(os.path.join(place, name))
+
+
+def write_bytes(path: Path, content: bytes | memoryview) -> None:
+    """Write bytes under `path`, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,6 +14,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
+
+from ep2sindy.machine.interruption import end_with
 
 # Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
 AHEAD = 2
@@ -60,6 +63,13 @@ def rows_in_order(
     return [row for number in sorted(found) for row in found[number]]
 
 
+def _in_worker(
+    function: Callable[[Any], Any], parent: int, numbered: tuple[int, Any]
+) -> tuple[int, Any]:
+    end_with(parent)
+    return _on_one_thread(function, numbered)
+
+
 @dataclass(frozen=True)
 class Serial:
     """One piece after the other, in this process."""
@@ -92,7 +102,8 @@ class Loky:
     ) -> Iterator[tuple[int, Any]]:
         # Pieces are pickled as they are: joblib would keep a copy of every large array on disk.
         workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
-        yield from workers(delayed(_on_one_thread)(function, each) for each in enumerate(pieces))
+        numbered = enumerate(pieces)
+        yield from workers(delayed(_in_worker)(function, os.getpid(), each) for each in numbered)
 
 
 @dataclass(frozen=True)

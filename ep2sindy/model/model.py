@@ -40,6 +40,12 @@ class SparseModel:
     units: of the states and of the library's variables. provenance: where it came from.
     covariance: (coefs, coefs) of the coefficients that are not zero, equation by equation and
     within one in the order of the library, in SI; None where it is not known.
+
+    >>> library = ep.polynomial(["x", "v"], degree=1)
+    >>> spring = ep.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
+    >>> print(ep.SparseModel(library, ["x", "v"], spring).text())
+    x' = 1 v
+    v' = -4 x
     """
 
     library: Library

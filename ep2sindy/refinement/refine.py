@@ -82,6 +82,11 @@ def refine(
     n_reweights: passes with each state weighted by 1/std of its residuals.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
     terms or a constraint that leaves out one of them. A failed fit is a result: see `status`.
+
+    >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    >>> refined = ep.refine(ep.discover(run).model, [run], rng=0)
+    >>> str(refined.status)
+    'converged'
     """
     rng = np.random.default_rng(rng)
     (found,) = refine_many(

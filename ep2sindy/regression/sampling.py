@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
+from ep2sindy.data.numbers import rounding_s
+
 # Deviation from an even grid, in steps, that is taken for rounding of the recorded times: a sample
 # so far off is wrong by a twentieth of what the signal changes in a step.
 ROUNDED = 0.05
@@ -23,7 +25,8 @@ MIN_SAMPLES = 20  # of a stretch between gaps: fewer say nothing of their own no
 def is_even(t: Float[np.ndarray, " samples"]) -> bool:
     """Whether times lie on an even grid but for rounding."""
     step = (t[-1] - t[0]) / (len(t) - 1)
-    return bool(np.abs(t - t[0] - step * np.arange(len(t))).max() <= ROUNDED * step)
+    off = np.abs(t - t[0] - step * np.arange(len(t))).max()
+    return bool(off <= max(ROUNDED * step, rounding_s(t)))
 
 
 def stretches(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ep2sindy.machine.files import replacing, write_json, write_text
+from ep2sindy.machine.files import replacing, sweep, write_json, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.picture import DPI
 from ep2sindy.report.provenance import commit, versions
@@ -39,6 +39,7 @@ class RunFolder:
         parent = root / experiment
         try:
             parent.mkdir(parents=True, exist_ok=True)
+            sweep(parent)
             stamp = f"{now:%Y-%m-%d_%H%M%S}"
             for name in [stamp, *(f"{stamp}_{k}" for k in range(2, 1000))]:
                 try:

@@ -13,6 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
+from ep2sindy.machine.files import writing
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
@@ -22,7 +23,9 @@ class Screen:
     """Prints to the terminal and, without colours, to run.log where there is one."""
 
     def __init__(self, log: Path | None = None) -> None:
-        self._log = None if log is None else log.open("a", encoding="utf-8")
+        self._path = log or Path()
+        with writing(self._path):
+            self._log = None if log is None else log.open("a", encoding="utf-8")
         terminal = Console()
         if not terminal.is_terminal:
             terminal.width = WIDTH
@@ -31,15 +34,18 @@ class Screen:
             self._consoles.append(Console(file=self._log, width=WIDTH, no_color=True))
 
     def print(self, *renderables: RenderableType) -> None:
-        for console in self._consoles:
-            console.print(*renderables, highlight=False)
-        if self._log is not None:
-            self._log.flush()
+        self._consoles[0].print(*renderables, highlight=False)
+        with writing(self._path):
+            for console in self._consoles[1:]:
+                console.print(*renderables, highlight=False)
+            self._flush()
 
     def log(self, text: str) -> None:
         """Into run.log alone."""
-        for console in self._consoles[1:]:
-            console.print(text, highlight=False, markup=False)
+        with writing(self._path):
+            for console in self._consoles[1:]:
+                console.print(text, highlight=False, markup=False)
+            self._flush()
 
     def show(self, sections: Sequence[Section]) -> None:
         """Every section that has something for the screen."""
@@ -52,7 +58,13 @@ class Screen:
 
     def close(self) -> None:
         if self._log is not None:
-            self._log.close()
+            with writing(self._path):
+                self._log.close()
+
+    def _flush(self) -> None:
+        """What is printed waits in the file's memory until here."""
+        if self._log is not None:
+            self._log.flush()
 
 
 def renderables(block: Block) -> Iterator[RenderableType]:

@@ -9,6 +9,8 @@ from pathlib import Path
 from textwrap import indent
 from typing import Any
 
+from ep2sindy.machine.files import writing
+
 
 class Board:
     """One run in TensorBoard; opened when something is written, for its import takes a while."""
@@ -23,7 +25,8 @@ class Board:
 
         values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()]
         self._add(Summary(value=values), step=step)
-        self._writer.flush()
+        with writing(self._folder):
+            self._writer.flush()
 
     def equations(self, texts: Mapping[str, str]) -> None:
         """The equations of all models, by name: one block of lines as they are, in a fixed font."""
@@ -61,15 +64,17 @@ class Board:
         self.scalars(metrics, step=0)
 
     def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with writing(self._folder):
+                writer.close()
 
     def _add(self, summary: Any, *, step: int = 0) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
 
-        if self._writer is None:
-            from tensorboard.summary.writer.event_file_writer import EventFileWriter
+        with writing(self._folder):
+            if self._writer is None:
+                from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-            self._writer = EventFileWriter(str(self._folder))
-        self._writer.add_event(Event(wall_time=time.time(), step=step, summary=summary))
+                self._writer = EventFileWriter(str(self._folder))
+            self._writer.add_event(Event(wall_time=time.time(), step=step, summary=summary))

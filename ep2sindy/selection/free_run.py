@@ -10,15 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
-from ep2sindy.model.free_run import (
-    Bounds,
-    FreeRun,
-    Verdict,
-    against_cycle,
-    columns_of,
-    deviation,
-    free_run,
-)
+from ep2sindy.model.free_run import FreeRun, columns_of, free_run
+from ep2sindy.model.likeness import Bounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.numbers import rounding_s
+
 STEP_TOLERANCE = 1e-6  # relative spread of steps below which sampling counts as uniform
 
 
 def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
     """Whether all time steps agree to rounding of the recorded times."""
     steps = np.diff(t)
-    return bool(np.ptp(steps) <= STEP_TOLERANCE * steps.mean())
+    return bool(np.ptp(steps) <= max(STEP_TOLERANCE * steps.mean(), 2 * rounding_s(t)))
 
 
 def power_spectrum(

@@ -70,6 +70,10 @@ def trace(
     "auto" leaves a hundred to a period. detrend: a straight line is taken out: a positive signal
     is divided by it, another less it, and the mean stays.
     Raises ValueError for a signal that does not oscillate, under six periods, or a wrong setting.
+
+    >>> t = np.linspace(0.0, 1e-3, 2001)
+    >>> ep.trace(ep.Trajectory(t, 3.0 + np.sin(6e4 * t)[:, None], ["I_d"])).is_positive
+    True
     """
     name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal
     if name is None:

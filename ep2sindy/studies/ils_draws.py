@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.model.free_run import FreeRun, Verdict
+from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.likeness import Verdict
 from ep2sindy.report.document import Section, Table
 
 FIGURES = ("f_error", "nrmse", "amplitude", "waveform")

@@ -84,16 +84,19 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
-        opened = self.source.field()
-        libraries = {name: case.library(opened) for name, case in self.libraries.items()}
-        data = self.source.sampled(opened, libraries.values(), run)
+        opened = self.source.fields()
+        libraries = {name: case.library(opened[0]) for name, case in self.libraries.items()}
+        runs = [self.source.sampled(field, libraries.values(), run) for field in opened]
+        data = runs[0]
+        if len(runs) > 1:
+            run.say(f"{len(runs)} records in one search; figures show the first")
         if hint := alone(data):
             run.warn(hint)
         # Each case draws from its own stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         results = {
             name: result_of(
-                data,
+                runs,
                 library,
                 recipes[name],
                 self.thesis.get(name, {}),
@@ -101,12 +104,13 @@ class Study:
                 self.living,
                 self.held_out,
                 self.compared,
-                zone_length_m(self.source),
+                zone_length_m(self.source, opened[0]),
                 rng=rng,
             )
             for (name, library), rng in zip(libraries.items(), streams, strict=True)
         }
-        return Outcome(data, results, self.figures)
+        files = [str(field.attrs.get("file", "")) for field in opened]
+        return Outcome(data, results, self.figures, files)
 
 
 def alone(data: Trajectory) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -37,6 +37,7 @@ from ep2sindy.studies.living_view import (
     living_summary,
     living_tables,
 )
+from ep2sindy.studies.records_view import records_sections, records_tables
 from ep2sindy.studies.shown import (
     INTEGRATED,
     Shown,
@@ -59,11 +60,12 @@ FRONT = (
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What every library found in the same data."""
+    """What every library found in the same data; files: of all records, data being the first."""
 
     data: Trajectory
     results: Mapping[str, LibraryResult]
     shown: Shown
+    files: Sequence[str] = ()
 
     @property
     def published(self) -> dict[str, FreeRun]:
@@ -97,7 +99,8 @@ class Outcome:
         for name, result in self.results.items():
             if result.roles is not None:
                 found[f"roles_{name}"] = roles_table(result.roles)
-        return found | living_tables(self.living) | {"comparison": self.comparison()}
+        found |= living_tables(self.living) | {"comparison": self.comparison()}
+        return found | records_tables(self.results, self.files)
 
     def comparison(self) -> pd.DataFrame:
         """One row per model: frequencies in Hz, trajectory error, and a word on the trajectory."""
@@ -140,7 +143,7 @@ class Outcome:
         shown = Section(
             "Run freely from the first sample", [self._comparison_table(), *pictures(FIGURES)]
         )
-        return [*found, *lives, shown]
+        return [*found, *lives, shown, *records_sections(self.results, self.files)]
 
     def _in_short(self) -> Section:
         """The equations that were found and how they run; a screen ends with them anyway."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 
@@ -26,7 +26,8 @@ class LibraryResult:
     """One library's discovery and its selected model; the published terms, fitted to our data.
 
     given: the published terms as printed, by state. living: a model that lives on its own; None
-    where it was not asked for, or the library has inputs. roles: of its terms.
+    where it was not asked for, or the library has inputs. roles: of its terms. elsewhere: the
+    selected model over the records beside the first.
     """
 
     recipe: Recipe
@@ -37,10 +38,11 @@ class LibraryResult:
     published: FreeRun | None
     living: Living | None = None
     roles: Roles | None = None
+    elsewhere: Sequence[FreeRun] = ()
 
 
 def result_of(
-    data: Trajectory,
+    runs: Sequence[Trajectory],
     library: Library,
     recipe: Recipe,
     published: Mapping[str, Mapping[str, float]],
@@ -52,9 +54,16 @@ def result_of(
     *,
     rng: np.random.Generator,
 ) -> LibraryResult:
-    """What one library finds, and how its model and the published one run."""
-    n_samples = data.n_samples if rollout_s is None else samples_in(data, rollout_s)
-    found = discover(data, library, recipe, seed=rng)
+    """What one library finds in all records, and how its model and the published one run.
+
+    They run over the first record, the model over the others as well; a model that lives is
+    searched in the first.
+    """
+    first, *others = [
+        (run, run.n_samples if rollout_s is None else samples_in(run, rollout_s)) for run in runs
+    ]
+    data, n_samples = first
+    found = discover(list(runs), library, recipe, seed=rng)
     refitted = _refitted(found, published)
     lives = roles = None
     if living is not None and not found.model.inputs:
@@ -73,6 +82,7 @@ def result_of(
         published=_run_refitted(found, refitted, data, n_samples),
         living=lives,
         roles=roles,
+        elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 import ep2sindy
+from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.discovery.blocks import Kept, blocks_of
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
@@ -27,7 +28,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import A_LIST, Count, Names
 from ep2sindy.studies.pointwise_view import Outcome
 from ep2sindy.studies.simulated import say_simulation
-from ep2sindy.studies.source import FieldSource
+from ep2sindy.studies.source import FieldSource, say_field
 from ep2sindy.thruster.parameters import Thruster
 
 # What does not change the result of a point, and may differ when a broken run is taken up.
@@ -71,6 +72,7 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         field = self.source.field()
         say_simulation(run, field.attrs)
+        say_field(run, field)
         lacking = [name for name in self.variables_if_present if name not in field]
         search = self.search(self.library(lacking=lacking), seed=run.seed)
         left_out = [name for name in map(str, self.terms) if name not in search.library.names]
@@ -84,9 +86,7 @@ class Study:
         found = regimes(result, rng=rng, max_regimes=self.max_regimes)
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
-        run.write(
-            "pointwise.nc", lambda path: result.to_netcdf(path, engine="h5netcdf", encoding=packed)
-        )
+        write_netcdf(result, run.folder.path / "pointwise.nc", encoding=packed)
         kept.clear()
         return Outcome(result, found, self.outline, wall_s=wall_s, n_before=n_before)
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
 
+from ep2sindy.data.extent import in_numbers, zone_words
+from ep2sindy.data.fields import grid_points
+from ep2sindy.data.gaps import gap_words
+from ep2sindy.data.open import files_of
+from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.report.run import Run
@@ -26,12 +32,35 @@ class FieldSource:
     prepare: Sequence[Step] = ()
 
     def field(self) -> xr.Dataset:
-        """Raises DivergedError for a simulation that broke before it could be studied.
+        """The one record; raises ValueError for several files.
 
-        What the data say of themselves stays, whatever a step makes of them: arithmetic of
-        xarray drops it, and a run that diverged would be silent.
+        Raises DivergedError for a simulation that broke before it could be studied.
         """
-        field: xr.Dataset = self.data.build()
+        records = self._records()
+        if len(records) > 1:
+            raise ValueError(
+                f"this experiment takes one record: data.path names {len(records)} files; give "
+                "one, or take +exp=discover or +exp=breathing, which take several"
+            )
+        return self._prepared(records[0])
+
+    def fields(self) -> list[xr.Dataset]:
+        """One for every file that `data.path` names, or the one that the data are."""
+        return [self._prepared(record) for record in self._records()]
+
+    def _records(self) -> list[Deferred]:
+        path = self.data.settings.get("path")
+        files = [path] if path is None else files_of(path)
+        if files == [path]:
+            return [self.data]
+        return [self.data.changed({"path": file}) for file in files]
+
+    def _prepared(self, data: Deferred) -> xr.Dataset:
+        """What the data say of themselves stays: a step's arithmetic drops it, and a run that
+        diverged would be silent."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtfulUnit)  # said of the data that are used
+            field: xr.Dataset = data.build()
         check_recorded(field)
         said = dict(field.attrs)
         for step in self.prepare:
@@ -47,6 +76,10 @@ class Sampling(Protocol):
     products: Sequence[str]
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory: ...
+
+    def place(self, field: xr.Dataset) -> str:
+        """Where on the field's grid, in words; empty for a field without one."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +97,9 @@ class Source:
     def field(self) -> xr.Dataset:
         return FieldSource(self.data, self.prepare).field()
 
+    def fields(self) -> list[xr.Dataset]:
+        return FieldSource(self.data, self.prepare).fields()
+
     def inputs(self, libraries: Iterable[Library]) -> list[str]:
         """Variables of the libraries that are neither states nor averages of products."""
         products = [f"<{name.replace(' ', '')}>" for name in self.trajectory.products]
@@ -75,25 +111,54 @@ class Source:
         """The trajectory that libraries need, and a word on it for those who watch."""
         say_simulation(run, field.attrs)  # first: it may say why the rest cannot work
         data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=run.title)
-        say_data(run, data)
+        say_data(run, data, field, self.trajectory.place(field))
         return data
 
 
-def zone_length_m(source: Source) -> float | None:
+def zone_length_m(source: Source, field: xr.Dataset) -> float | None:
     """Of the zone that the trajectory is averaged over, along z; None for the whole axis."""
-    z = getattr(getattr(source.trajectory, "zone", None), "z", None)
+    z: Any = in_numbers(getattr(source.trajectory, "zone", None), field).z
     return None if z is None else float(z[1] - z[0])
 
 
-def say_data(run: Run, data: Trajectory) -> None:
+def say_field(run: Run, field: xr.Dataset) -> None:
+    """Which data, for a study of every grid point."""
+    t = grid_points(field, "time")
+    words = [
+        field.attrs.get("file", ""),
+        zone_words(None, field),
+        f"{len(t)} samples of {(t[-1] - t[0]) / (len(t) - 1):.4g} s from {t[0]:.4g} s",
+    ]
+    run.say(f"data: {'; '.join(word for word in words if word)}")
+    say_doubts(run, field)
+
+
+def say_doubts(run: Run, field: xr.Dataset) -> None:
+    """Numbers of a file that look like another unit."""
+    if "file" in field.attrs:
+        for text in unit_doubts(field):
+            run.warn(text)
+
+
+def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
+    """Which data: the file, the zone, samples and units; what is missing, what looks amiss."""
+    units = ", ".join(f"{name} in {unit}" for name, unit in data.units.items())
+    where = [field.attrs.get("file", ""), place]
     frequencies = ", ".join(
         f"{name} {data.clock.frequency_text(dominant_frequency(data.t, column))}"
         for name, column in zip(data.state_names, data.states.T, strict=True)
     )
-    run.say(
-        f"data: {data.n_samples} samples of {data.clock.duration_text(data.dt_s, digits=4)}; "
-        f"dominant frequency {frequencies}"
-    )
+    words = [
+        *(text for text in where if text),
+        f"{data.n_samples} samples of {data.clock.duration_text(data.dt_s, digits=4)} "
+        f"from {data.clock.duration_text(data.t[0], digits=4)}",
+        units,
+        f"dominant frequency {frequencies}",
+    ]
+    run.say(f"data: {'; '.join(words)}")
+    say_doubts(run, field)
+    if data.n_samples < field.sizes["time"]:
+        run.warn(gap_words(data.t, field.sizes["time"]))
 
 
 def data_summary(data: Trajectory) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from ep2sindy.figures.living import (
     waveform_figure,
 )
 from ep2sindy.library.equations import equation_text
-from ep2sindy.model.free_run import FreeRun, Verdict
+from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import (

@@ -10,7 +10,8 @@ from tempfile import TemporaryFile
 import xarray as xr
 from tqdm import tqdm
 
-from ep2sindy.machine.files import fingerprint, replacing
+from ep2sindy.data.netcdf import write_netcdf
+from ep2sindy.machine.files import fingerprint, sweep
 from ep2sindy.thruster.axial.model import CFL
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.simulate import as_start, simulate_as
@@ -75,6 +76,7 @@ def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
             tqdm.write(f"{path} cannot be read ({error}); simulating it again")
     try:  # now, not after the simulation
         path.parent.mkdir(parents=True, exist_ok=True)
+        sweep(path.parent)
         with TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
@@ -101,5 +103,4 @@ def write(field: xr.Dataset, path: Path) -> None:
         str(variable): {"zlib": True, "complevel": 1, "shuffle": True}
         for variable in field.data_vars
     }
-    with replacing(path) as temporary:
-        field.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+    write_netcdf(field, path, encoding=compressed)

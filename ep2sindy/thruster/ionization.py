@@ -11,16 +11,20 @@ import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.thruster import propellants
+from ep2sindy.thruster.propellant_files import propellant
 
 
-def ionization_rate(field: xr.Dataset, *, table: str | Path | None = None) -> xr.Dataset:
-    """Add R_ion in m^3/s, the ionization rate coefficient of xenon, from T_e_eV.
+def ionization_rate(
+    field: xr.Dataset, *, gas: str = "xenon", table: str | Path | None = None
+) -> xr.Dataset:
+    """Add R_ion in m^3/s, the ionization rate coefficient of a gas, from T_e_eV.
 
-    table: CSV file of T_e in eV (increasing) and rate in m^3/s, linear between its rows; any
-    further columns and lines of text are left out. By default the fits of
-    `ep2sindy.thruster.propellants`.
-    Raises ValueError if the field has R_ion already or no T_e_eV, or if T_e_eV leaves the
-    table, which is never extrapolated.
+    gas: xenon, by the fits of `ep2sindy.thruster.propellants`; krypton or argon, by the tables of
+    `ep2sindy.propellant`, linear between their rows.
+    table: CSV file of T_e in eV (increasing) and rate in m^3/s of any gas, instead, linear between
+    its rows; any further columns and lines of text are left out.
+    Raises ValueError if the field has R_ion already or no T_e_eV, or if T_e_eV leaves a table,
+    which is never extrapolated.
     """
     if "R_ion" in field:
         raise ValueError(
@@ -28,23 +32,36 @@ def ionization_rate(field: xr.Dataset, *, table: str | Path | None = None) -> xr
         )
     if "T_e_eV" not in field:
         raise ValueError(f"R_ion needs T_e_eV; this field has {list(field.data_vars)}")
+    if table is not None and gas != "xenon":
+        raise ValueError(
+            f"a table says the rates of its own gas: gas={gas!r} came beside {table}; leave one out"
+        )
     T_e_eV = field["T_e_eV"].astype(np.float64)
-    if table is None:
-        rate: Callable = propellants.ionization_rate
-    else:
-        T_eV, rates = read_rate_table(Path(table))
-        low, high = float(T_e_eV.min()), float(T_e_eV.max())
-        if low < T_eV[0] or high > T_eV[-1]:
-            raise ValueError(
-                f"T_e_eV must stay in the rate table, {T_eV[0]:g} to {T_eV[-1]:g} eV: it runs "
-                f"from {low:g} to {high:g} eV; extend {table}"
-            )
-
-        def rate(T: np.ndarray) -> np.ndarray:
-            return np.interp(T, T_eV, rates)
-
+    rate: Callable = propellants.ionization_rate
+    if table is not None:
+        rate = _tabulated(*read_rate_table(Path(table)), T_e_eV, f"extend {table}")
+    elif gas != "xenon":
+        known = propellant(gas)
+        rows = np.array(known.T_e_eV), np.array(known.ionization_rate)
+        rate = _tabulated(*rows, T_e_eV, "keep_where leaves cells out, or give a table of your own")
     R_ion = xr.apply_ufunc(rate, T_e_eV, dask="parallelized", output_dtypes=[np.float64])
     return field.assign(R_ion=R_ion.drop_attrs(deep=False).assign_attrs(units="m^3/s"))
+
+
+def _tabulated(
+    T_eV: Float[np.ndarray, " rows"],
+    rates: Float[np.ndarray, " rows"],
+    T_e_eV: xr.DataArray,
+    way_out: str,
+) -> Callable:
+    """Linear between the rows of a table, which must cover all temperatures."""
+    low, high = float(T_e_eV.min()), float(T_e_eV.max())
+    if low < T_eV[0] or high > T_eV[-1]:
+        raise ValueError(
+            f"T_e_eV must stay in the rate table, {T_eV[0]:g} to {T_eV[-1]:g} eV: it runs "
+            f"from {low:g} to {high:g} eV; {way_out}"
+        )
+    return lambda T: np.interp(T, T_eV, rates)
 
 
 def read_rate_table(

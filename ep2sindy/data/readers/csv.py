@@ -1,20 +1,113 @@
-"""Tables as text."""
+"""Tables as text: CSV and its kin, as programs and oscilloscopes write them."""
 
 from __future__ import annotations
 
+import codecs
+import re
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import xarray as xr
+from jaxtyping import Float
 
 from ep2sindy.data.readers.source import Reader, Source
+from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, Layout, layout_of
+
+N_LOOKED_AT = 2000  # lines that tell the layout: longer preambles there are none
+
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def read_csv(path: Path) -> Source:
-    """CSV with a header line of names, one row per sample; lines from # on are left out."""
-    frame = pd.read_csv(path, comment="#", skipinitialspace=True)
-    frame.columns = frame.columns.str.strip()
-    return Source(path, [*map(str, frame)], lambda name: xr.DataArray(frame[name].to_numpy()))
+    """Text with one row per sample, its columns parted by , ; | tabs or blanks.
+
+    Decimal commas, a preamble and a line of units are told from the content; a header need not be.
+    A name is the header's without its unit, or the column's number, from 0. Columns of text are
+    left out, and an empty cell is NaN.
+    """
+    encoding = _encoding(path)
+    with path.open(encoding=encoding, newline=None) as file:
+        lines = list(islice(file, N_LOOKED_AT))
+    layout = layout_of(lines)
+    frame = _frame(path, layout, encoding)
+    header = layout.header
+    names = {header.names[j]: j for j in layout.columns if j < len(header.names)}
+    numbered = {str(j): j for j in layout.columns}
+
+    def read(name: str) -> xr.DataArray:
+        j = (numbered | names)[name]
+        values = _numbers(frame[j], name, layout)
+        return xr.DataArray(values, attrs={"units": header.units[j]})
+
+    aliases = tuple(number for number in numbered if number not in names)
+    return Source(
+        path, [*names], read, aliases=aliases, words=layout.words, step_s=header.step_s,
+        is_table=True,
+    )  # fmt: skip
 
 
-CSV = Reader("CSV", read_csv, form="other", endings=(".csv",))
+def _encoding(path: Path) -> str:
+    """Raises ValueError for a file that is no text."""
+    with path.open("rb") as file:
+        head = file.read(2**16)
+    if head.startswith(UTF_16):
+        return "utf-16"
+    if b"\0" in head:
+        raise ValueError("it holds bytes that are no text, as a binary file by another name does")
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8-sig"
+
+
+def _frame(path: Path, layout: Layout, encoding: str) -> pd.DataFrame:
+    """The rows; raises ValueError for one of more cells than the first."""
+    missing = sorted({*MISSING, *map(str.upper, MISSING), "NaN", "Inf", "-Inf"} - {""})
+    with path.open(encoding=encoding, newline=None) as file:
+        for _ in range(layout.first):  # lines of a preamble may hold quotes that pandas pairs
+            next(file)
+        try:
+            return pd.read_csv(
+                file,
+                sep=layout.separator or r"\s+",
+                decimal=layout.decimal,
+                header=None,
+                comment=COMMENTS[0],
+                skipinitialspace=True,
+                na_values=missing,
+                low_memory=False,
+            )
+        except pd.errors.ParserError as error:
+            found = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error))
+            if not found:
+                raise
+            raise ValueError(
+                f"every row must have as many cells as the first, {found[1]}: row {found[2]} has "
+                f"{found[3]}"
+            ) from error
+
+
+def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, " rows"]:
+    """A column as numbers; raises ValueError with the row of a cell that is none."""
+    if column.dtype.kind in "fiu":
+        return column.to_numpy(dtype=np.float64)
+    text = column.astype("string").str.strip().str.replace(layout.decimal, ".", regex=False)
+    text = text.str.replace(r"[dD](?=[+-]?\d+$)", "e", regex=True)  # Fortran's exponents
+    values = pd.to_numeric(text, errors="coerce")
+    wrong = np.flatnonzero(values.isna() & text.notna() & ~text.str.lower().isin(MISSING))
+    if wrong.size:
+        raise ValueError(
+            f"column {name!r} must hold numbers: row {wrong[0] + 1} holds {column.iloc[wrong[0]]!r}"
+        )
+    return values.to_numpy(dtype=np.float64, na_value=np.nan)
+
+
+CSV = Reader(
+    "text",
+    read_csv,
+    form="other",
+    endings=(".csv", ".tsv", ".txt", ".dat", ".asc", ".prn"),
+)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -12,28 +13,84 @@ import xarray as xr
 
 from ep2sindy.data.readers.source import Reader, Source, leaves
 
+UNITS = {
+    "t": "s", "z": "m", "grid": "m", "cell_centers": "m", "n": "m^-3", "ni": "m^-3", "nn": "m^-3",
+    "ne": "m^-3", "u": "m/s", "ui": "m/s", "ue": "m/s", "Tev": "eV", "B": "T", "E": "V/m",
+    "potential": "V", "thrust": "N", "discharge_current": "A", "discharge_voltage": "V",
+    "ion_current": "A", "electron_current": "A",
+}  # fmt: skip
+
 
 def read_hallthruster(path: Path) -> Source:
-    """Time-resolved JSON output of HallThruster.jl, SI but for Tev in eV.
+    """Time-resolved JSON output of HallThruster.jl, SI but for Tev in eV; or columns by name.
 
     A name is a path inside a frame, counted from 0: `ions.Xe.0.n` is the density of Xe+,
-    `neutrals.Xe.n`, `Tev`, `discharge_current`, with time `t` and grid `z`. Layout of versions
-    0.19 to 0.22 (output.frames); also read are 0.18 (`ni.0`) and earlier ones (a bare list of
-    frames, `ni_1`).
+    `neutrals.Xe.n`, `Tev`, `discharge_current`, with time `t` and grid `z`. Layouts: of versions
+    0.19 to 0.22 (output.frames); frames with `t` and `grid` beside them; 0.18 (`ni.0`, `ui.0`,
+    `nn`) and earlier (`ni_1`), a bare list of frames; without frames, plain columns. What stands
+    beside the frames is named by its path from the top.
     Source: https://um-pepl.github.io/HallThruster.jl (Use JSON for input and output).
     """
-    content = json.loads(path.read_text(encoding="utf-8"))
-    frames = content.get("output", {}).get("frames") if isinstance(content, dict) else content
-    if not frames or not isinstance(frames[0], dict):
+    content = json.loads(path.read_text(encoding="utf-8-sig"))
+    frames, beside = _parted(content)
+    columns = {name: v for name, v in leaves(beside).items() if _is_column(v)}
+    if not frames and not columns:
         raise ValueError("it holds no output.frames; run the simulation with save_time_resolved")
+    inside = list(leaves(frames[0])) if frames else []
+    grid = [name for name in ("z",) if name in inside]  # repeated in every frame: the grid stays
 
     def read(name: str) -> xr.DataArray:
-        if name == "z":  # repeated in every frame, since the grid stays
-            return xr.DataArray(np.array(frames[0]["z"], dtype=np.float64))
+        if name in grid:
+            return xr.DataArray(np.array(frames[0][name], dtype=np.float64))
+        if name not in inside:
+            return xr.DataArray(np.array(columns[name], dtype=np.float64))
         rows = [reduce(_step_into, name.split("."), frame) for frame in frames]
         return xr.DataArray(np.array(rows, dtype=np.float64))
 
-    return Source(path, list(leaves(frames[0])), read)
+    names = [*inside, *(name for name in columns if name not in inside)]
+    channel_m = _channel_m(content) if isinstance(content, dict) else None
+    words = f"{len(frames)} frames" if frames else "columns, no frames"
+    return Source(path, names, read, words=words, channel_m=channel_m, units=_units(names))
+
+
+def _parted(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
+    """The frames, and what stands beside them."""
+    if isinstance(content, list):
+        frames, beside = content, {}
+    else:
+        output = content.get("output", {})
+        holder = output if isinstance(output, dict) and "frames" in output else content
+        frames = holder.get("frames") or []
+        # The input and the averages describe the run: they are no samples.
+        beside = {k: v for k, v in holder.items() if k not in ("frames", "input", "average")}
+        beside.pop("output", None)
+    if not all(isinstance(frame, dict) for frame in frames):
+        return [], beside
+    return frames, beside
+
+
+def _is_column(value: Any) -> bool:
+    """Two numbers or more, or lists of them."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return array.ndim > 0 and array.size > 1
+
+
+def _units(names: Sequence[str]) -> dict[str, str]:
+    """What the program writes them in, by the last name of a path; a charge's is the one before."""
+    lasts = {name: [part for part in name.split(".") if not part.isdigit()][-1] for name in names}
+    return {name: UNITS[last] for name, last in lasts.items() if last in UNITS}
+
+
+def _channel_m(content: Mapping[str, Any]) -> float | None:
+    """Length of the channel in m, from the input that newer versions keep beside the output."""
+    places = ("input", "config", "thruster", "geometry", "channel_length")
+    node: Any = content
+    for place in places:
+        node = node.get(place) if isinstance(node, dict) else None
+    return float(node) if isinstance(node, int | float) else None
 
 
 def _step_into(node: Any, key: str) -> Any:

@@ -2,22 +2,42 @@
 
 from __future__ import annotations
 
+from itertools import product
+from math import ceil
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.source import Reader, Source
+from ep2sindy.data.readers.source import UNDECODED, Reader, Source
+
+if TYPE_CHECKING:
+    import h5py
+
+UNITS = ("units", "Units", "UNITS", "unit", "Unit", "UNIT")
+
+# Attributes by which NetCDF packs numbers and marks those that are missing; other programs too.
+PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value")
 
 
 def read_hdf5(path: Path) -> Source:
-    """HDF5; a name is the path of a data set, such as "group/n_i"."""
+    """HDF5; a name is the path of a data set, such as "group/n_i".
+
+    Numbers packed by `scale_factor` and `add_offset` are unpacked; those that `_FillValue` marks,
+    and those that were never written, are NaN.
+    """
     import h5py
 
     def read(name: str) -> xr.DataArray:
         with h5py.File(path) as file:
-            units = file[name].attrs.get("units", "")
-            units = units.decode() if isinstance(units, bytes) else units
-            return xr.DataArray(file[name][()], attrs={"units": units})
+            found = file[name]
+            attrs = {key: _plain(found.attrs[key]) for key in PACKING if key in found.attrs}
+            attrs["units"] = next((_plain(found.attrs[k]) for k in UNITS if k in found.attrs), "")
+            dims = [f"dim_{k}" for k in range(len(found.shape))]
+            packed = xr.Variable(dims, written(found), attrs)
+        plain = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
+        return xr.DataArray(plain.values, attrs={"units": attrs["units"]})
 
     return Source(path, names_in_hdf5(path), read)
 
@@ -32,6 +52,48 @@ def names_in_hdf5(path: Path) -> list[str]:
             lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None
         )
     return names
+
+
+def written(found: h5py.Dataset) -> np.ndarray:
+    """The values of a data set; NaN where none were ever written, for HDF5 gives zeros there.
+
+    Raises ValueError where not one was.
+    """
+    values = found[()]
+    holes = holes_of(found)
+    if not holes:
+        return values
+    if len(holes) == 1 and holes[0] == (slice(None),) * found.ndim:
+        raise ValueError(f"{found.name!r} was never written: the file holds its shape alone")
+    values = values.astype(np.float64)
+    for hole in holes:
+        values[hole] = np.nan
+    return values
+
+
+def holes_of(found: h5py.Dataset) -> list[tuple[slice, ...]]:
+    """Blocks of a data set of numbers that have no place in the file, since nobody wrote them."""
+    if not found.size or found.shape == () or found.dtype.kind not in "iuf":
+        return []
+    if found.chunks is None or not found.id.get_num_chunks():
+        return [] if found.id.get_storage_size() else [(slice(None),) * found.ndim]
+    counts = [ceil(n / step) for n, step in zip(found.shape, found.chunks, strict=True)]
+    if found.id.get_num_chunks() == np.prod(counts, dtype=object):
+        return []
+    places = range(found.id.get_num_chunks())
+    there = {found.id.get_chunk_info(k).chunk_offset for k in places}
+    starts = product(*(range(0, n, s) for n, s in zip(found.shape, found.chunks, strict=True)))
+    return [
+        tuple(slice(a, a + step) for a, step in zip(start, found.chunks, strict=True))
+        for start in starts
+        if start not in there
+    ]
+
+
+def _plain(value: Any) -> Any:
+    """An attribute as one value; text as such, also where it stands in an array of one."""
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
 HDF5 = Reader("HDF5", read_hdf5, form="hdf5")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.hdf5 import names_in_hdf5
+from ep2sindy.data.readers.hdf5 import names_in_hdf5, written
 from ep2sindy.data.readers.source import Reader, Source, leaves
 
 V73 = b"MATLAB 7.3"
@@ -25,7 +25,7 @@ def read_matlab73(path: Path) -> Source:
 
     def read(name: str) -> xr.DataArray:
         with h5py.File(path) as file:
-            return xr.DataArray(file[name.replace(".", "/")][()].T)
+            return xr.DataArray(written(file[name.replace(".", "/")]).T)
 
     names = [
         name.replace("/", ".") for name in names_in_hdf5(path) if not name.startswith("#refs#")

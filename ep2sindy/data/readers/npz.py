@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import xarray as xr
 
+from ep2sindy.data.readers.limits import check_declared
 from ep2sindy.data.readers.source import Reader, Source
 
 
@@ -17,6 +19,9 @@ def read_npz(path: Path) -> Source:
         with np.load(path, allow_pickle=False) as arrays:
             return xr.DataArray(arrays[name])
 
+    with ZipFile(path) as archive:
+        for member in archive.infolist():
+            check_declared(repr(member.filename), member.file_size, path)
     with np.load(path, allow_pickle=False) as arrays:
         return Source(path, list(arrays), read)
 

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ep2sindy.data.readers.csv import CSV
+from ep2sindy.data.readers.guard import look_through_first
 from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
 from ep2sindy.data.readers.hdf5 import HDF5
+from ep2sindy.data.readers.limits import check_kind
 from ep2sindy.data.readers.matlab import MATLAB
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.npz import NPZ
@@ -17,11 +19,18 @@ from ep2sindy.data.readers.zarr import ZARR
 # In any order: no two of them claim a file equally.
 READERS = (NETCDF, HDF5, MATLAB, NPZ, CSV, HALLTHRUSTER, ZARR)
 
+# Beginnings of what libraries in C read, beside HDF5: MATLAB up to v7, and classic NetCDF of
+# 64-bit sizes.
+IN_C = (b"MATLAB 5.0", b"CDF\x05")
+
 
 def open_source(path: Path) -> Source:
     """Open a file with the reader for its kind."""
     reader = reader_of(path)
+    look = look_at(path)
     with damage_named(path):
+        if look.form == "hdf5" or look.head.startswith(IN_C):
+            look_through_first(path)
         return reader.open(path)
 
 
@@ -32,6 +41,9 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
     """
     if not path.exists():
         raise ValueError(f"no such file: {path.absolute()}")
+    if path.is_file() and path.stat().st_size == 0:
+        raise ValueError(f"{path} is empty: it holds no bytes; was it written to the end?")
+    check_kind(path)
     look = look_at(path)
     claims = [reader.claim(look) for reader in readers]
     if any(claims):

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import xarray as xr
 
+from ep2sindy.data.fields import channel_length_m
+from ep2sindy.data.readers.limits import ALWAYS, check_declared
+
 # Time stays a number, whatever its attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
-
-# What the parsing libraries raise on damaged files beyond ValueError and OSError.
-LIBRARY_ERRORS = (zipfile.BadZipFile, zlib.error)
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -25,13 +23,23 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 class Source:
     """A file opened: the names it holds, and the array of one name.
 
-    dims_named: whether the arrays' dimension names are the file's own.
+    dims_named: whether the arrays' dimension names are the file's own. aliases: further names that
+    it answers to, such as a column's number. units: name -> unit that all files of the kind have.
+    step_s: of time, where the file says it elsewhere than in an array. channel_m: length of a
+    thruster's channel, where the file says it. words: how it was read, for those who look into it.
+    is_table: whether its arrays are columns.
     """
 
     path: Path
     names: Sequence[str]
     read: Callable[[str], xr.DataArray]
     dims_named: bool = False
+    aliases: Sequence[str] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    step_s: float | None = None
+    channel_m: float | None = None
+    words: str = ""
+    is_table: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,16 +105,37 @@ def damage_named(path: Path) -> Iterator[None]:
     """Turn what the parsing libraries raise into one error that names the file."""
     try:
         yield
-    except (OSError, EOFError, ValueError, LookupError, TypeError, *LIBRARY_ERRORS) as error:
+    except Exception as error:  # of a damaged file a library may raise anything
+        said = str(error).strip().removesuffix(".") or type(error).__name__
         raise ValueError(
-            f"{path} cannot be read: {error}; the file may be cut short, or of another kind"
+            f"{path} cannot be read: {said}; the file may be cut short, or of another kind"
         ) from error
+
+
+@contextmanager
+def file_named(path: Path) -> Iterator[None]:
+    """Let what is wrong with a file's values say which file it was."""
+    try:
+        yield
+    except ValueError as error:
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"{path}: {error}") from error
 
 
 def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
     """Variables of a dataset whose dimensions the file names."""
     names = [str(name) for name in dataset.variables]
-    return Source(path, names, lambda name: dataset[name], dims_named=True)
+    length = channel_length_m(dataset.attrs)
+
+    def read(name: str) -> xr.DataArray:
+        array = dataset[name]
+        check_declared(repr(name), array.nbytes, path)
+        if array.nbytes <= ALWAYS:
+            array.compute()  # damage is told here, with the file's name; the array stays on disk
+        return array
+
+    return Source(path, names, read, dims_named=True, channel_m=length)
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:

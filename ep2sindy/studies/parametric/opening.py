@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ep2sindy.data.quantities import unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError
+from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.parametric.oscillation import STEADY, PointData, naming, point_label
 from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
@@ -38,8 +40,10 @@ class PointSource:
                     return PointData(self.parameters, None, status)
                 sampling = self.source.trajectory
                 run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                notes = amiss(field.attrs) if is_simulation(field.attrs) else []
-                return PointData(self.parameters, run, notes=notes)
+                notes = amiss(field.attrs) if is_simulation(field.attrs) else unit_doubts(field)
+                words = [field.attrs.get("file", ""), sampling.place(field)]
+                used = "; ".join(word for word in words if word)
+                return PointData(self.parameters, run, notes=notes, used=used)
             except DivergedError:
                 return PointData(self.parameters, None, "diverged")
             except ConstantStateError:
@@ -74,6 +78,16 @@ def point_sources(
         seen[same] = point.label
         found.append(point)
     return found
+
+
+def say_used(run: Run, points: Sequence[PointData]) -> None:
+    """Which data: in one line where all points are averaged alike, else one each."""
+    used = {point_label(point.parameters): point.used for point in points if point.used}
+    if len({*used.values()}) == 1:
+        run.say(f"data: {next(iter(used.values()))}")
+        return
+    for label, words in used.items():
+        run.say(f"data: {label}: {words}")
 
 
 def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:

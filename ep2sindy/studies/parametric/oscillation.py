@@ -26,13 +26,14 @@ class PointData:
     """One operating point. trajectory: None where the source says that nothing oscillates.
 
     status: what the source says of it; "oscillating" is looked into, all else believed.
-    notes: what is amiss with its data.
+    notes: what is amiss with its data. used: which they are, in words.
     """
 
     parameters: Mapping[str, float]
     trajectory: Trajectory | None
     status: str = OSCILLATING
     notes: Sequence[str] = ()
+    used: str = ""
 
     def __post_init__(self) -> None:
         if self.trajectory is None and self.status == OSCILLATING:

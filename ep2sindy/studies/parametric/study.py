@@ -17,7 +17,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly
-from ep2sindy.studies.parametric.opening import PointSource, point_sources
+from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
 from ep2sindy.studies.parametric.oscillation import point_label
 from ep2sindy.studies.parametric.points import (
     Case,
@@ -131,6 +131,7 @@ class Study:
         inputs = self.source.inputs([how.library, how.searched])
         opening = self.parallel.run(partial(PointSource.open, inputs=inputs), sources)
         points = _in_order(opening, len(sources), "opened", run)
+        say_used(run, points)
         for point in points:
             for note in point.notes:
                 run.warn(f"{point_label(point.parameters)}: {note}")

@@ -15,7 +15,7 @@ from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Counts, Kind, Positive
 from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.parametric.opening import PointSource, point_sources
+from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
 from ep2sindy.studies.predict.branch import Branch, How, Searched, branch_of, grouped
 from ep2sindy.studies.predict.view import Outcome, n_points
@@ -171,6 +171,7 @@ def _check_enough(points: Sequence[Mapping[str, float]], degree: int) -> None:
 def _records(opened: Sequence[PointData], run: Run) -> tuple[list[OperatingRecord], dict[str, str]]:
     """Records that hold enough periods, and the status of every point by its label."""
     records, statuses = [], {}
+    say_used(run, opened)
     for point in opened:
         label = point_label(point.parameters)
         for note in point.notes:

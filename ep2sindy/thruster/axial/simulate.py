@@ -78,6 +78,12 @@ def simulate(
     impulse and efficiency, and `mass_balance` and `energy_balance` (out plus stored over in).
     A diverged run ends at its last finite sample and says so; it is not an error.
     Raises ValueError for settings that cannot be run.
+
+    >>> field = ep.simulate(
+    ...     ep.Thruster(), ep.OPERATING_POINTS[3], duration_s=5e-5, warm_up_s=0.0, progress=False
+    ... )
+    >>> field["n_i"].dims
+    ('time', 'z')
     """
     settings = Settings(
         duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,

@@ -1,0 +1,157 @@
+"""What the documentation site adds to docs/*.md: a reference, the notebook, typeset formulas.
+
+Hooks of MkDocs; `make docs` builds the site.
+"""
+
+import re
+from base64 import b64decode
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import nbformat
+from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+from nbclient import NotebookClient
+
+import ep2sindy
+
+# Page of the reference -> the rooms (or modules) whose names in the face it shows.
+REFERENCE = {
+    "Discover": [
+        "discovery.discover", "discovery.recipe", "estimation.joint", "estimation",
+        "discovery.shared_support",
+    ],
+    "Data": [
+        "data.trajectory", "data.inspection", "data.open", "data.zones", "data", "library.units",
+        "synthetic",
+    ],
+    "Libraries": ["library.library", "library.functions", "library.equations"],
+    "Models": ["model.model", "model"],
+    "Regressions": ["regression", "constraints"],
+    "Searches": ["search"],
+    "Selection": ["selection"],
+    "Refinement": ["refinement"],
+    "Signals": ["signals"],
+    "Operating points": [
+        "discovery.operating_fit", "discovery.operating_law", "discovery.operating_map",
+        "discovery.operating_points", "discovery.coefficient_law", "discovery.control_law",
+        "studies.parametric",
+    ],
+    "Grids": ["discovery.pointwise", "discovery.blocks", "discovery.regimes", "machine"],
+    "Thruster": ["thruster.parameters", "thruster.axial", "thruster"],
+    "PySINDy": ["studies.pysindy_variants"],
+}  # fmt: skip
+CONTENTS = """# Reference
+
+Every public name, under `import ep2sindy as ep`. Everything is SI unless its name says otherwise;
+arrays are (sample, state), (row, term), (term, equation). What is wrong is a `ValueError` that says
+what must hold, what arrived, and the way out.
+"""
+NOTEBOOK = "first_steps.ipynb"
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """The reference in the navigation, page by page."""
+    (section,) = (part for part in config.nav if "Reference" in part)
+    section["Reference"] = ["reference/index.md", *(f"reference/{_path(t)}" for t in REFERENCE)]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    pages: dict[str, str | bytes] = {
+        f"reference/{_path(title)}": _reference(title) for title in REFERENCE
+    }
+    pages["reference/index.md"] = _contents()
+    pages |= notebook_files(Path(config.docs_dir) / NOTEBOOK)
+    for path, text in pages.items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Pages called by their titles; links and cells of HTML tables, as GitHub reads them."""
+    if page.file.src_uri != "first_steps.md":
+        markdown = markdown.replace(f"({NOTEBOOK})", "(first_steps.md)")
+
+    def titled(link: re.Match[str]) -> str:
+        target = files.get_file_from_path(link[1])
+        title = target and re.match(r"# (.*)", target.content_string)
+        return f"[{title[1]}]({link[2]})" if title else link[0]
+
+    markdown = re.sub(r"\[(\w+\.md)\]\((\1[^)]*)\)", titled, markdown)
+    return re.sub(r"<(table|tr|td|th)>", r'<\1 markdown="1">', markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Formulas as MathML, so that no page needs a script for them."""
+    html = re.sub(
+        r'<span class="arithmatex">\\\((.*?)\\\)</span>', lambda m: _formula(m[1], "inline"), html
+    )
+    return re.sub(
+        r'<div class="arithmatex">\\\[(.*?)\\\]</div>',
+        lambda m: f'<div class="formula">{_formula(m[1], "block")}</div>',
+        html,
+        flags=re.DOTALL,
+    )
+
+
+def _formula(tex: str, display: str) -> str:
+    plain = tex.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")
+    return convert(plain.strip(), display=display)
+
+
+def names_of(title: str) -> list[str]:
+    """The names of the face on a page of the reference, in the order of its places."""
+    return list(
+        dict.fromkeys(
+            name
+            for place in REFERENCE[title]
+            for name, module in ep2sindy._MODULES.items()
+            if f"{module}.".startswith(f"{place}.")
+        )
+    )
+
+
+def _path(title: str) -> str:
+    return title.lower().replace(" ", "_") + ".md"
+
+
+def _reference(title: str) -> str:
+    entries = "\n\n".join(f"::: ep2sindy.{name}" for name in names_of(title))
+    return f"# {title}\n\nAll names are those of `import ep2sindy as ep`.\n\n{entries}\n"
+
+
+def _contents() -> str:
+    lines = [CONTENTS, "| | names |", "|---|---|"]
+    for title in REFERENCE:
+        links = ", ".join(f"[`{name}`][ep2sindy.{name}]" for name in names_of(title))
+        lines.append(f"| [{title}]({_path(title)}) | {links} |")
+    return "\n".join(lines) + "\n"
+
+
+def notebook_files(path: Path) -> dict[str, str | bytes]:
+    """A notebook as a page: its cells, what they give when they are run now, and the figures."""
+    notebook = nbformat.read(path, as_version=4)
+    with TemporaryDirectory() as folder:
+        NotebookClient(notebook, timeout=300, resources={"metadata": {"path": folder}}).execute()
+    files: dict[str, str | bytes] = {}
+    parts = []
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            parts.append(cell.source)
+            continue
+        parts.append(f"```python\n{cell.source}\n```")
+        for output in cell.outputs:
+            data = output.get("data", {})
+            if "image/png" in data:
+                name = f"{path.stem}_{len(files)}.png"
+                files[name] = b64decode(data["image/png"])
+                parts.append(f"![What the cell draws]({name})")
+            elif text := (output.get("text") or data.get("text/plain", "")).strip():
+                parts.append(f"```text\n{text}\n```")
+    offer = f"*This page is a notebook, run when the site was built: [download it]({path.name}).*"
+    files[f"{path.stem}.md"] = "\n\n".join([parts[0], offer, *parts[1:]]) + "\n"
+    return files

@@ -1,0 +1,134 @@
+"""`ep2sindy inspect PATH ...`: what files hold, and a config of the data group for them."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ep2sindy.data.conversion import KNOWN_UNITS
+from ep2sindy.data.inspection import Inspection, check_alike, inspect
+from ep2sindy.data.mapping import Variable
+from ep2sindy.data.open import files_of
+from ep2sindy.machine.files import write_text
+
+ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks like time, z and r,
+and what is missing for which experiment. Several files, or a pattern in quotes, are several
+records of one kind."""
+
+
+def main(arguments: Sequence[str], conf: Path) -> None:
+    """conf: the package's configs.
+
+    Raises ValueError as `ep2sindy.inspect` does, and for a config that is there already.
+    """
+    parser = argparse.ArgumentParser("ep2sindy inspect", description=ABOUT)
+    parser.add_argument("path", nargs="+", help="file, folder.zarr or pattern")
+    parser.add_argument(
+        "--write",
+        nargs="?",
+        const="",
+        metavar="NAME",
+        help="write conf/data/NAME.yaml for data=NAME; by default the name of the first file",
+    )
+    given = parser.parse_args(arguments)
+    paths = files_of(given.path)
+    found = [inspect(path) for path in paths]
+    for each in found:
+        print("\n".join(each.lines()), end="\n\n")
+    name = re.sub(r"\W+", "_", given.write or Path(paths[0]).stem).strip("_")
+    if given.write is None:
+        print(f"--write makes conf/data/{name}.yaml of it, for data={name}")
+        return
+    check_alike(found)
+    path = own_config(name, conf)
+    write_text(path, config_text(found, paths))
+    print(f"written: {path}; next, for example:")
+    print("\n".join(f"  {command}" for command in commands(found[0], name)))
+
+
+def own_config(name: str, conf: Path) -> Path:
+    """Where a config of the data group goes that is found from here; no file is overwritten."""
+    path = Path("conf") / "data" / f"{name}.yaml"
+    if (conf / "data" / path.name).is_file() and conf.resolve() != Path("conf").resolve():
+        raise ValueError(f"the package has data={name} itself: choose another, --write NAME")
+    if path.exists():
+        raise ValueError(f"{path} is there already: delete it, or choose another, --write NAME")
+    return path
+
+
+def config_text(found: Sequence[Inspection], paths: Sequence[str]) -> str:
+    """The config of the data group, with a word wherever something was only likely."""
+    first = found[0]
+    variables = {n: Variable(None, u) for n, u in {**KNOWN_UNITS, "T_e_eV": "eV"}.items()}
+    variables |= first.variables
+    lines = [
+        f"# {paths[0]}{' ...' if len(paths) > 1 else ''}, as `ep2sindy inspect` found it.",
+        "# A name is the one in the file; null: the file has it not. Correct what is wrong.",
+        "_target_: ep2sindy.open_field",
+        f"path: {_flow(paths[0] if len(paths) == 1 else list(paths))}",
+        "",
+        "variables:",
+        *(f"  {_flow(n)}: {_flow(_node(v))}{_word(first, n)}" for n, v in variables.items()),
+        "",
+    ]
+    units = {"time": "s", "z": "m", "r": "m"}
+    for axis, unit in units.items():
+        variable = getattr(first, axis) or Variable(None, unit)
+        lines.append(f"{axis}: {_flow(_node(variable))}{_word(first, axis)}")
+    steps = "null" if first.dt_s is None else repr(first.dt_s)
+    lines += [
+        f"dt_s: {steps}  # time step in s where the file has no time; taken instead of it",
+        'mask: {name: null, unit: "1", dims: null}  # nonzero in the plasma',
+        "channel_m: null  # length of the channel from z = 0; null: as the file says",
+        "chunks: null  # such as {time: 1000}, for what exceeds memory (NetCDF, Zarr; needs dask)",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _node(variable: Variable) -> dict[str, Any]:
+    dims = None if variable.dims is None else list(variable.dims)
+    return {"name": variable.name, "unit": variable.unit, "dims": dims}
+
+
+def _flow(value: Any) -> str:
+    """YAML on one line; what reads back as something else than text stands in quotes."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_flow, value)) + "]"
+    if not isinstance(value, str):
+        return "null" if value is None else repr(value)
+    plain = re.fullmatch(r"[\w./^-]+", value) and yaml.safe_load(value) == value
+    return value if plain else "'" + value.replace("'", "''") + "'"
+
+
+def _word(found: Inspection, name: str) -> str:
+    return "  # the likely unit: check it" if name in found.found.guesses else ""
+
+
+def commands(found: Inspection, name: str) -> list[str]:
+    """What can be run with it, with a word in capitals for what only the user knows."""
+    lacking = found.missing()
+    data = [f"data={name}"]
+    if found.time is None and found.dt_s is None:
+        data.append("data.dt_s=STEP")
+    lines = []
+    if not lacking["breathing"]:
+        steps = ",".join(f"{{_target_:{step}}}" for step in found.prepare.values())
+        prepare = [f"prepare=[{steps}]"] if steps else []
+        zone = [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]
+        lines.append(["+exp=breathing", *data, *zone, *prepare])
+    traces = [n for n, v in found.variables.items() if found.is_trace(v)]
+    if traces:
+        signal = "I_d" if "I_d" in traces else traces[0]
+        lines.append(["+exp=trace", *data, f"signal={signal}"])
+    states = traces[:3] if len(traces) > 1 else [n for n in ("n_i", "n_n") if n in found.variables]
+    if states:
+        lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]"])
+    return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]

@@ -1,0 +1,60 @@
+"""Missing samples: rows that hold a NaN, and a word on how many there are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class MissingSamples(UserWarning):
+    """Samples that are NaN, and were left out."""
+
+
+def present_rows(columns: Mapping[str, Float[np.ndarray, " _"]]) -> Bool[np.ndarray, " _"]:
+    """Which samples every column has; a NaN is a sample that is missing.
+
+    Raises ValueError for a column without a number, and where fewer than two samples are left.
+    """
+    lacking = {name: np.isnan(values) for name, values in columns.items()}
+    for name, absent in lacking.items():
+        if absent.all():
+            raise ValueError(
+                f"{name} must hold numbers: all its {len(absent)} samples are NaN; leave it out, "
+                "or look at the file's column and its unit"
+            )
+    present = ~np.any([*lacking.values()], axis=0)
+    if present.sum() < 2:
+        counts = ", ".join(f"{name} lacks {int(a.sum())}" for name, a in lacking.items() if a.any())
+        raise ValueError(
+            f"two samples or more must hold all of {list(columns)}: of {len(present)} samples "
+            f"{counts}, and {int(present.sum())} are left; fill them first (ep2sindy.interpolate)"
+        )
+    return present
+
+
+def without_gaps(field: xr.Dataset) -> xr.Dataset:
+    """The samples that all variables of time alone have; others must not be missing at times."""
+    alone = {
+        str(name): array.values.astype(np.float64)
+        for name, array in field.data_vars.items()
+        if array.dims == ("time",)
+    }
+    if not any(np.isnan(values).any() for values in alone.values()):
+        return field
+    return field.isel(time=np.flatnonzero(present_rows(alone)))
+
+
+def gap_words(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
+    """How many of `n_samples` are missing at the times that are left, and how long at most."""
+    longest, usual = float(np.diff(t).max()), float(np.median(np.diff(t)))
+    return (
+        f"{n_samples - len(t)} of {n_samples} samples are missing (NaN) and left out; the longest "
+        f"gap is {longest:.4g} s, {longest / usual:.0f} steps: crop the record if that is long "
+        "beside its period, or fill it with ep2sindy.interpolate"
+    )

@@ -1,0 +1,289 @@
+"""Preparation of fields along time: plain functions, field -> field.
+
+A config lists them as steps. None changes its argument, and units stay with the variables. Cells
+that are NaN at all times stay so; variables without time stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from scipy import signal
+from scipy.interpolate import CubicSpline
+
+from ep2sindy.data.fields import (
+    DIMS,
+    check_samples,
+    grid_points,
+    grid_values,
+    masked_cells,
+)
+from ep2sindy.library.units import unit_product
+
+
+def crop(
+    field: xr.Dataset, *, start_s: float | None = None, stop_s: float | None = None
+) -> xr.Dataset:
+    """Keep the samples from `start_s` to `stop_s`, ends included; None is the field's own end."""
+    t = grid_points(field, "time")
+    start = t[0] if start_s is None else start_s
+    stop = t[-1] if stop_s is None else stop_s
+    keep = np.flatnonzero((t >= start) & (t <= stop))
+    if len(keep) < 2:
+        raise ValueError(
+            f"a crop must leave two samples or more: {start:g} to {stop:g} s leaves {len(keep)} "
+            f"of {len(t)}, which run from {t[0]:g} to {t[-1]:g} s"
+        )
+    return field.isel(time=slice(int(keep[0]), int(keep[-1]) + 1))
+
+
+def decimate(field: xr.Dataset, *, factor: int) -> xr.Dataset:
+    """Keep every `factor`-th sample, from the first on.
+
+    Plain subsampling: what oscillates faster than half the new rate is folded onto lower
+    frequencies, so apply `low_pass` below that rate first.
+    """
+    n_samples = field.sizes["time"]
+    if factor < 1 or n_samples <= factor:
+        raise ValueError(
+            f"factor must be 1 or more and leave two samples or more: {factor} came with "
+            f"{n_samples} samples"
+        )
+    return field.isel(time=slice(None, None, factor))
+
+
+def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Dataset:
+    """Remove what oscillates faster than `cutoff_Hz`, without shifting phases.
+
+    A Butterworth filter of the given order run forwards and backwards: amplitudes halve at
+    the cutoff and fall by 12 * order dB per octave above it. Variables without time and masked
+    cells stay as they are. Loads the field.
+    Raises ValueError for unequal time steps (beyond 1e-3 of a step), a cutoff not between 0
+    and half the sampling rate, or a record shorter than the filter's edges.
+    """
+    dt_s = _uniform_step(field)
+    n_edge = 3 * (order + 1)
+    if not 0 < cutoff_Hz < 0.5 / dt_s:
+        raise ValueError(
+            f"cutoff_Hz must lie between 0 and half the sampling rate, {0.5 / dt_s:g} Hz: "
+            f"{cutoff_Hz:g} came"
+        )
+    if field.sizes["time"] <= n_edge:
+        raise ValueError(
+            f"a low-pass of order {order} needs more than {n_edge} samples: "
+            f"{field.sizes['time']} came; lower the order or leave it out"
+        )
+    sos = signal.butter(order, cutoff_Hz, fs=1 / dt_s, output="sos")
+    smooth = {
+        name: signal.sosfiltfilt(sos, _samples(field, name), axis=0, padlen=n_edge)
+        for name in _of_time(field)
+    }
+    return field.assign({name: _like(field[name], values) for name, values in smooth.items()})
+
+
+def _uniform_step(field: xr.Dataset) -> float:
+    """Time step in s."""
+    steps = np.diff(grid_points(field, "time"))
+    dt_s = float(steps.mean())
+    if np.ptp(steps) > 1e-3 * dt_s:
+        k = int(np.argmax(np.abs(steps - dt_s)))
+        raise ValueError(
+            f"a low-pass needs equal time steps: t[{k + 1}] - t[{k}] = {steps[k]:g} s, the mean "
+            f"is {dt_s:g} s; bring the field to equal steps first (ep2sindy.resample)"
+        )
+    return dt_s
+
+
+def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
+    """Bring the field to equal steps of `dt_s`.
+
+    Steps no longer than the usual one: cubic splines through the samples, from the first on.
+    Longer ones: means over a step, at its middle, of the straight lines between samples, so that
+    little of what is faster is folded in. Loads the field.
+    Raises ValueError for a step that leaves fewer than two samples, or samples that are missing.
+    """
+    t = grid_points(field, "time")
+    if not 0 < dt_s <= 0.5 * (t[-1] - t[0]):
+        raise ValueError(
+            f"dt_s must be positive and leave two samples or more: {dt_s:g} s came for a record of "
+            f"{t[-1] - t[0]:g} s"
+        )
+    finer = dt_s <= np.median(np.diff(t)) * (1 + 1e-6)
+    n_steps = int((t[-1] - t[0]) / dt_s * (1 + 1e-12))
+    new = t[0] + dt_s * (np.arange(n_steps + 1) if finer else 0.5 + np.arange(n_steps))
+    arrays = {}
+    for name in _of_time(field):
+        values = _samples(field, name)
+        masked = np.isnan(values).any(axis=0)
+        filled = np.where(masked, 0.0, values)
+        found = CubicSpline(t, filled, axis=0)(new) if finer else _means(t, filled, new, dt_s)
+        arrays[name] = np.where(masked, np.nan, found)
+    times = xr.DataArray(new, dims="time", attrs=field["time"].attrs)
+    kept = field.drop_vars([*arrays, "time"]).assign_coords(time=times)
+    found = {name: _like(field[name], values, times=times) for name, values in arrays.items()}
+    return kept.assign(found)[list(field.data_vars)].assign_attrs(field.attrs)
+
+
+def _means(t: np.ndarray, values: np.ndarray, at: np.ndarray, width: float) -> np.ndarray:
+    """Of the straight lines between samples, over `width` around each time."""
+    steps = np.diff(t)[:, None, None]
+    areas = np.concatenate(
+        [
+            np.zeros((1, *values.shape[1:])),
+            np.cumsum(steps * (values[1:] + values[:-1]) / 2, axis=0),
+        ]
+    )
+    slopes = np.diff(values, axis=0) / steps
+
+    def area(x: np.ndarray) -> np.ndarray:
+        k = np.clip(np.searchsorted(t, x, side="right") - 1, 0, len(t) - 2)
+        past = (x - t[k])[:, None, None]
+        return areas[k] + past * (values[k] + 0.5 * past * slopes[k])
+
+    return (area(at + width / 2) - area(at - width / 2)) / width
+
+
+def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Dataset:
+    """Fill samples that are missing (NaN) by straight lines between their neighbours in time.
+
+    max_gap_s: the longest time between two neighbours that is filled; None fills all. Loads the
+    field.
+    Raises ValueError for a longer gap, and for one at an end of the record.
+    """
+    t = grid_points(field, "time")
+    filled = {}
+    for name in _of_time(field):
+        values = grid_values(field[name])
+        absent = np.isnan(values)
+        some = absent.any(axis=0) & ~absent.all(axis=0)
+        for cell in np.argwhere(some):
+            place = (slice(None), *cell)
+            present = np.flatnonzero(~absent[place])
+            _check_gaps(str(name), t, present, max_gap_s)
+            values[place] = np.interp(t, t[present], values[place][present])
+        if some.any():
+            filled[name] = _like(field[name], values)
+    return field.assign(filled)
+
+
+def _check_gaps(name: str, t: np.ndarray, present: np.ndarray, max_gap_s: float | None) -> None:
+    if present[0] > 0 or present[-1] < len(t) - 1:
+        raise ValueError(
+            f"only gaps inside the record can be filled: {name} holds numbers from "
+            f"{t[present[0]]:.6g} to {t[present[-1]]:.6g} s, the record runs from {t[0]:.6g} to "
+            f"{t[-1]:.6g} s; crop it first (ep2sindy.crop)"
+        )
+    gaps = np.diff(t[present])
+    if max_gap_s is not None and gaps.max() > max_gap_s:
+        k = int(gaps.argmax())
+        raise ValueError(
+            f"gaps must not exceed max_gap_s = {max_gap_s:g} s: {name} is missing from "
+            f"{t[present[k]]:.6g} to {t[present[k + 1]]:.6g} s; crop the record there"
+        )
+
+
+def delay(
+    field: xr.Dataset, *, variable: str, delay_s: float, name: str | None = None
+) -> xr.Dataset:
+    """Add a variable's own past, x(t - delay_s), by straight lines between samples.
+
+    name: by default `<variable>_delayed`. Samples without that past, at the beginning, are left
+    out.
+    Raises ValueError for a delay that is not positive or as long as the record.
+    """
+    array = _variable(field, variable)
+    t = grid_points(field, "time")
+    name = _new_name(field, name or f"{variable}_delayed")
+    kept = t >= t[0] + delay_s * (1 - 1e-12)
+    if delay_s <= 0 or kept.sum() < 2:
+        raise ValueError(
+            f"delay_s must be positive and leave two samples or more: {delay_s:g} s came for a "
+            f"record of {t[-1] - t[0]:g} s"
+        )
+    values = _samples(field, variable)
+    at = np.maximum(t[kept] - delay_s, t[0])
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    share = ((at - t[k]) / (t[k + 1] - t[k]))[:, None, None]
+    past = values[k] * (1 - share) + values[k + 1] * share
+    later = field.isel(time=np.flatnonzero(kept))
+    return later.assign({name: _like(array, past, times=later["time"])})
+
+
+def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> xr.Dataset:
+    """Add a variable's rate of change, by central differences of second order.
+
+    name: by default `d<variable>_dt`. Noise grows with it: `low_pass` first. Steps may differ.
+    """
+    array = _variable(field, variable)
+    t = grid_points(field, "time")
+    name = _new_name(field, name or f"d{variable}_dt")
+    if len(t) < 3:
+        raise ValueError(f"a derivative needs three samples or more: {len(t)} came")
+    rate = np.gradient(_samples(field, variable), t, axis=0, edge_order=2)
+    units = unit_product([(array.attrs["units"], 1), ("s", -1)])
+    return field.assign({name: _like(array, rate).assign_attrs(units=units)})
+
+
+def detrend(
+    field: xr.Dataset, *, variables: Sequence[str] | None = None, degree: int = 1
+) -> xr.Dataset:
+    """Take out what drifts: a polynomial in time, fitted by least squares; the mean stays.
+
+    variables: None takes all that have time.
+    """
+    names = _of_time(field) if variables is None else list(variables)
+    t = grid_points(field, "time")
+    if not 1 <= degree < len(t):
+        raise ValueError(f"degree must be 1 or more, below the number of samples: {degree} came")
+    basis = np.linalg.qr(np.vander((t - t.mean()) / np.ptp(t), degree + 1, increasing=True))[0]
+    found = {}
+    for name in names:
+        array = _variable(field, name)
+        values = _samples(field, name)
+        cells = values.reshape(len(t), -1)
+        mean = cells.mean(axis=0)
+        flat = cells - basis @ (basis.T @ cells) + mean
+        found[name] = _like(array, flat.reshape(values.shape))
+    return field.assign(found)
+
+
+def _of_time(field: xr.Dataset) -> list[str]:
+    return [str(name) for name, array in field.data_vars.items() if "time" in array.dims]
+
+
+def _variable(field: xr.Dataset, name: str) -> xr.DataArray:
+    if name not in _of_time(field):
+        raise ValueError(f"unknown variable of time {name!r}; this field has {_of_time(field)}")
+    return field[name]
+
+
+def _new_name(field: xr.Dataset, name: str) -> str:
+    if name in field.variables or not name.isidentifier():
+        raise ValueError(
+            f"a new variable needs a new name of letters, digits and _: {name!r} came, this field "
+            f"has {list(field.variables)}"
+        )
+    return name
+
+
+def _samples(field: xr.Dataset, name: str) -> Float[np.ndarray, "time z r"]:
+    """Values of a variable, none of them missing at times."""
+    values = grid_values(field[name])
+    check_samples(field[name], values, masked_cells(field[name]))
+    return values
+
+
+def _like(
+    array: xr.DataArray, values: np.ndarray, *, times: xr.DataArray | None = None
+) -> xr.DataArray:
+    """New values (time, z, r) in the place of a variable's, with its dimensions and unit."""
+    dims = [axis for axis in DIMS if axis in array.dims]
+    sizes = [array.sizes[axis] for axis in dims[1:]]
+    coords = {axis: array[axis] for axis in dims if axis in array.coords}
+    coords |= {} if times is None else {"time": times}
+    return xr.DataArray(
+        values.reshape(len(values), *sizes), dims=dims, coords=coords, attrs=array.attrs
+    )

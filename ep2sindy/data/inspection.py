@@ -1,0 +1,190 @@
+"""What a file holds, what it was taken for, and what is missing for what."""
+
+from __future__ import annotations
+
+import html
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ep2sindy.data.held import Held
+from ep2sindy.data.mapping import Variable
+from ep2sindy.data.quantities import MADE_FROM
+from ep2sindy.data.readers.registry import open_source, reader_of
+from ep2sindy.data.recognition import Recognised, recognised
+from ep2sindy.machine.screen import WIDTH, html_table, one_screen, text_table
+
+# What the experiments need beside time; those that take any variables are not here.
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "breathing": ("n_i", "n_n", "R_ion", "u_iz"),
+    "weak": ("n_i", "n_n"),
+    "constrained": ("n_i", "n_n", "R_ion", "u_iz"),
+    "ils": ("n_i", "n_n"),
+    "parametric": ("n_i", "n_n", "R_ion", "u_iz"),
+    "predict": ("n_i", "n_n"),
+    "pointwise": ("n_i", "n_n", "R_ion", "u_iz"),
+    "trace": (),
+    "discover": (),
+}
+
+HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """A file looked into, and the mapping by which `open_field` opens it.
+
+    kind: of file; words: how it was read. found: what was recognised.
+    """
+
+    path: Path
+    kind: str
+    words: str
+    found: Recognised
+    channel_m: float | None
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The mapping of what was recognised, with units that are only likely."""
+        return dict(self.found.variables)
+
+    @property
+    def time(self) -> Variable | None:
+        return self.found.axes.get("time")
+
+    @property
+    def z(self) -> Variable | None:
+        return self.found.axes.get("z")
+
+    @property
+    def r(self) -> Variable | None:
+        return self.found.axes.get("r")
+
+    @property
+    def dt_s(self) -> float | None:
+        """Time step that the file says elsewhere than in an array."""
+        return self.found.dt_s
+
+    @property
+    def prepare(self) -> dict[str, str]:
+        """Variables that the file lacks and a step of `prepare` makes: name -> step."""
+        have = self.found.variables
+        return {
+            name: step
+            for name, (source, step) in MADE_FROM.items()
+            if source in have and name not in have
+        }
+
+    def missing(self) -> dict[str, tuple[str, ...]]:
+        """Experiment -> variables that it needs, and that the file neither holds nor yields."""
+        have = {*self.found.variables, *self.prepare}
+        return {name: tuple(v for v in needs if v not in have) for name, needs in NEEDS.items()}
+
+    def is_trace(self, variable: Variable) -> bool:
+        """Whether a variable has only time, varies, and does not rise all along."""
+        (one,) = (e for e in self.found.held if str(variable.name).split("[")[0] == e.name)
+        n_axes = 1 + (one.name != variable.name)
+        of_time = len(one.lengths) == n_axes and self.found.n_samples in one.lengths
+        return of_time and one.step is None and one.low < one.high
+
+    def notes(self) -> list[str]:
+        """What is to be decided, what is only likely, and what is lacking, in words."""
+        texts = []
+        if self.time is None and self.dt_s is None:
+            texts.append("no time: give the step between samples, data.dt_s=STEP in s")
+        if self.dt_s is not None:
+            texts.append(f"time in steps of {self.dt_s:.6g} s, as the file says beside its arrays")
+        texts += [text.removesuffix(": give it") for text in self.found.guesses.values()]
+        texts += list(self.found.questions)
+        texts += [
+            f"{n} is made by {step} from {MADE_FROM[n][0]}" for n, step in self.prepare.items()
+        ]
+        if self.z is not None and self.channel_m is None:
+            texts.append(
+                "no length of the channel: give it, data.channel_m=LENGTH in m, or a zone, "
+                "'trajectory.zone.z=[FROM,TO]' in m, for experiments that average over one"
+            )
+        return texts
+
+    def experiments(self) -> list[str]:
+        """A line for those that can be run, and one for those that lack the same variables."""
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for name, lacking in self.missing().items():
+            groups.setdefault(lacking, []).append(f"+exp={name}")
+        return [
+            f"{'missing ' + ', '.join(lacking) if lacking else 'all there'} for {', '.join(names)}"
+            for lacking, names in groups.items()
+        ]
+
+    def lines(self) -> list[str]:
+        """The file, its arrays, and what is to be known of them, in lines of a screen's width."""
+        words = f"; {self.words}" if self.words else ""
+        notes = [
+            line
+            for text in (*self.notes(), *self.experiments())
+            for line in textwrap.wrap(text, WIDTH, initial_indent="- ", subsequent_indent="  ",
+                                      break_long_words=False, break_on_hyphens=False)
+        ]  # fmt: skip
+        head = f"{self.path}: {self.kind}{words}"
+        return [head, *text_table(HEADER, self._rows()), *notes]
+
+    def __repr__(self) -> str:
+        return one_screen(self.lines(), n_lines=60)
+
+    def _repr_html_(self) -> str:
+        rows = [list(map(html.escape, row)) for row in self._rows()]
+        items = "".join(f"<li>{html.escape(t)}</li>" for t in (*self.notes(), *self.experiments()))
+        head = html.escape(f"{self.path}: {self.kind}")
+        return f"<div>{head}</div>{html_table(HEADER, rows)}<ul>{items}</ul>"
+
+    def _rows(self) -> list[list[str]]:
+        return [self._row(each) for each in self.found.held]
+
+    def _row(self, one: Held) -> list[str]:
+        shape = f"({', '.join(map(str, one.shape))})"
+        if one.problem:
+            return [one.name, "", "", "", "", "", one.problem]
+        step = "" if one.step is None else f", {'' if one.even else 'about '}{one.step:.4g} apart"
+        missing = str(one.n_missing) if one.n_missing else ""
+        return [one.name, shape, one.unit, f"{one.low:.4g}", f"{one.high:.4g}", missing,
+                self._role(one) + step]  # fmt: skip
+
+    def _role(self, one: Held) -> str:
+        roles = {**self.found.axes, **self.found.variables}
+        named = [
+            f"{ours} in {v.unit}"
+            for ours, v in roles.items()
+            if v.name == one.name or str(v.name).startswith(f"{one.name}[")
+        ]
+        return ", ".join(named) or "-"
+
+
+def inspect(path: str | Path) -> Inspection:
+    """Look into a file: what it holds, and what that is by names, units, shapes and sizes.
+
+    Reads every array once. The result prints as a table and says what is missing for which
+    experiment; `ep2sindy.open_field(path, variables=found.variables, time=found.time, z=found.z,
+    r=found.r, dt_s=found.dt_s)` opens what it found.
+    Raises ValueError for a file that is missing, empty, damaged or of no known kind.
+
+    >>> found = ep.inspect("run.nc")
+    >>> found.variables["n_i"].unit
+    'm^-3'
+    """
+    path = Path(path)
+    source = open_source(path)
+    found = recognised(source)
+    kind = reader_of(path).name
+    return Inspection(path, kind, source.words, found, source.channel_m)
+
+
+def check_alike(found: Sequence[Inspection]) -> None:
+    """Raise ValueError for files that hold other names than the first: one mapping must fit all."""
+    names = [{v.name for v in each.variables.values()} for each in found]
+    for each, held in zip(found, names, strict=True):
+        if held != names[0]:
+            raise ValueError(
+                f"files of one mapping must hold the same names: {each.path} differs from "
+                f"{found[0].path} in {sorted(map(str, held ^ names[0]))}; give each its own"
+            )

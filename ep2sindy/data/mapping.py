@@ -1,0 +1,150 @@
+"""Where each quantity sits in a file: names, units and orders of dimensions, and their reading."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.readers.source import Source, damage_named
+from ep2sindy.library.names import check_variable
+
+N_LISTED = 100  # names in an error
+
+# `probe[:, 1]`: part of an array, counted from 0.
+PART = re.compile(r"(.+?)\s*\[([\d:,\s-]+)\]")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Where one quantity sits in a file.
+
+    name: in the file; a path in HDF5 ("group/n_i"), a struct field in MATLAB ("data.n_i"), a
+        column's number in a table ("2"), part of an array ("probe[:, 1]"), counted from 0.
+        None: the file has it not.
+    unit: what the file's numbers count: "cm^-3", "km/s", "degC"; with a factor, "1e19 m^-3".
+    dims: dimensions in the file's order, such as ("r", "z", "time"). None: as the file names
+        them, or the one order in which the lengths fit.
+    """
+
+    name: str | None
+    unit: str
+    dims: Sequence[str] | None = None
+
+
+Keys = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Problems:
+    """What is wrong with a mapping, gathered so that one answer names all of it."""
+
+    found: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        try:
+            yield
+        except ValueError as error:
+            self.found.append(str(error))
+
+    def check(self, source: Source) -> None:
+        """Raise ValueError if there are any, with what the file holds where a name is missing."""
+        if not self.found:
+            return
+        if len(self.found) == 1:
+            raise ValueError(
+                f"the mapping must be put right: {self.found[0]}{self._held(source, '; it')}"
+            )
+        lines = "".join(f"\n  - {each}" for each in self.found)
+        raise ValueError(
+            f"{len(self.found)} things must be put right for {source.path}:{lines}"
+            f"{self._held(source, '. It')}"
+        )
+
+    def _held(self, source: Source, joined: str) -> str:
+        """What the file holds, where a name that it does not hold was asked for."""
+        if not any(" no variable " in each for each in self.found):
+            return ""
+        return f"{joined} holds {listed(source)}; set the name, or null if the file has it not"
+
+
+def in_file(
+    variables: Mapping[str, Variable | Keys | None], problems: Problems
+) -> dict[str, Variable]:
+    """Those that the file has; a config's keys become a `Variable`."""
+    found = {}
+    for ours, value in variables.items():
+        with problems.noted():
+            check_variable(ours)
+        if isinstance(value, Mapping):
+            if not {"name", "unit"} <= set(value) <= {"name", "unit", "dims"}:
+                problems.found.append(
+                    f"{ours} needs a name, a unit, perhaps dims: {dict(value)} came"
+                )
+                continue
+            name = None if value["name"] is None else str(value["name"])
+            value = Variable(name, str(value["unit"]), value.get("dims"))
+        if value is not None and value.name is not None:
+            found[ours] = value
+    return found
+
+
+def read_array(source: Source, ours: str, name: str) -> xr.DataArray:
+    """One array of the file, or part of one, as real numbers, in the file's unit and shape."""
+    whole, part = _parted(source, name)
+    if whole is None:
+        near = get_close_matches(name, source.names, n=1)
+        hint = f", but {near[0]!r}" if near else ""
+        raise ValueError(f"{source.path} has no variable {name!r} (wanted as {ours}){hint}")
+    with damage_named(source.path):
+        array = source.read(whole)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{name!r} in {source.path} must be real numbers, not {array.dtype}")
+    try:
+        array = array[part] if part else array
+    except IndexError as error:
+        raise ValueError(
+            f"{name!r} (wanted as {ours}) must lie inside its array: {whole!r} has shape "
+            f"{array.shape}, counted from 0"
+        ) from error
+    if (unit := source.units.get(whole)) and not array.attrs.get("units"):
+        array = array.assign_attrs(units=unit)
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+def _parted(source: Source, name: str) -> tuple[str | None, tuple[int | slice, ...]]:
+    """The array that a name means, and the part of it; None where there is no such array."""
+    names = {*source.names, *source.aliases}
+    if name in names:
+        return name, ()
+    found = PART.fullmatch(name)
+    if found is None or found[1] not in names:
+        return None, ()
+    parts = [part.strip() for part in found[2].split(",")]
+    if not all(re.fullmatch(r":|-?\d+", part) for part in parts):
+        raise ValueError(f"part of an array is written like [:, 1]: {name!r} came")
+    return found[1], tuple(slice(None) if part == ":" else int(part) for part in parts)
+
+
+def listed(source: Source) -> str:
+    """Names with shapes and units: `ni (6, 4, 3) cm^-3, t (6)`."""
+    texts = []
+    for name in source.names[:N_LISTED]:
+        try:
+            array = source.read(name)
+        except Exception:  # a library's, of a damaged array: it is named all the same
+            texts.append(name)
+            continue
+        unit = array.attrs.get("units") or source.units.get(name, "")
+        shape = f"({', '.join(map(str, array.shape))})"
+        texts.append(f"{name} {shape} {unit}".rstrip())
+    n_more = len(source.names) - len(texts)
+    texts += [f"and {n_more} more"] if n_more else []
+    return ", ".join(texts) or "nothing"

@@ -1,0 +1,149 @@
+"""Which axis of an array is time, z or r, by the file's names, the user's, or the lengths."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import permutations
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.conversion import to_si
+from ep2sindy.data.fields import DIMS
+from ep2sindy.data.mapping import Problems, Variable, read_array
+from ep2sindy.data.numbers import evened
+from ep2sindy.data.readers.source import Source
+
+
+def read_axis(source: Source, axis: str, variable: Variable) -> xr.DataArray:
+    """Coordinate of one axis as a float64 vector in SI."""
+    points = read_array(source, axis, str(variable.name))
+    if points.ndim != 1:
+        points = points.squeeze() if points.size > 1 else xr.DataArray(points.values.ravel())
+    if points.ndim != 1:
+        raise ValueError(
+            f"{axis} must be a vector: {variable.name!r} has shape {points.shape} in {source.path}"
+        )
+    points = points.copy(data=evened(points.values)) if axis == "time" else points
+    return to_si(points.astype(np.float64), axis, variable.unit)
+
+
+def read_axes(
+    source: Source,
+    axes: Mapping[str, Variable],
+    dt_s: float | None,
+    arrays: Mapping[str, xr.DataArray],
+    variables: Mapping[str, Variable],
+    problems: Problems,
+) -> dict[str, xr.DataArray]:
+    """Coordinates the file has, in SI; the time is counted in steps where they are given."""
+    points = {}
+    for axis, variable in axes.items():
+        if axis != "time" or dt_s is None:
+            with problems.noted():
+                points[axis] = read_axis(source, axis, variable)
+    if dt_s is None and "time" not in axes:
+        problems.found.append(
+            f"a field needs time: name the file's time or give its step dt_s; {source.path} holds "
+            f"{list(source.names)}"
+        )
+    if dt_s is None or problems.found:
+        return points
+    with problems.noted():
+        n_samples, dim = time_length(source, arrays, variables, points)
+        steps = xr.DataArray(dt_s * np.arange(n_samples), dims=dim, attrs={"units": "s"})
+        return {"time": steps, **points}
+    return points
+
+
+def time_length(
+    source: Source,
+    arrays: Mapping[str, xr.DataArray],
+    variables: Mapping[str, Variable],
+    points: Mapping[str, xr.DataArray],
+) -> tuple[int, str]:
+    """Number of samples, and the file's name of their dimension, without a time to count.
+
+    By the user's dims, by the dimension that the file names and no coordinate has, or by the
+    length that remains in most arrays when those of z and r are taken away.
+    """
+    votes: Counter[tuple[int, str]] = Counter()
+    known = {str(p.dims[0]) for p in points.values()} if source.dims_named else set()
+    space = [p.size for axis, p in points.items() if axis != "time"]
+    for ours, array in arrays.items():
+        dims = variables[ours].dims
+        if dims is not None:
+            if "time" in dims and array.size > 1:
+                shape = array.shape if array.ndim == len(dims) else array.squeeze().shape
+                return shape[list(dims).index("time")], "time"
+        elif source.dims_named:
+            votes.update((array.sizes[d], str(d)) for d in array.dims if str(d) not in known)
+        else:
+            votes.update((n, "time") for n in _may_be_time(array.shape, space))
+    if not votes:
+        shapes = {ours: array.shape for ours, array in arrays.items()}
+        raise ValueError(
+            f"the samples must be countable: no axis of {shapes} is left for time beside z and r "
+            f"of {space} points; name the coordinates, or give data.variables.NAME.dims"
+        )
+    (best, n_best), *others = votes.most_common()
+    if others and others[0][1] == n_best:
+        raise ValueError(
+            f"the samples must be countable: time may have {best[0]} or {others[0][0][0]} of them; "
+            "give data.variables.NAME.dims in the order of the file, such as [r,z,time]"
+        )
+    return best
+
+
+def _may_be_time(shape: Sequence[int], space: Sequence[int]) -> set[int]:
+    """Lengths of the axes whose fellows are all axes of space."""
+    longer = [n for n in shape if n > 1]
+    found = set()
+    for k, n in enumerate(longer):
+        fellows = Counter(longer[:k] + longer[k + 1 :])
+        if not fellows - Counter(space):
+            found.add(n)
+    return found
+
+
+def place(
+    array: xr.DataArray,
+    ours: str,
+    dims: Sequence[str] | None,
+    lengths: Mapping[str, int],
+    file_dims: Mapping[str, str],
+) -> xr.DataArray:
+    """Name the dimensions of an array and bring them into the order time, z, r.
+
+    dims: as the user gave them, or None: as the file names them, or by their lengths. Axes of
+    length 1, which MATLAB adds and drops, may be missing on either side.
+    """
+    shape = tuple(n for n in array.shape if n > 1)
+    if dims is None and array.dims and all(d in file_dims for d in array.dims):
+        dims = [file_dims[str(d)] for d in array.dims]
+    if dims is None:
+        options = fitting(shape, lengths)
+        dims = options[0] if len(options) == 1 else ()
+    sizes = tuple(lengths.get(d, 0) for d in dims)
+    if tuple(n for n in sizes if n != 1) != shape or len(set(dims)) < len(dims):
+        raise ValueError(
+            f"{ours} must fit the grid: the file has shape {array.shape} and the grid {lengths}, "
+            f"dims given: {list(dims) or None}; give data.variables.{ours}.dims in the order of "
+            "the file, such as [z,time]"
+        )
+    if array.shape == sizes:
+        named = array.drop_vars(list(array.coords)).rename(dict(zip(array.dims, dims, strict=True)))
+    else:
+        named = xr.DataArray(array.values.reshape(sizes), dims=list(dims), attrs=array.attrs)
+    return named.transpose(*[d for d in DIMS if d in dims])
+
+
+def fitting(shape: Sequence[int], lengths: Mapping[str, int]) -> list[tuple[str, ...]]:
+    """The orders of dimensions in which these lengths give the shape."""
+    longer = tuple(n for n in shape if n > 1)
+    return [
+        option
+        for option in permutations([d for d in lengths if lengths[d] > 1], len(longer))
+        if tuple(lengths[d] for d in option) == longer
+    ]

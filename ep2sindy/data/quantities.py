@@ -1,0 +1,226 @@
+"""What our usual names mean: their units, the sizes they have in a thruster, and their aliases."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.conversion import KNOWN_UNITS, conversion
+from ep2sindy.data.fields import COORDINATE_UNITS
+
+
+class DoubtfulUnit(UserWarning):
+    """Numbers that look like another unit than the one they are said to count."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of a thruster.
+
+    low, high: where the median of its size lies, in its unit. others: units that files often count
+    in. words: its names, as `words_of` gives them, ordered.
+    """
+
+    unit: str
+    low: float
+    high: float
+    others: tuple[str, ...]
+    words: frozenset[tuple[str, ...]]
+
+    def fits(self, size: float, factor: float = 1.0) -> bool:
+        """Whether a size may be this quantity's; what is all zeros may be anything's."""
+        return size == 0.0 or self.low <= factor * size <= self.high
+
+
+def _names(*texts: str) -> frozenset[tuple[str, ...]]:
+    return frozenset(tuple(sorted(text.split())) for text in texts)
+
+
+_SI = COORDINATE_UNITS | KNOWN_UNITS
+QUANTITIES: dict[str, Quantity] = {
+    "n_i": Quantity(
+        _SI["n_i"], 1e14, 1e21, ("cm^-3",),
+        _names("n i", "ni", "i n0 n", "i dens", "n_i", "nion", "n plasma", "dens plasma"),
+    ),
+    "n_n": Quantity(
+        _SI["n_n"], 1e15, 1e24, ("cm^-3",),
+        _names("n n", "nn", "n neutral", "nneutral", "neutral dens", "na", "n a", "ng", "n g"),
+    ),
+    "u_iz": Quantity(
+        _SI["u_iz"], 50.0, 2e5, ("km/s",),
+        _names("u i z", "uiz", "u i", "ui", "viz", "vi", "u z", "uz", "vz", "i z u", "i vel z"),
+    ),
+    "u_ir": Quantity(
+        _SI["u_ir"], 1.0, 2e5, ("km/s",),
+        _names("u i r", "uir", "vir", "u r", "ur", "vr"),
+    ),
+    "T_e_eV": Quantity(
+        "eV", 0.1, 300.0, ("K",),
+        _names("t e", "te", "tev", "t electron", "e temp", "electron temp", "temp e"),
+    ),
+    "R_ion": Quantity(
+        _SI["R_ion"], 0.0, 1e-11, ("cm^3/s",),
+        _names("r i", "rion", "kion", "k i", "rate", "i rate", "kiz", "k iz", "iz rate"),
+    ),
+    "I_d": Quantity(
+        _SI["I_d"], 1e-3, 300.0, ("mA",),
+        _names("i d", "id", "d current", "current", "d i", "idis", "i discharge"),
+    ),
+    "V_d": Quantity(
+        _SI["V_d"], 1.0, 2e4, ("kV", "mV"),
+        _names("u d", "vd", "ud", "d voltage", "voltage", "vdis", "udis"),
+    ),
+}  # fmt: skip
+
+AXES: dict[str, Quantity] = {
+    "time": Quantity(
+        "s", 0.0, np.inf, ("us", "ms", "ns"),
+        _names("t", "time", "times", "timestamp", "tvec", "seconds", "sec"),
+    ),
+    "z": Quantity("m", 1e-4, 1.0, ("mm", "cm"), _names("z", "axial", "zz")),
+    "r": Quantity("m", 1e-4, 1.0, ("mm", "cm"), _names("r", "radial", "rr")),
+}  # fmt: skip
+
+# How a variable is had that a file lacks: from another one, by a step of `prepare`.
+MADE_FROM = {"R_ion": ("T_e_eV", "ep2sindy.ionization_rate")}
+
+PLASMA = frozenset({"n_i", "n_n", "u_iz", "u_ir", "T_e_eV", "R_ion"})
+LONGEST_STEP_S = 1e-3  # of their records: ten periods of breathing
+
+# A word of a name and what it says; "" says nothing.
+WORDS = {
+    **dict.fromkeys(("density", "densities", "number"), "dens"),
+    **dict.fromkeys(("ion", "ions", "plus"), "i"),
+    **dict.fromkeys(("neutrals", "neut", "atom", "atoms", "gas"), "neutral"),
+    **dict.fromkeys(("v", "velocity", "vel", "speed"), "u"),
+    **dict.fromkeys(("radius", "rad"), "radial"),
+    **dict.fromkeys(("temperature",), "temp"),
+    **dict.fromkeys(("electrons", "el", "elec"), "electron"),
+    **dict.fromkeys(("discharge", "dis", "anode"), "d"),
+    **dict.fromkeys(("curr",), "current"),
+    **dict.fromkeys(("volt", "volts", "potential"), "voltage"),
+    **dict.fromkeys(("ionization", "ionisation", "iz", "ioniz"), "iz"),
+    **dict.fromkeys(("coefficient", "coeff", "coef"), ""),
+    **dict.fromkeys(("grid", "pos", "position", "coord", "coordinate", "coords", "points"), ""),
+    **dict.fromkeys(("cells", "centers", "centres", "axis", "vec", "vector", "cell"), ""),
+    **dict.fromkeys(("avg", "mean", "average", "averaged", "data", "field", "si"), ""),
+}  # fmt: skip
+
+# HallThruster.jl's names, of the lowest charge state.
+HALLTHRUSTER = {
+    r"ions\.\w+\.0\.n|ni\.0|ni_1": "n_i",
+    r"ions\.\w+\.0\.u|ui\.0|ui_1": "u_iz",
+    r"neutrals\.\w+\.n": "n_n",
+    r"grid|grid\.(z|cell_centers|cellcenters)": "z",
+}
+
+# Scalars that say the time step in s, or its inverse in Hz.
+STEPS = frozenset({"dt", "dts", "deltat", "timestep", "sampletime", "samplinginterval"})
+RATES = frozenset({"fs", "samplingrate", "samplerate", "samplingfrequency", "fshz"})
+
+# A unit at the end of a name.
+ENDINGS = {
+    "s": "s", "ms": "ms", "us": "us", "ns": "ns", "m": "m", "cm": "cm", "mm": "mm", "ev": "eV",
+    "k": "K", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "kv": "kV", "m3": "m^-3", "cm3": "cm^-3",
+    "m_s": "m/s", "km_s": "km/s", "m3_s": "m^3/s", "cm3_s": "cm^3/s",
+}  # fmt: skip
+
+
+def named_unit(name: str) -> tuple[str, str | None]:
+    """`t_us` as `t` and `us`; a name that ends in no unit with None."""
+    for ending in sorted(ENDINGS, key=len, reverse=True):
+        if name.lower().endswith(f"_{ending}") and len(name) > len(ending) + 1:
+            return name[: -len(ending) - 1], ENDINGS[ending]
+    return name, None
+
+
+def words_of(name: str) -> tuple[str, ...]:
+    """What the words of a name say, ordered: `ionDensity` and `density_ion` are one."""
+    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
+    said = [WORDS.get(part.lower(), part.lower()) for part in parts]
+    return tuple(sorted(word for word in said if word))
+
+
+def step_said(name: str, value: float) -> float | None:
+    """The time step in s that a scalar of this name says."""
+    *_, last = re.split(r"[/.]", name)
+    plain = re.sub(r"[^a-z]", "", last.lower())
+    if not (np.isfinite(value) and value > 0):
+        return None
+    return value if plain in STEPS else 1.0 / value if plain in RATES else None
+
+
+def meant_by(name: str) -> set[str]:
+    """Our names for what a name in a file may mean, by its last words or by its whole path."""
+    known = QUANTITIES | AXES
+    if name in known:
+        return {name}
+    exact = {ours for pattern, ours in HALLTHRUSTER.items() if re.fullmatch(pattern, name)}
+    if exact:
+        return exact
+    *_, last = re.split(r"[/.]", name)
+    for text in (last, named_unit(last)[0], name, named_unit(name)[0]):
+        if last.isdigit():
+            break
+        if said := words_of(text):
+            found = {ours for ours, quantity in known.items() if said in quantity.words}
+            if found:
+                return found
+    return set()
+
+
+def typical(values: np.ndarray) -> float:
+    """Median size of what is neither zero nor missing; 0 where there is none."""
+    sizes = np.abs(values[np.isfinite(values) & (values != 0)])
+    return float(np.median(sizes)) if sizes.size else 0.0
+
+
+def likely_time_unit(step: float, names: Iterable[str]) -> str | None:
+    """The unit in which a plasma's record has steps near a microsecond; None where seconds will do.
+
+    names: of its variables. A current alone may be logged once a second.
+    """
+    if step <= LONGEST_STEP_S or not PLASMA & {*names}:
+        return None
+    factors = {unit: conversion("time", unit)[0] for unit in AXES["time"].others}
+    return min(factors, key=lambda unit: abs(np.log10(step * factors[unit] / 1e-6)))
+
+
+def unit_doubts(field: xr.Dataset) -> list[str]:
+    """Quantities of a field whose numbers look like another unit; looks at one sample of many.
+
+    Densities of 1e12 m^-3, say, are those of a file that counts in cm^-3.
+    """
+    found = []
+    step = float(np.diff(field["time"].values[:2])[0])
+    if (unit := likely_time_unit(step, map(str, field.data_vars))) is not None:
+        found.append(
+            f"time goes in steps of {step:.2g} s, as if the file counted in {unit}: give its unit, "
+            f"data.time.unit={unit}, or leave this aside if it is right"
+        )
+    for name, quantity in (QUANTITIES | AXES).items():
+        # A variable z without that axis is a state of another system.
+        if name not in (field.dims if name in AXES else field.data_vars):
+            continue
+        array = field[name]
+        if "time" in array.dims and array.ndim > 1:
+            array = array.isel(time=array.sizes["time"] // 2)
+        size = typical(np.asarray(array.values, dtype=np.float64))
+        if quantity.fits(size):
+            continue
+        looks = [unit for unit in quantity.others if quantity.fits(size, conversion(name, unit)[0])]
+        if looks:
+            found.append(
+                f"{name} is about {size:.2g} {quantity.unit}, as if the file counted in "
+                f"{' or '.join(looks)}: give its unit, data{_place(name)}.unit={looks[0]}, or "
+                "leave this aside if it is right"
+            )
+    return found
+
+
+def _place(name: str) -> str:
+    return f".{name}" if name in AXES else f".variables.{name}"

@@ -1,0 +1,74 @@
+"""Files whose libraries may die of them are looked through in a process of its own first."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from threading import Lock
+
+from ep2sindy.data.readers.limits import size_of
+
+PATIENCE_S = 20.0  # and a second per 10 MB: slower than any disk
+SPEED = 1e7  # bytes per s
+
+_LOCK = Lock()
+
+
+def look_through_first(path: Path) -> None:
+    """Raise ValueError for a file that cannot be read to its end, or that the library dies of.
+
+    The process is started once and kept. A file that was sound is not looked at again until it
+    changes.
+    """
+    stat = path.stat()
+    if said := _verdict(path.absolute(), stat.st_size, stat.st_mtime_ns):
+        raise ValueError(said)
+
+
+@cache
+def _verdict(path: Path, size: int, changed_ns: int) -> str:
+    with _LOCK:
+        prober = _prober(os.getpid())
+        patience_s = PATIENCE_S + size_of(path) / SPEED
+        assert prober.stdin is not None
+        assert prober.stdout is not None
+        prober.stdin.write(json.dumps(str(path)).encode() + b"\n")
+        prober.stdin.flush()
+        answered = _answers(prober, patience_s)
+        line = prober.stdout.readline() if answered else b""
+        if line:
+            return str(json.loads(line))
+        _prober.cache_clear()
+        prober.kill()
+        status = prober.wait()
+    if not answered:
+        return f"reading it was given up after {patience_s:.0f} s"
+    by = signal.Signals(-status).name if status < 0 else f"status {status}"
+    return f"the library that reads it breaks down over it ({by})"
+
+
+def _answers(prober: subprocess.Popen, patience_s: float) -> bool:
+    """Whether it says something, or ends, in time."""
+    if os.name == "nt":
+        return True  # no pipe can be waited for there
+    assert prober.stdout is not None
+    return bool(select.select([prober.stdout], [], [], patience_s)[0])
+
+
+@cache
+def _prober(process: int) -> subprocess.Popen:
+    """One for each process of ours: a fork must not share its parent's."""
+    paths = os.pathsep.join(path for path in sys.path if path)
+    return subprocess.Popen(
+        [sys.executable, "-m", "ep2sindy.data.readers.probe"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": paths, "MALLOC_PERTURB_": "165"},  # luck is no soundness
+    )

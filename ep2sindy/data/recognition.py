@@ -1,0 +1,252 @@
+"""What a file's arrays are, told by their names, units, shapes and sizes, without a mapping."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.fields import DIMS
+from ep2sindy.data.held import TEXT, Held, held_array
+from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
+from ep2sindy.data.placing import fitting, time_length
+from ep2sindy.data.quantities import (
+    AXES,
+    QUANTITIES,
+    meant_by,
+    step_said,
+)
+from ep2sindy.data.readers.source import Source
+from ep2sindy.data.unit_choice import converts, is_of, own_unit, with_time_unit, with_unit
+
+MOST_COLUMNS = 32  # of an array whose columns are taken as signals of their own
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """A mapping of a file as far as it can be told.
+
+    variables, axes: our name -> where it is. guesses: our name -> a unit that is only likely, in
+    words. questions: what is left open, in words. n_samples: None where they cannot be counted.
+    """
+
+    held: Sequence[Held]
+    variables: Mapping[str, Variable]
+    axes: Mapping[str, Variable]
+    dt_s: float | None
+    guesses: Mapping[str, str] = field(default_factory=dict)
+    questions: Sequence[str] = ()
+    n_samples: int | None = None
+
+    def check(self, source: Source) -> None:
+        """Raise ValueError unless a field can be made of it without doubt."""
+        problems = [each.problem for each in self.held if each.problem not in ("", TEXT)]
+        problems += self.guesses.values()
+        if "time" not in self.axes and self.dt_s is None:
+            problems.insert(0, "a field needs time: give its step dt_s, or name the file's time")
+        if not self.variables:
+            problems.append("no array of the file fits its axes")
+        if problems:
+            text = "; ".join([*problems, *self.questions])
+            raise ValueError(
+                f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect "
+                "shows what it holds"
+            )
+
+
+def recognised(
+    source: Source,
+    *,
+    dt_s: float | None = None,
+    given: Mapping[str, Variable | Keys] | None = None,
+) -> Recognised:
+    """What the arrays of a file are. given: coordinates that the user names."""
+    problems = Problems()
+    named = in_file(given or {}, problems)
+    problems.check(source)
+    held = [held_array(source, name) for name in source.names]
+    usable = [each for each in held if not each.problem]
+    questions: list[str] = []
+    guesses: dict[str, str] = {}
+    axes = dict(named)
+    for axis in DIMS[:1] if source.is_table else DIMS:  # a column z is a state of one's own
+        if axis not in axes and (found := _axis(axis, usable, source, questions)) is not None:
+            axes[axis] = found
+    if dt_s is None:
+        dt_s = _step_s(source, axes, usable)
+    counter = axes.pop("time", None) if dt_s is not None else None
+    taken = {v.name for v in (*axes.values(), *([counter] if counter else [])) if v.name}
+    taken |= {each.name for each in usable if "time" in meant_by(each.name)}
+    rest = [each for each in usable if each.name not in taken]
+    for axis, variable in axes.items():
+        if (one := _of(held, variable.name)) is not None and axis not in named:
+            axes[axis] = with_unit(axis, one, AXES[axis], guesses)
+    lengths = _lengths(axes, held, source, rest, dt_s, questions)
+    variables = _variables(source, rest, axes, held, lengths, questions, guesses)
+    if "time" not in named and (one := _of(held, getattr(axes.get("time"), "name", None))):
+        said_s = _said_step_s(usable)
+        axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
+    return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
+
+
+def _of(held: Sequence[Held], name: str | None) -> Held | None:
+    return next((each for each in held if each.name == name), None)
+
+
+def _axis(axis: str, held: Sequence[Held], source: Source, questions: list[str]) -> Variable | None:
+    """The vector that is this coordinate: by its name, for time also by its unit or its place."""
+    unit = AXES[axis].unit
+    rising = [each for each in held if each.step is not None]
+    options = [each for each in rising if axis in meant_by(each.name)]
+    options = [e for e in options if e.unit in ("", "1") or is_of(e.unit, unit)]
+    if not options and axis == "time":
+        options = [each for each in rising if is_of(each.unit, unit)]
+        if not options and source.is_table and rising and rising[0] is held[0]:
+            options = rising[:1]  # the first column of a table, where it rises, is its time
+    exact = [each for each in options if each.name == axis] or options
+    if len(exact) > 1:
+        names = " or ".join(repr(each.name) for each in exact)
+        questions.append(f"{axis} may be {names}: name one")
+        return None
+    return Variable(exact[0].name, exact[0].unit or unit) if exact else None
+
+
+def _step_s(source: Source, axes: Mapping[str, Variable], held: Sequence[Held]) -> float | None:
+    """The time step that a preamble says, unless the time has a unit: a count of samples has none.
+
+    Without a time, that of a scalar such as dt or fs.
+    """
+    time = axes.get("time")
+    one = _of(held, time.name) if time is not None else None
+    if source.step_s is not None:
+        return None if one is not None and is_of(one.unit, "s") else source.step_s
+    return _said_step_s(held) if time is None else None
+
+
+def _said_step_s(held: Sequence[Held]) -> float | None:
+    """The time step that scalars such as dt or fs say, if they say one."""
+    scalars = [step_said(e.name, e.low) for e in held if not e.lengths and not e.dims]
+    said = {step for step in scalars if step is not None}
+    return said.pop() if len(said) == 1 else None
+
+
+def _lengths(
+    axes: Mapping[str, Variable],
+    held: Sequence[Held],
+    source: Source,
+    rest: Sequence[Held],
+    dt_s: float | None,
+    questions: list[str],
+) -> dict[str, int]:
+    """Points of the axes; without a time, its samples are what is left of the arrays."""
+    found = {axis: one.shape for axis, v in axes.items() if (one := _of(held, v.name))}
+    lengths = {axis: int(np.prod(shape)) for axis, shape in found.items()}
+    if "time" in axes or not rest:
+        return lengths
+    points = {axis: xr.DataArray(np.empty(n), dims=_dim(axes[axis], held, axis))
+              for axis, n in lengths.items()}  # fmt: skip
+    arrays = {e.name: xr.DataArray(np.broadcast_to(0.0, e.shape), dims=e.dims or None)
+              for e in rest if e.lengths}  # fmt: skip
+    try:
+        plain = {name: Variable(name, "1") for name in arrays}
+        lengths["time"] = time_length(source, arrays, plain, points)[0]
+    except ValueError as error:
+        questions.append(str(error))
+    return lengths
+
+
+def _dim(variable: Variable, held: Sequence[Held], axis: str) -> str:
+    one = _of(held, variable.name)
+    return one.dims[0] if one is not None and one.dims else axis
+
+
+def _variables(
+    source: Source,
+    rest: Sequence[Held],
+    axes: Mapping[str, Variable],
+    held: Sequence[Held],
+    lengths: Mapping[str, int],
+    questions: list[str],
+    guesses: dict[str, str],
+) -> dict[str, Variable]:
+    """Arrays that fit the axes in one way, under our names where theirs are known."""
+    fit = [each for each in rest if _fits(each, axes, held, lengths, questions)]
+    found: dict[str, Variable] = {}
+    for ours, quantity in QUANTITIES.items():
+        options = [each for each in fit if ours in meant_by(each.name) and _may_be(ours, each)]
+        exact = [each for each in options if each.name == ours] or options
+        if len(exact) == 1:
+            found[ours] = with_unit(ours, exact[0], quantity, guesses)
+        elif exact:
+            names = " or ".join(repr(each.name) for each in exact)
+            questions.append(f"{ours} may be {names}: name one")
+    taken = {variable.name for variable in found.values()}
+    for each in fit:
+        if each.name not in taken:
+            ours = _own_name(each.name, {*found, *lengths, "time"})
+            found[ours] = Variable(each.name, own_unit(ours, each))
+    for each in rest:
+        found |= _columns(each, lengths, {*found, *lengths, "time"})
+    return found
+
+
+def _may_be(ours: str, one: Held) -> bool:
+    return one.unit in ("", "1") or converts(ours, one.unit)
+
+
+def _fits(
+    one: Held,
+    axes: Mapping[str, Variable],
+    held: Sequence[Held],
+    lengths: Mapping[str, int],
+    questions: list[str],
+) -> bool:
+    """Whether an array has one place on the axes; asks where it might have several, or none."""
+    if not one.lengths or one.low != one.low:
+        return False
+    known = {_dim(variable, held, axis) for axis, variable in axes.items()}
+    if one.dims and set(one.dims) <= known:
+        return True
+    ways = fitting(one.shape, lengths)
+    if len(ways) > 1:
+        texts = " or ".join(f"[{','.join(way)}]" for way in ways)
+        questions.append(f"{one.name!r} of shape {one.shape} may be {texts}: give its dims")
+    if not ways and len(one.lengths) > 1 and not _has_columns(one, lengths):
+        part = ", ".join([":", *["0"] * (len(one.shape) - 1)])
+        questions.append(
+            f"{one.name!r} of shape {one.shape} has an axis without a coordinate: name it, or take "
+            f"part of the array, such as {one.name}[{part}]"
+        )
+    return len(ways) == 1
+
+
+def _has_columns(one: Held, lengths: Mapping[str, int]) -> bool:
+    """Whether an array is a few signals side by side."""
+    n = lengths.get("time", 0)
+    return len(one.shape) == 2 and sorted(one.shape)[-1] == n and min(one.shape) <= MOST_COLUMNS
+
+
+def _columns(one: Held, lengths: Mapping[str, int], taken: set[str]) -> dict[str, Variable]:
+    """The signals of such an array, one by one."""
+    if fitting(one.shape, lengths) or not _has_columns(one, lengths) or len(one.lengths) < 2:
+        return {}
+    samples_first = one.shape[0] == lengths["time"]
+    found = {}
+    for k in range(min(one.shape)):
+        part = f"[:, {k}]" if samples_first else f"[{k}, :]"
+        ours = _own_name(f"{one.name}_{k}", taken)
+        found[ours] = Variable(one.name + part, own_unit(ours, one))
+    return found
+
+
+def _own_name(name: str, taken: set[str]) -> str:
+    """A name in a file as one of ours."""
+    *_, last = re.split(r"[/.]", name)
+    ours = re.sub(r"\W+", "_", name if last.isdigit() and last != name else last).strip("_")
+    ours = f"column_{ours}" if not ours or ours[0].isdigit() else ours
+    while ours in taken:
+        ours += "_"
+    return ours

@@ -1,0 +1,174 @@
+"""How like a record a run is: by its cycle, or by its statistics where nothing repeats."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.signals.attractor import (
+    Cycle,
+    distribution_distances,
+    find_cycle,
+    spectrum_distance,
+    waveform_errors,
+)
+from ep2sindy.signals.wander import statistics_wander
+
+LONG = 8.0  # periods of a record whose first half may be left out as a transient
+REPEATS = 0.9  # of the variance, that the waveform of a cycle explains; of chaos 0.5 to 0.75
+# Times what the spectra of quarters are apart: they lack the slow bands, in which a record that
+# does not repeat itself wanders most.
+SPECTRUM_WANDERS = 2.0
+DEAD = 0.1  # of the data's spread: a state that varies less in the second half has died out
+
+
+class Verdict(StrEnum):
+    """How a free run ends, the best first."""
+
+    LIVES = "lives"
+    SLIPS = "slips"
+    WRONG_CYCLE = "wrong cycle"
+    DIES_OUT = "dies out"
+    LEAVES_DOMAIN = "leaves the domain"
+    DIVERGES = "diverges"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """How close a model that lives stays to the data.
+
+    frequency, amplitude: relative error of the frequency and of each state's standard deviation.
+    waveform: RMS difference of the waveforms, in standard deviations. For records that do not
+    repeat themselves, distribution: Wasserstein distance of each state's distribution, in standard
+    deviations, and spectrum: share of the power in other bands; or as far as quarters of the
+    record are apart, twice that of the spectrum, where that is more.
+    """
+
+    frequency: float = 0.01
+    amplitude: float = 0.1
+    waveform: float = 0.2
+    distribution: float = 0.2
+    spectrum: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0.0:
+                raise ValueError(f"the bound {name} must be positive: {value} came")
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """How one run compares to a record; the fields are those of `FreeRun`."""
+
+    verdict: Verdict
+    f_error: float
+    spectrum: float
+    by_state: Mapping[str, Float[np.ndarray, " n_states"]]
+
+
+def deviation(
+    f_error: float,
+    amplitude_ratio: Float[np.ndarray, " n_states"],
+    waveform_error: Float[np.ndarray, " n_states"],
+    bounds: Bounds,
+) -> float:
+    """The largest from the data's cycle, in units of its bound; NaN where there is none."""
+    return float(
+        max(
+            abs(f_error) / bounds.frequency,
+            np.abs(amplitude_ratio - 1.0).max() / bounds.amplitude,
+            waveform_error.max() / bounds.waveform,
+        )
+    )
+
+
+def against_cycle(
+    cycle: Cycle, t: Float[np.ndarray, " samples"], states: Float[np.ndarray, "samples n_states"]
+) -> tuple[float, Float[np.ndarray, " n_states"], Float[np.ndarray, " n_states"]]:
+    """Relative error of the frequency, amplitude ratios, waveform errors; NaN without a cycle."""
+    found = find_cycle(t, states, n_harmonics=len(cycle.harmonics))
+    if found is None:
+        nothing = np.full(states.shape[1], np.nan)
+        return np.nan, nothing, nothing
+    f_error = found.frequency_Hz / cycle.frequency_Hz - 1.0
+    return f_error, found.std / zero_to_one(cycle.std), waveform_errors(cycle, found)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What runs are compared to: samples, and what they repeat.
+
+    cycle: of the samples, or of a longer record that they are a part of; None without a period.
+    """
+
+    t: Float[np.ndarray, " samples"]
+    states: Float[np.ndarray, "samples n_states"]
+    cycle: Cycle | None
+    std: Float[np.ndarray, " n_states"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        std = self.states.std(axis=0) if self.cycle is None else self.cycle.std
+        object.__setattr__(self, "std", zero_to_one(std))
+
+    def excursion(self, states: Float[np.ndarray, "_ n_states"]) -> float:
+        return float((np.abs(states - self.states.mean(axis=0)) / self.std).max())
+
+    def likeness(self, states: Float[np.ndarray, "_ n_states"], bounds: Bounds) -> Likeness:
+        """Of a run at the times t; one with fewer samples has diverged."""
+        nothing = np.full(states.shape[1], np.nan)
+        by_state = dict.fromkeys(("amplitude_ratio", "waveform_error", "distribution"), nothing)
+        if len(states) < len(self.t) or not np.isfinite(states).all():
+            return Likeness(Verdict.DIVERGES, np.nan, np.nan, by_state)
+        half = len(states) // 2 if self._is_long else 0
+        late = states[half:]
+        by_state["distribution"] = distribution_distances(self.states[half:], late)
+        by_state["amplitude_ratio"] = late.std(axis=0) / self.std
+        spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
+        middle = len(states) // 2
+        if (states[middle:].std(axis=0) < DEAD * self.states[middle:].std(axis=0)).all():
+            return Likeness(Verdict.DIES_OUT, np.nan, spectrum, by_state)
+        # What does not repeat itself is alike by its statistics alone.
+        if (self.cycle is None or self.cycle.share < REPEATS) and self._is_alike(states, bounds):
+            return Likeness(Verdict.LIVES, np.nan, spectrum, by_state)
+        if self.cycle is None:
+            return Likeness(Verdict.WRONG_CYCLE, np.nan, spectrum, by_state)
+        f_error, amplitude, waveform = against_cycle(self.cycle, self.t[half:], late)
+        if np.isnan(f_error):
+            return Likeness(Verdict.WRONG_CYCLE, f_error, spectrum, by_state)
+        by_state |= {"amplitude_ratio": amplitude, "waveform_error": waveform}
+        verdict = self._with_period(f_error, amplitude, waveform, bounds)
+        return Likeness(verdict, f_error, spectrum, by_state)
+
+    @property
+    def _is_long(self) -> bool:
+        """Whether half of it holds enough periods to compare."""
+        return self.cycle is not None and self.cycle.n_periods >= LONG
+
+    def _with_period(
+        self, f_error: float, amplitude: np.ndarray, waveform: np.ndarray, bounds: Bounds
+    ) -> Verdict:
+        if deviation(0.0, amplitude, waveform, bounds) > 1.0:
+            return Verdict.WRONG_CYCLE
+        return Verdict.LIVES if abs(f_error) <= bounds.frequency else Verdict.SLIPS
+
+    def _is_alike(self, states: np.ndarray, bounds: Bounds) -> bool:
+        """Whether a run is as near to the record as its quarters are to each other, about."""
+        apart, apart_spectrum = statistics_wander(self.t, self.states)
+        distribution = distribution_distances(self.states, states)
+        near = distribution <= np.maximum(bounds.distribution, apart)
+        spectrum = spectrum_distance(self.t, self.states, states)
+        return bool(
+            near.all() and spectrum <= max(bounds.spectrum, SPECTRUM_WANDERS * apart_spectrum)
+        )
+
+
+def record_of(run: Trajectory, states: Sequence[str]) -> Record:
+    """A trajectory as what runs are compared to."""
+    values = run.columns(states)
+    return Record(run.t, values, find_cycle(run.t, values))

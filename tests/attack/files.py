@@ -1,0 +1,159 @@
+"""Mutated files of all kinds: each is read, refused in our words, or it is a fault of ours.
+
+`python -m tests.attack.files` reads the paths that come in, one a line: a process that may die.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tests.attack.results import Outcome
+
+TIMES = 1e-6 * np.arange(40)
+VALUES = 1e18 * (2.0 + np.sin(0.3 * np.arange(40)))
+ENDINGS = ("nc", "nc3", "nc5", "h5", "mat", "mat73", "npz", "csv", "json", "zarr")
+LIMIT_S, MEMORY = 60.0, 2**31
+
+
+def whole(folder: Path) -> dict[str, bytes]:
+    """One sound file of every kind; a Zarr store is stood for by the file of its values."""
+    import h5py
+    import netCDF4
+    from scipy.io import savemat
+
+    arrays = {"t": TIMES, "n": VALUES}
+    for ending, form in (
+        ("nc", "NETCDF4"), ("nc3", "NETCDF3_64BIT"), ("nc5", "NETCDF3_64BIT_DATA"),
+    ):  # fmt: skip
+        with netCDF4.Dataset(folder / f"a.{ending}", "w", format=form) as file:
+            file.createDimension("t", len(TIMES))
+            for name, values in arrays.items():
+                file.createVariable(name, "f8", ("t",))[:] = values
+    for ending, block in (("h5", 0), ("mat73", 512)):
+        with h5py.File(folder / f"a.{ending}", "w", userblock_size=block) as file:
+            for name, values in arrays.items():
+                file.create_dataset(name, data=values, chunks=(10,), compression="gzip")
+    content = bytearray((folder / "a.mat73").read_bytes())
+    content[:128] = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    (folder / "a.mat73").write_bytes(content)
+    with (folder / "a.mat").open("wb") as file:
+        savemat(file, {**arrays, "s": {"x": VALUES}}, do_compression=False)
+    np.savez_compressed(folder / "a.npz", **arrays)
+    rows = "".join(f"{t!r},{n!r}\n" for t, n in zip(TIMES.tolist(), VALUES.tolist(), strict=True))
+    (folder / "a.csv").write_text(f"t (s),n (m^-3)\n{rows}")
+    (folder / "a.json").write_text(json.dumps({"t": TIMES.tolist(), "n": VALUES.tolist()}))
+    return {e: (folder / f"a.{e}").read_bytes() for e in ENDINGS if e != "zarr"}
+
+
+def mutated(data: bytes, rng: np.random.Generator) -> bytes:
+    """Bytes changed, cut off, doubled, zeroed, or a number made large."""
+    changed, n = bytearray(data), len(data)
+    at = int(rng.integers(n))
+    match rng.integers(6):
+        case 0:
+            for place in rng.integers(n, size=rng.integers(1, 9)):
+                changed[place] = rng.integers(256)
+        case 1:
+            del changed[at:]
+        case 2:
+            changed[at:at] = changed[at : at + int(rng.integers(1, 200))]
+        case 3:
+            end = min(n, at + int(rng.integers(1, 200)))
+            changed[at:end] = bytes(end - at)
+        case 4:
+            changed[at : at + 8] = rng.choice([b"\xff" * 8, b"\x7f" + b"\xff" * 7, b"\0" * 8])
+        case _:
+            changed[at] ^= 1 << int(rng.integers(8))
+    return bytes(changed)
+
+
+def attack(folder: Path, seed: int) -> Callable[[str], Outcome]:
+    """The attack on one case `ENDING-NUMBER`."""
+    sound = whole(folder)
+    readers: list[subprocess.Popen] = []
+
+    def attacked(case: str) -> Outcome:
+        ending, number = case.split("-")
+        rng = np.random.default_rng([seed, ENDINGS.index(ending), int(number)])
+        path = folder / f"case.{ending.rstrip('357')}"
+        path.write_bytes(mutated(sound[ending], rng))
+        if not readers:
+            readers.append(_reader())
+        outcome = _asked(readers[0], path)
+        if outcome[0] in ("crash", "hang"):
+            readers.pop().kill()
+        return outcome
+
+    return attacked
+
+
+def cases(n: int) -> Iterator[str]:
+    kinds = [ending for ending in ENDINGS if ending != "zarr"]
+    return (f"{kinds[k % len(kinds)]}-{k // len(kinds)}" for k in range(n))
+
+
+def _reader() -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.attack.files"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+
+
+def _asked(reader: subprocess.Popen, path: Path) -> Outcome:
+    assert reader.stdin is not None
+    assert reader.stdout is not None
+    begin = time.monotonic()
+    reader.stdin.write(f"{path}\n".encode())
+    reader.stdin.flush()
+    if not select.select([reader.stdout], [], [], LIMIT_S)[0]:
+        return "hang", f"over {LIMIT_S:g} s"
+    line = reader.stdout.readline()
+    if not line:
+        return "crash", f"status {reader.wait()} after {time.monotonic() - begin:.1f} s"
+    kind, words = json.loads(line)
+    return kind, words
+
+
+def read(path: Path) -> Outcome:
+    """The same values, others, a refusal that names the file, or an error that is not ours."""
+    from ep2sindy.data.mapping import Variable
+    from ep2sindy.data.open import open_field
+
+    try:
+        field = open_field(
+            path, variables={"n_i": Variable("n", "m^-3")}, time=Variable("t", "s")
+        ).load()
+    except ValueError as error:
+        return ("refused" if path.name in str(error) else "refused, file not named"), str(error)
+    except Exception as error:
+        return "foreign error", repr(error)
+    same = np.array_equal(field["n_i"].values, VALUES) and np.array_equal(field["time"], TIMES)
+    return ("same", "") if same else ("different", "")
+
+
+def main() -> None:
+    import resource
+    import warnings
+
+    warnings.simplefilter("ignore")
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        outcome = read(Path(line.strip()))
+        if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 > MEMORY:
+            outcome = ("memory above 2 GiB", outcome[1])
+        print(json.dumps(outcome), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""A disk that takes no more: one message with the path and the way out, and whole files."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from ep2sindy.machine.files import WriteError, replacing, sweep, write_bytes, write_text
+from ep2sindy.report.screen import Screen
+from ep2sindy.report.tensorboard import Board
+
+resource = pytest.importorskip("resource", reason="limits of a process need POSIX")
+
+WRITE = """
+import resource, sys
+import numpy as np, xarray as xr
+from pathlib import Path
+from ep2sindy.data.open import write_field
+from ep2sindy.thruster.cache import write
+
+n = np.random.default_rng(0).random((3000, 20))
+field = xr.Dataset(
+    {"n_i": (("time", "z"), n, {"units": "m^-3"})},
+    coords={"time": 1e-6 * np.arange(3000), "z": 1e-3 * np.arange(20)},
+)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+for writer in (lambda: write_field(field, Path("field.nc")), lambda: write(field, Path("kept.nc"))):
+    try:
+        writer()
+    except OSError as error:
+        print(error)
+"""
+
+
+def test_no_netcdf_writer_falls_over_on_a_full_disk(tmp_path: Path) -> None:
+    """HDF5 itself ends the process with a segmentation fault, when it closes the file."""
+    (tmp_path / "field.nc").write_text("earlier")
+    done = subprocess.run(
+        [sys.executable, "-c", WRITE], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    said = done.stdout.splitlines()
+    assert [line.partition(" could")[0] for line in said] == ["field.nc", "kept.nc"]
+    assert all("File too large" in line and "make room there" in line for line in said)
+    assert (tmp_path / "field.nc").read_text() == "earlier"
+    assert [path.name for path in tmp_path.iterdir()] == ["field.nc"]
+
+
+def test_an_error_says_path_reason_and_way_out(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(WriteError, match=r"taken/x.txt could not be written \(.*\).*make room"):
+        write_text(tmp_path / "taken" / "x.txt", "text")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_log_that_cannot_be_written_is_named() -> None:
+    screen = Screen(Path("/dev/full"))
+    with pytest.raises(WriteError, match=r"/dev/full could not be written \(No space left"):
+        screen.print("a line")
+
+
+def test_a_board_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(WriteError, match="taken/board could not be written"):
+        Board(tmp_path / "taken" / "board").scalars({"x": 1.0}, step=0)
+
+
+def test_only_what_dead_processes_left_is_swept(tmp_path: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    deeper = tmp_path / "run" / "figures"
+    deeper.mkdir(parents=True)
+    with replacing(deeper / "a.b.nc") as living:
+        living.write_text("being written")
+        left = living.with_name(living.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
+        elsewhere = left.with_name(left.name.replace(left.name.split("-")[-3], "0" * 8))
+        for path in (left, elsewhere, deeper / ".hidden-0-1.nc", deeper / "mine.nc"):
+            path.write_text("x")
+        sweep(tmp_path)
+        assert not left.exists()
+        assert living.exists()
+    assert sorted(p.name for p in deeper.iterdir()) == sorted(
+        [elsewhere.name, ".hidden-0-1.nc", "a.b.nc", "mine.nc"]
+    )
+
+
+def test_bytes_are_written_whole(tmp_path: Path) -> None:
+    write_bytes(tmp_path / "x.bin", memoryview(b"\0\1"))
+    assert (tmp_path / "x.bin").read_bytes() == b"\0\1"
+
+
+def test_a_written_field_is_the_same_from_memory(tmp_path: Path) -> None:
+    from ep2sindy.data.netcdf import write_netcdf
+
+    field = xr.Dataset({"n": (("time",), np.arange(5.0))}, coords={"time": np.arange(5.0)})
+    packed = {"n": {"zlib": True, "complevel": 4}}
+    write_netcdf(field, tmp_path / "a.nc", encoding=packed)
+    with xr.open_dataset(tmp_path / "a.nc") as found:
+        xr.testing.assert_identical(found.load(), field)

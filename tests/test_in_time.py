@@ -1,0 +1,183 @@
+"""Steps of `prepare` along time: onto equal steps, into gaps, the past, the rate, the drift."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.data.gaps import gap_words, present_rows
+
+T = np.sort(np.random.default_rng(2).uniform(0.0, 1.0, 400))
+T[[0, -1]] = 0.0, 1.0
+OMEGA = 20.0
+
+
+def field_of(t: np.ndarray, **columns: np.ndarray) -> xr.Dataset:
+    data = {name: ("time", values, {"units": "A"}) for name, values in columns.items()}
+    return xr.Dataset(data, coords={"time": ("time", t, {"units": "s"})})
+
+
+def plane(t: np.ndarray) -> xr.Dataset:
+    """x(t, z) = t z with a cell outside the plasma, B(z), and x alone in time."""
+    x = np.outer(t, [1.0, 2.0, 3.0])
+    x[:, 2] = np.nan
+    data = {
+        "x": (("time", "z"), x, {"units": "m"}),
+        "B": ("z", [1.0, 2.0, 3.0], {"units": "T"}),
+        "I_d": ("time", t**2, {"units": "A"}),
+    }
+    return xr.Dataset(data, coords={"time": ("time", t), "z": ("z", [0.0, 1.0, 2.0])})
+
+
+def test_resampling_finer_follows_a_smooth_signal_to_fourth_order() -> None:
+    errors = []
+    for n in (50, 100, 200):
+        t = np.linspace(0.0, 1.0, n + 1)
+        fine = ep.resample(field_of(t, x=np.sin(OMEGA * t)), dt_s=0.37 / n)
+        errors.append(np.abs(fine["x"].values - np.sin(OMEGA * fine["time"].values)).max())
+        assert np.ptp(np.diff(fine["time"].values)) < 1e-12
+    slopes = np.diff(np.log2(errors))
+    assert np.all(slopes < -3.5)
+
+
+def test_resampling_coarser_takes_means_of_what_lies_between() -> None:
+    t = np.linspace(0.0, 1.0, 1001)
+    coarse = ep.resample(field_of(t, line=2 + 3 * t, fast=np.sin(2 * np.pi * 250 * t)), dt_s=0.1)
+    at = coarse["time"].values
+    np.testing.assert_allclose(at, 0.05 + 0.1 * np.arange(10), rtol=1e-12)
+    np.testing.assert_allclose(coarse["line"].values, 2 + 3 * at, rtol=1e-12)
+    assert np.abs(coarse["fast"].values).max() < 1e-12  # whole periods: a plain pick has up to one
+
+
+def test_resampling_takes_unequal_steps_and_leaves_masks_and_maps(tmp_path: Path) -> None:
+    even = ep.resample(plane(T), dt_s=0.001)
+    assert even["x"].dims == ("time", "z")
+    np.testing.assert_allclose(even["x"].values[:, 1], 2 * even["time"].values, atol=1e-12)
+    assert np.isnan(even["x"].values[:, 2]).all()
+    assert list(even.data_vars) == ["x", "B", "I_d"]
+    np.testing.assert_array_equal(even["B"].values, [1.0, 2.0, 3.0])
+    ep.write_field(even, tmp_path / "even.nc")  # which checks that it is a field
+
+
+def gappy() -> xr.Dataset:
+    t = np.arange(11.0)
+    x = 2 * t
+    x[[3, 4, 7]] = np.nan
+    return field_of(t, x=x, y=t)
+
+
+def test_interpolation_fills_gaps_by_straight_lines() -> None:
+    np.testing.assert_allclose(ep.interpolate(gappy())["x"].values, 2 * np.arange(11.0))
+    outside = ep.interpolate(plane(T))
+    assert np.isnan(outside["x"].values[:, 2]).all()
+
+
+def test_gaps_too_long_or_at_an_end_are_refused() -> None:
+    with pytest.raises(ValueError, match="max_gap_s = 2 s: x is missing from 2 to 5 s"):
+        ep.interpolate(gappy(), max_gap_s=2.0)
+    with pytest.raises(ValueError, match="x holds numbers from 5 to 10 s, .*; crop it first"):
+        ep.interpolate(gappy().isel(time=slice(3, None)))
+
+
+def test_a_delay_is_the_signals_past() -> None:
+    t = np.linspace(0.0, 1.0, 101)
+    field = ep.delay(field_of(t, x=np.sin(3 * t)), variable="x", delay_s=0.105)
+    later = field["time"].values
+    assert later[0] == pytest.approx(0.11)
+    # straight lines over 0.01 s: x'' h^2 / 8
+    np.testing.assert_allclose(field["x_delayed"].values, np.sin(3 * (later - 0.105)), atol=1.2e-4)
+    np.testing.assert_array_equal(field["x"].values, np.sin(3 * t)[11:])
+    assert field["x_delayed"].attrs["units"] == "A"
+
+
+def test_derivatives_at_unequal_steps_are_exact_for_parabolas() -> None:
+    field = ep.derivative(plane(T), variable="I_d")
+    np.testing.assert_allclose(field["dI_d_dt"].values, 2 * T, atol=1e-9)
+    assert field["dI_d_dt"].attrs["units"] == "A s^-1"
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> None:
+    field = field_of(T, x=5 + (T**degree - (T**degree).mean()) * 7, y=T)
+    flat = ep.detrend(field, variables=["x"], degree=degree)
+    np.testing.assert_allclose(flat["x"].values, 5.0, atol=1e-10)
+    np.testing.assert_array_equal(flat["y"].values, T)
+    both = ep.detrend(plane(T), degree=degree)
+    assert np.isnan(both["x"].values[:, 2]).all()
+    np.testing.assert_allclose(both["x"].values[:, 1], 2 * T.mean(), atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("step", "settings", "message"),
+    [
+        (ep.resample, {"dt_s": 2.0}, "leave two samples or more: 2 s came for a record of 1 s"),
+        (ep.resample, {"dt_s": 0.0}, "dt_s must be positive"),
+        (ep.delay, {"variable": "q", "delay_s": 0.1}, r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
+        (ep.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
+        (ep.delay, {"variable": "x", "delay_s": 1.5}, "leave two samples or more: 1.5 s came"),
+        (ep.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"}, "a new name .*'I_d' came"),
+        (ep.derivative, {"variable": "B"}, "unknown variable of time 'B'"),
+        (ep.derivative, {"variable": "x", "name": "a b"}, "letters, digits and _: 'a b' came"),
+        (ep.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
+        (ep.detrend, {"variables": ["q"]}, "unknown variable of time 'q'"),
+    ],
+)  # fmt: skip
+def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        step(plane(T), **settings)
+
+
+def test_steps_that_need_every_sample_name_a_gap() -> None:
+    for step, settings in (
+        (ep.resample, {"dt_s": 0.5}),
+        (ep.delay, {"variable": "x", "delay_s": 1.0}),
+        (ep.derivative, {"variable": "x"}),
+        (ep.detrend, {}),
+    ):
+        with pytest.raises(ValueError, match=r"x = nan at time = 3 s \(3 such values\)"):
+            step(gappy(), **settings)
+
+
+def test_missing_samples_of_a_record_are_left_out_for_all() -> None:
+    run = ep.zone_average(gappy(), None, states=["x", "y"])
+    kept = np.array([0, 1, 2, 5, 6, 8, 9, 10])
+    np.testing.assert_array_equal(run.t, kept)
+    np.testing.assert_array_equal(run.states, np.column_stack([2 * kept, kept]))
+    alone = ep.zone_average(gappy(), None, states=["y"])
+    assert alone.n_samples == 11
+
+
+def test_a_state_without_a_number_is_named() -> None:
+    field = gappy()
+    field["x"].values[:] = np.nan
+    with pytest.raises(ValueError, match="x must hold numbers: all its 11 samples are NaN"):
+        ep.zone_average(field, None, states=["x", "y"])
+
+
+def test_samples_that_no_row_holds_together_are_named() -> None:
+    t = np.arange(6.0)
+    x, y = np.where(t < 3, t, np.nan), np.where(t >= 2, t, np.nan)
+    with pytest.raises(ValueError, match="of 6 samples x lacks 3, y lacks 2, and 1 are left"):
+        present_rows({"x": x, "y": y})
+
+
+def test_gaps_are_told_with_their_length() -> None:
+    words = gap_words(np.array([0, 1, 2, 5, 6, 8, 9, 10.0]), 11)
+    assert words.startswith(
+        "3 of 11 samples are missing (NaN) and left out; the longest gap is 3 s"
+    )
+
+
+def test_lorenz_is_found_through_gaps() -> None:
+    run = ep.lorenz().trajectory(noise=0.01, rng=0)
+    table = pd.DataFrame(run.states, columns=["x", "y", "z"]).assign(t=run.t)
+    missing = np.random.default_rng(1).choice(len(table), 150, replace=False)
+    table.loc[missing, "y"] = np.nan
+    table.loc[800:830, "x"] = np.nan
+    with pytest.warns(ep.MissingSamples, match=r"of 3000 samples are missing"):
+        found = ep.discover(table)
+    terms = {state: sorted(found.model.terms(state)) for state in "xyz"}
+    assert terms == {"x": ["x", "y"], "y": ["x", "x*z", "y"], "z": ["x*y", "z"]}

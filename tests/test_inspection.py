@@ -1,0 +1,287 @@
+"""Files without a mapping: what they are taken for, what is asked, and what is made of it."""
+
+import json
+import warnings
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.io import savemat
+
+import ep2sindy as ep
+from ep2sindy.data.conversion import conversion
+from ep2sindy.data.quantities import meant_by
+from ep2sindy.data.readers.registry import open_source
+from ep2sindy.data.recognition import recognised
+
+NT, NZ, NR = 40, 7, 5
+T = np.arange(NT) * 1.5e-6
+Z, R = np.linspace(0.001, 0.031, NZ), np.linspace(0.035, 0.05, NR)
+RNG = np.random.default_rng(5)
+WAVE = RNG.uniform(1.0, 2.0, (NT, NZ, NR))
+N_I, N_N, U_Z, T_E = 1e18 * WAVE, 5e18 * WAVE[::-1], 1e4 * WAVE, 20 * WAVE
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("n_i", "n_i"), ("ni", "n_i"), ("ionDensity", "n_i"), ("density_ion", "n_i"),
+        ("plasma/N_ion", "n_i"), ("nIon", "n_i"), ("ions.Xe.0.n", "n_i"), ("ni.0", "n_i"),
+        ("ni_1", "n_i"), ("ni_cm3", "n_i"), ("ions.Kr.0.u", "u_iz"), ("ui.0", "u_iz"),
+        ("Vel_ion_z", "u_iz"), ("nn", "n_n"), ("neutralDensity", "n_n"), ("neutrals.Ar.n", "n_n"),
+        ("Te", "T_e_eV"), ("Tev", "T_e_eV"), ("T_e_eV", "T_e_eV"), ("rate", "R_ion"),
+        ("electron_temperature", "T_e_eV"), ("ionization_rate", "R_ion"), ("Id", "I_d"),
+        ("discharge_current", "I_d"),
+        ("Vd", "V_d"), ("time", "time"), ("t_us", "time"), ("Time", "time"), ("grid", "z"),
+        ("mesh/axial_pos", "z"), ("radius", "r"),
+    ],
+)  # fmt: skip
+def test_names_of_many_codes_are_known(name: str, ours: str) -> None:
+    assert meant_by(name) == {ours}
+
+
+@pytest.mark.parametrize(
+    "name", ["ions.Xe.1.n", "ni.1", "ni_2", "foo", "n", "thrust", "neutrals.Xe.u", "B", "ne", "phi"]
+)
+def test_other_names_mean_nothing_of_ours(name: str) -> None:
+    assert not meant_by(name)
+
+
+def odd_hdf5(path: Path, *, units: bool) -> None:
+    """Odd names, axes reversed, no time; densities in cm^-3, temperatures in K."""
+    with h5py.File(path, "w") as file:
+        for name, values, unit in (
+            ("out/ionDens", 1e-6 * N_I, "cm-3"),
+            ("out/NeutralDensity", 1e-6 * N_N, "cm-3"),
+            ("out/Te", T_E / 8.617333262145e-5, "K"),
+            ("out/Vel_ion_z", U_Z, "m/s"),
+        ):
+            file[name] = values.T
+            file[name].attrs["units"] = unit if units else ""
+        file["mesh/axial_pos"], file["mesh/radial_pos"] = 100 * Z, 100 * R
+        for name in ("mesh/axial_pos", "mesh/radial_pos"):
+            file[name].attrs["units"] = "cm"
+
+
+def test_an_odd_file_that_names_its_units_opens_with_its_step_alone(tmp_path: Path) -> None:
+    odd_hdf5(tmp_path / "a.h5", units=True)
+    with pytest.raises(ValueError, match="a field needs time: give its step dt_s"):
+        ep.open_field(tmp_path / "a.h5")
+    field = ep.open_field(tmp_path / "a.h5", dt_s=1.5e-6)
+    expected = {"n_i": N_I, "n_n": N_N, "T_e_eV": T_E, "u_iz": U_Z, "time": T, "z": Z, "r": R}
+    for name, values in expected.items():
+        np.testing.assert_allclose(field[name].values, values, rtol=1e-9, err_msg=name)
+    assert field["n_i"].dims == ("time", "z", "r")
+
+
+def test_units_that_are_only_likely_are_asked_and_inspect_takes_them(tmp_path: Path) -> None:
+    odd_hdf5(tmp_path / "a.h5", units=False)
+    with pytest.raises(ValueError, match=r"n_i .*in cm\^-3, and it names no unit: give it; n_n"):
+        ep.open_field(tmp_path / "a.h5", dt_s=1.5e-6)
+    found = ep.inspect(tmp_path / "a.h5")
+    units = {name: variable.unit for name, variable in found.variables.items()}
+    assert units == {"n_i": "cm^-3", "n_n": "cm^-3", "u_iz": "m/s", "T_e_eV": "K"}
+    field = ep.open_field(
+        tmp_path / "a.h5", variables=found.variables, z=found.z, r=found.r, dt_s=1.5e-6
+    )
+    np.testing.assert_allclose(field["T_e_eV"].values, T_E, rtol=1e-9)
+
+
+def test_an_inspection_says_what_is_there_and_what_lacks(tmp_path: Path) -> None:
+    odd_hdf5(tmp_path / "a.h5", units=False)
+    text = repr(ep.inspect(tmp_path / "a.h5"))
+    for part in (
+        "out/ionDens", "(5, 7, 40)", "n_i in cm^-3", "no time: give the step", "data.dt_s=STEP",
+        "R_ion is made by ep2sindy.ionization_rate from T_e_eV", "z in cm, 0.5 apart",
+        "no length of the channel", "all there for +exp=breathing",
+    ):  # fmt: skip
+        assert part in text, part
+    assert "<table>" in ep.inspect(tmp_path / "a.h5")._repr_html_()
+
+
+def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"probe": WAVE[:, :2, 0], "t": T, "fs": 1.0})
+    field = ep.open_field(tmp_path / "a.mat")
+    np.testing.assert_array_equal(field["probe_1"].values, WAVE[:, 1, 0])
+    one = ep.open_field(
+        tmp_path / "a.mat",
+        variables={"I_d": ep.Variable("probe[:, 1]", "mA")},
+        time=ep.Variable("t", "s"),
+    )
+    np.testing.assert_allclose(one["I_d"].values, 1e-3 * WAVE[:, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("probe[:, 2]", r"must lie inside its array: 'probe' has shape \(40, 2\), counted from 0"),
+        ("probe[:, a]", "has no variable 'probe"),
+        ("prob", "has no variable 'prob' .*, but 'probe'"),
+        ("probe[0:2, 1]", r"written like \[:, 1\]"),
+    ],
+)
+def test_parts_that_are_not_there_are_refused(tmp_path: Path, name: str, message: str) -> None:
+    savemat(tmp_path / "a.mat", {"probe": WAVE[:, :2, 0], "t": T})
+    with pytest.raises(ValueError, match=message):
+        ep.open_field(
+            tmp_path / "a.mat",
+            variables={"I_d": ep.Variable(name, "A")},
+            time=ep.Variable("t", "s"),
+        )
+
+
+@pytest.mark.parametrize(("name", "value"), [("fs", 1 / 1.5e-6), ("dt", 1.5e-6)])
+def test_a_scalar_may_say_the_step(tmp_path: Path, name: str, value: float) -> None:
+    savemat(tmp_path / "a.mat", {"signal": WAVE[:, 0, 0], name: value})
+    field = ep.open_field(tmp_path / "a.mat")
+    np.testing.assert_allclose(field["time"].values, T, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1.0, "s"), (1e3, "ms"), (1e6, "us"), (7.0, "s")])
+def test_a_rate_beside_a_time_says_its_unit(tmp_path: Path, factor: float, unit: str) -> None:
+    savemat(tmp_path / "a.mat", {"signal": WAVE[:, 0, 0], "t": factor * T, "fs": 1 / 1.5e-6})
+    assert ep.inspect(tmp_path / "a.mat").time == ep.Variable("t", unit)
+
+
+def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
+    square = 1e18 * np.repeat(WAVE[:, :, :1], NZ, axis=2)
+    np.savez(tmp_path / "a.npz", t=T, z=Z, r=R[0] + Z, ni=square, I_d=WAVE[:, 0, 0])
+    found = recognised(open_source(tmp_path / "a.npz"))
+    assert "n_i" not in found.variables
+    assert any(
+        "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]" in q for q in found.questions
+    )
+
+
+def test_two_names_for_one_quantity_are_asked(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", t=T, ni=N_I[:, 0, 0], ion_density=N_I[:, 1, 0])
+    found = recognised(open_source(tmp_path / "a.npz"))
+    assert "n_i may be 'ni' or 'ion_density': name one" in found.questions
+
+
+def frames(*, old: bool) -> list[dict]:
+    found = []
+    for k in range(NT):
+        n, u, nn = N_I[k, :, 0].tolist(), U_Z[k, :, 0].tolist(), N_N[k, :, 0].tolist()
+        if old:
+            found.append({"ni": [n], "ui": [u], "nn": nn})
+        else:
+            found.append(
+                {"neutrals": {"Kr": {"n": nn}}, "ions": {"Kr": [{"n": n, "u": u, "Z": 1}]}}
+            )
+    return found
+
+
+def hallthruster(layout: str) -> object:
+    """One run in a layout of HallThruster.jl."""
+    old = layout != "0.22"
+    each = frames(old=old)
+    if layout == "beside":
+        return {"t": T.tolist(), "grid": {"cell_centers": Z.tolist()}, "frames": each}
+    each = [frame | {"t": t, "z": Z.tolist()} for frame, t in zip(each, T.tolist(), strict=True)]
+    config = {"thruster": {"geometry": {"channel_length": 0.025}}}
+    return each if old else {"input": {"config": config}, "output": {"frames": each}}
+
+
+@pytest.mark.parametrize("layout", ["0.18", "0.22", "beside"])
+def test_layouts_of_hallthruster_are_known(tmp_path: Path, layout: str) -> None:
+    (tmp_path / "a.json").write_text(json.dumps(hallthruster(layout)))
+    field = ep.open_field(tmp_path / "a.json")
+    expected = {"n_i": N_I[:, :, 0], "n_n": N_N[:, :, 0], "u_iz": U_Z[:, :, 0], "time": T, "z": Z}
+    for name, values in expected.items():
+        np.testing.assert_array_equal(field[name].values, values, err_msg=name)
+    assert field.attrs.get("channel_m") == (0.025 if layout == "0.22" else None)
+
+
+def test_plain_columns_in_json_are_a_record(tmp_path: Path) -> None:
+    content = {"t": T.tolist(), "discharge_current": WAVE[:, 0, 0].tolist(), "note": "text"}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    field = ep.open_field(tmp_path / "a.json")
+    np.testing.assert_array_equal(field["I_d"].values, WAVE[:, 0, 0])
+    assert field["I_d"].attrs["units"] == "A"
+
+
+def test_all_that_is_wrong_with_a_mapping_is_told_at_once(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", t=T, z=Z, ni=N_I[:, :, 0], Te=T_E[:10, :, 0])
+    with pytest.raises(ValueError, match="4 things must be put right") as caught:
+        ep.open_field(
+            tmp_path / "a.npz",
+            variables={
+                "n_i": ep.Variable("nii", "m^-3"),
+                "n_n": ep.Variable("nn", "m^-3"),
+                "u_iz": ep.Variable("ni", "kg"),
+                "T_e_eV": ep.Variable("Te", "eV"),
+            },
+            time=ep.Variable("t", "s"),
+            z=ep.Variable("z", "m"),
+        )
+    text = str(caught.value)
+    for part in (
+        "no variable 'nii' (wanted as n_i), but 'ni'", "no variable 'nn'", "'kg' came",
+        "T_e_eV must fit the grid: the file has shape (10, 7)", "ni (40, 7)",
+    ):  # fmt: skip
+        assert part in text, part
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-6, "cm^-3"), (1.0, None)])
+def test_numbers_that_look_like_another_unit_are_told(
+    tmp_path: Path, factor: float, unit: str | None
+) -> None:
+    np.savez(tmp_path / "a.npz", t=T, ni=factor * N_I[:, 0, 0])
+    given = {"variables": {"n_i": ep.Variable("ni", "m^-3")}, "time": ep.Variable("t", "s")}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ep.open_field(tmp_path / "a.npz", **given)
+    texts = [str(w.message) for w in caught if w.category is ep.DoubtfulUnit]
+    assert len(texts) == (unit is not None)
+    assert all(f"as if the file counted in {unit}" in text for text in texts)
+
+
+def test_temperatures_in_kelvin_become_those_in_eV() -> None:
+    factor, zero, unit = conversion("T_e_eV", "K")
+    assert (zero, unit) == (0.0, "eV")
+    assert factor == pytest.approx(8.617333262e-5, rel=1e-9)  # k_B/e, CODATA 2018
+    with pytest.raises(ValueError, match="'K' came"):
+        conversion("n_i", "K")
+
+
+def test_whole_numbers_are_samples(tmp_path: Path) -> None:
+    counts = np.arange(NT) % 7
+    np.savez(tmp_path / "a.npz", time=T, counts=counts)
+    field = ep.open_field(tmp_path / "a.npz")
+    assert field["counts"].dtype == np.float64
+    own = xr.Dataset({"c": ("time", counts, {"units": "1"})}, coords={"time": T})
+    run = ep.zone_average(own, None, states=["c"])
+    np.testing.assert_array_equal(run.states[:, 0], counts)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e6, "us"), (1e3, "ms"), (1e9, "ns"), (1.0, "s")])
+def test_the_steps_of_a_plasmas_record_show_the_unit_of_time(
+    tmp_path: Path, factor: float, unit: str
+) -> None:
+    np.savez(tmp_path / "a.npz", t=factor * T, ni=N_I[:, 0, 0], x=WAVE[:, 0, 0])
+    found = ep.inspect(tmp_path / "a.npz")
+    assert found.time == ep.Variable("t", unit)
+    assert ("time" in found.found.guesses) is (unit != "s")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        given = {"n_i": ep.Variable("ni", "m^-3")}
+        ep.open_field(tmp_path / "a.npz", variables=given, time=ep.Variable("t", "s"))
+    assert [f"data.time.unit={unit}" in str(w.message) for w in caught] == [True] * (unit != "s")
+    slow = {"x": ep.Variable("x", "1")}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ep.open_field(tmp_path / "a.npz", variables=slow, time=ep.Variable("t", "s"))
+
+
+def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> None:
+    np.savez(
+        tmp_path / "a.npz",
+        t=T, z=Z, B=RNG.uniform(size=NZ), n_i=N_I[:, :, 0], I_d=WAVE[:, 0, 0],
+        V_d=np.full(NT, 300.0),
+    )  # fmt: skip
+    found = ep.inspect(tmp_path / "a.npz")
+    signals = [name for name, variable in found.variables.items() if found.is_trace(variable)]
+    assert signals == ["I_d"]

@@ -1,0 +1,111 @@
+"""What is taken as samples and times: one meaning is converted, the rest is refused."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ep2sindy.data.given import trajectories_of
+from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
+from ep2sindy.regression.sampling import is_even
+from ep2sindy.signals.spectrum import is_uniform
+
+X = np.sin(np.arange(8.0))
+
+
+@pytest.mark.parametrize("unit", ["ns", "us", "ms", "s"])
+def test_dates_are_seconds_from_the_first(unit: str) -> None:
+    dates = np.datetime64("2024-02-28T23:59:58", unit) + np.arange(0, 8, 2).astype("m8[s]")
+    np.testing.assert_array_equal(seconds(dates), [0, 2, 4, 6])
+    np.testing.assert_array_equal(seconds(dates - dates[0]), [0, 2, 4, 6])
+
+
+def test_dates_of_tables_and_arrays_are_seconds() -> None:
+    dates = pd.date_range("2024-03-30 23:00", periods=8, freq="250ms", tz="Europe/Berlin")
+    for run in (pd.DataFrame({"time": dates, "x": X}), (dates.tz_convert(None).to_numpy(), X)):
+        (found,) = trajectories_of(run)
+        np.testing.assert_allclose(found.t, 0.25 * np.arange(8), rtol=1e-15)
+
+
+def test_a_time_that_is_no_date_is_missing() -> None:
+    t = np.array(["2024-01-01", "NaT", "2024-01-03"], dtype="M8[D]")
+    np.testing.assert_array_equal(seconds(t), [0, np.nan, 172800])
+
+
+@pytest.mark.parametrize(
+    ("values", "match"),
+    [
+        (X + 0j, "complex128 came; give real and imaginary parts"),
+        (X > 0, "bool came; give 0.0 and 1.0"),
+        (["1", "2"], "<U1 came; convert them first"),
+        (np.array([1.0, None]), "object came"),
+        (np.array(["2024"], dtype="M8[Y]"), "datetime64"),
+    ],
+)
+def test_what_is_no_real_number_is_refused(values: object, match: str) -> None:
+    with pytest.raises(ValueError, match=f"states must hold real numbers: .*{match}"):
+        real_numbers(values, "states")
+
+
+def test_masked_values_are_missing() -> None:
+    masked = np.ma.array([1.0, 9.97e36, 3.0], mask=[False, True, False])
+    np.testing.assert_array_equal(real_numbers(masked, "x"), [1, np.nan, 3])
+    with pytest.raises(ValueError, match=r"samples must be finite: x\[1\] = nan"):
+        trajectories_of((np.arange(3.0), masked))
+
+
+@pytest.mark.parametrize("level", [1e-300, 1e200])
+def test_sizes_whose_products_leave_the_number_format_are_refused(level: float) -> None:
+    with pytest.raises(ValueError, match=r"'x' reaches .*; count it in another unit"):
+        check_magnitude(level * X[:, None], ("x",))
+    check_magnitude(np.zeros((3, 1)), ("x",))
+
+
+def test_times_in_single_precision_are_even() -> None:
+    t = 0.5 + 1.5e-6 * np.arange(4000)
+    assert not is_uniform(t.astype(np.float32).astype(np.float64))
+    assert is_uniform(seconds(t.astype(np.float32)))
+    np.testing.assert_allclose(seconds(t.astype(np.float32)), t, atol=6e-8)
+
+
+def test_unequal_times_stay_so_in_single_precision() -> None:
+    t = 1e-6 * np.cumsum(1.0 + 0.01 * np.sin(np.arange(100))).astype(np.float32)
+    np.testing.assert_array_equal(seconds(t), t.astype(np.float64))
+
+
+def test_epoch_seconds_are_even_but_for_their_rounding() -> None:
+    t = 1.7e9 + 2e-6 * np.arange(1000)
+    assert np.ptp(np.diff(t)) > 0.05 * 2e-6
+    assert is_uniform(t)
+    assert is_even(t)
+    assert rounding_s(t) == pytest.approx(4.8e-7, rel=0.01)
+    t[500:] += 2e-6
+    assert not is_uniform(t)
+    assert not is_even(t)
+
+
+def test_a_trajectory_refuses_them_without_type_checks_too() -> None:
+    """As users have it: in tests jaxtyping refuses them first."""
+    lines = [
+        "import numpy as np",
+        "from ep2sindy import Trajectory",
+        "x = np.arange(4.0)[:, None]",
+        "dates = np.datetime64('2024-01-01', 'ms') + np.arange(4)",
+        "print(Trajectory(dates, x, ['x']).t.tolist())",
+        "for t, s in ((x[:, 0], x + 1j), (['0', '1', '2', '3'], x), (x[:, 0], x > 1),",
+        "             (x[:, 0], 1e-300 * x)):",
+        "    try: Trajectory(t, s, ['x'])",
+        "    except ValueError as error: print(str(error)[:30])",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines() == [
+        "[0.0, 0.001, 0.002, 0.003]",
+        "states must hold real numbers:",
+        "t must hold real numbers: <U1 ",
+        "states must hold real numbers:",
+        "a variable must be of a size w",
+    ]

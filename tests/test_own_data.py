@@ -1,0 +1,195 @@
+"""A file of one's own on the command line: looked into, written down, run, and said."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+import yaml
+
+import ep2sindy as ep
+from ep2sindy.app import main as program
+from ep2sindy.app.runner import run_config
+from ep2sindy.data.inspection import NEEDS
+from tests.programs import EXPERIMENTS, composed
+
+
+def ep2sindy(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["ep2sindy", *arguments])
+    program.main()
+
+
+def lorenz_csv(path: Path, *, seed: int = 0, lost: int = 0) -> np.ndarray:
+    """A file with semicolons, decimal commas and a preamble; returns its states."""
+    start = np.random.default_rng(seed).uniform(-8.0, 8.0, 3) + np.array([0.0, 0.0, 25.0])
+    run = ep.lorenz().trajectory(initial=start, noise=0.001, rng=seed)
+    lines = ["made by;a scope", "", "Time;x;y;z", "(s);;;"]
+    for k, row in enumerate(zip(run.t, *run.states.T, strict=True)):
+        cells = [f"{value:.9g}".replace(".", ",") for value in row]
+        if 100 <= k < 100 + lost:
+            cells[1] = ""
+        lines.append(";".join(cells))
+    path.write_text("\n".join(lines) + "\n")
+    return run.states
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_two_commands_lead_from_a_file_to_its_equations(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    lorenz_csv(folder / "scope.csv", lost=5)
+    ep2sindy(monkeypatch, "inspect", "scope.csv", "--write")
+    said = capsys.readouterr().out
+    assert "between semicolons, decimal commas, rows from line 5" in said
+    command = "ep2sindy +exp=discover data=scope 'trajectory.states=[x,y,z]'"
+    assert command in said
+    ep2sindy(monkeypatch, "+exp=discover", "data=scope", "trajectory.states=[x,y,z]")
+    (run,) = (folder / "outputs" / "discover").iterdir()
+    summary = json.loads((run / "summary.json").read_text())
+    terms = summary["models"]["model"]["equations"]["x"]["terms"]
+    assert terms == pytest.approx({"x": -10.0, "y": 10.0}, rel=0.05)
+    page, log = (run / "report.html").read_text(), (run / "run.log").read_text()
+    for part in ("data: scope.csv", "2995 samples", "x in 1"):
+        assert part in page
+        assert part in log
+    assert "5 of 3000 samples are missing (NaN)" in summary["warnings"][0]
+
+
+def test_a_written_config_is_that_of_the_file(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    np.savez(
+        folder / "a b.npz",
+        t=np.arange(9.0) * 1e-6,
+        z=np.linspace(0, 0.05, 4),
+        ni=1e12 * np.ones((4, 9)) * np.linspace(1, 2, 9),
+        null=np.arange(9.0),
+    )
+    ep2sindy(monkeypatch, "inspect", "a b.npz", "--write", "mine")
+    text = (folder / "conf" / "data" / "mine.yaml").read_text()
+    config = yaml.safe_load(text)
+    assert config["path"] == "a b.npz"
+    assert config["variables"]["n_i"] == {"name": "ni", "unit": "cm^-3", "dims": None}
+    assert config["variables"]["null"] == {"name": "null", "unit": "1", "dims": None}
+    assert "the likely unit: check it" in text
+    field = ep.open_field(
+        config.pop("path"), **{k: v for k, v in config.items() if k != "_target_"}
+    )
+    np.testing.assert_allclose(field["n_i"].values[-1], 2e18)
+    assert "data.channel_m=LENGTH" in capsys.readouterr().out
+    for name, message in (("mine", "mine.yaml is there already"), ("file", "has data=file itself")):
+        with pytest.raises(SystemExit, match=message):
+            ep2sindy(monkeypatch, "inspect", "a b.npz", "--write", name)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["none.csv"], "error: no such file: .*none.csv"),
+        (["empty.csv"], "error: empty.csv is empty"),
+        (["."], "a folder that ends in .zarr"),
+        (["*.h5"], "no file fits the pattern '\\*.h5'"),
+        (
+            ["a.npz", "b.npz", "--write"],
+            r"must hold the same names: b.npz differs from a.npz in \['x', 'y'\]",
+        ),
+    ],
+)
+def test_what_cannot_be_looked_into_ends_in_one_message(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    (folder / "empty.csv").write_bytes(b"")
+    np.savez(folder / "a.npz", t=np.arange(5.0), x=np.arange(5.0) ** 2)
+    np.savez(folder / "b.npz", t=np.arange(5.0), y=np.arange(5.0) ** 2)
+    with pytest.raises(SystemExit, match=message):
+        ep2sindy(monkeypatch, "inspect", *arguments)
+
+
+def test_several_files_are_several_records(folder: Path) -> None:
+    for k in range(3):
+        lorenz_csv(folder / f"run{k}.csv", seed=k)
+    overrides = ["+exp=discover", "data=recognised", "trajectory.states=[x,y,z]"]
+    run = run_config(composed(*overrides, "data.path=run*.csv", f"output={folder}")).folder
+    summary = json.loads((run / "summary.json").read_text())
+    log = (run / "run.log").read_text()
+    assert all(f"data: run{k}.csv; 3000 samples" in log for k in range(3))
+    rows = (run / "tables" / "records.csv").read_text().splitlines()
+    assert len(rows) == 4
+    assert summary["models"]["model"]["equations"]["x"]["terms"] == pytest.approx(
+        {"x": -10.0, "y": 10.0}, rel=0.01
+    )
+    one = run_config(composed(*overrides, "data.path=[run0.csv]", f"output={folder}")).folder
+    assert not (one / "tables" / "records.csv").exists()
+
+
+def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:
+    for k in range(2):
+        lorenz_csv(folder / f"run{k}.csv", seed=k)
+    config = composed(
+        "+exp=trace", "data=recognised", "signal=x", "data.path=[run0.csv,run1.csv]",
+        f"output={folder}",
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="takes one record: data.path names 2 files; give one"):
+        run_config(config)
+    with pytest.raises(ValueError, match="no file fits the pattern 'none"):
+        run_config(composed("+exp=trace", "data=recognised", "signal=x", "data.path=none*.csv",
+                            f"output={folder}"))  # fmt: skip
+
+
+GRID = xr.Dataset(
+    {
+        "n_i": (
+            ("time", "z"),
+            np.outer(np.arange(1.0, 6.0), np.arange(1.0, 11.0)),
+            {"units": "m^-3"},
+        )
+    },
+    coords={"time": np.arange(5.0), "z": np.linspace(0.0025, 0.0475, 10)},
+)
+
+
+def test_downstream_is_the_last_part_of_a_channel_that_is_known() -> None:
+    zone = ep.Zone(z="downstream")
+    known = GRID.assign_attrs(channel_m=0.025)
+    average = ep.ZoneAverage(["n_i"], zone)
+    run = average.trajectory(known, inputs=[], label="")
+    by_hand = ep.zone_average(GRID, ep.Zone(z=(0.015, 0.025)), states=["n_i"])
+    np.testing.assert_array_equal(run.states, by_hand.states)
+    words = average.place(known)
+    assert words == (
+        "average over z 15 to 25 mm (2 of 10 points), the last 40% of the channel's 25 mm"
+    )
+    simulated = GRID.assign_attrs(parameters=json.dumps({"thruster": {"channel_length": 0.025}}))
+    assert average.place(simulated) == words
+    assert ep.GridPoint(["n_i"], z=0.018).place(GRID) == "the grid point at z = 17.5 mm"
+
+
+def test_a_channel_that_is_not_known_is_asked_for() -> None:
+    with pytest.raises(ValueError, match=r"give data.channel_m=LENGTH in m, or a zone of your own"):
+        ep.zone_average(GRID, ep.Zone(z="downstream"), states=["n_i"])
+    flat = GRID.isel(z=0, drop=True)
+    assert ep.zone_average(flat, ep.Zone(z="downstream"), states=["n_i"]).n_samples == 5
+    with pytest.raises(ValueError, match="must be two increasing numbers in m"):
+        ep.Zone(z="upstream")
+
+
+def test_a_variable_that_can_be_made_says_how() -> None:
+    field = GRID.assign(T_e_eV=GRID["n_i"])
+    with pytest.raises(ValueError, match=r"'prepare=\[\{_target_:ep2sindy.ionization_rate\}\]'"):
+        ep.zone_average(field, None, states=["n_i"], inputs=["R_ion"])
+
+
+def test_every_experiment_on_files_is_known_to_an_inspection() -> None:
+    """Those that take the data group; what they need is in their configs."""
+    made = {"simulate", "benchmark", "frontier", "weak_windows"}
+    assert set(NEEDS) == {*EXPERIMENTS} - made
+    for name in ("breathing", "parametric", "pointwise"):
+        text = str(composed(f"+exp={name}"))
+        assert all(variable in text for variable in NEEDS[name])

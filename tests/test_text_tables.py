@@ -1,0 +1,169 @@
+"""Tables as text, in the layouts of oscilloscopes, programs and people."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ep2sindy.data.mapping import Variable
+from ep2sindy.data.open import open_field
+from ep2sindy.data.readers.registry import open_source
+
+T = np.arange(30) * 1.5e-6
+X = 4.0 + np.sin(np.arange(30) / 3)
+
+
+def rows(*columns: np.ndarray, sep: str = ",", decimal: str = ".", end: str = "") -> str:
+    lines = [sep.join(f"{v:.9g}".replace(".", decimal) for v in row) for row in zip(*columns)]  # noqa: B905
+    return "\n".join(line + end for line in lines) + "\n"
+
+
+# text, then the names, the units and the factor of the time column
+LAYOUTS = {
+    "commas": ("t,I\n" + rows(T, X), ["t", "I"], ["", ""], 1.0),
+    "no header": (rows(T, X), ["0", "1"], ["", ""], 1.0),
+    "blanks, no header": (rows(T, X, sep="   "), ["0", "1"], ["", ""], 1.0),
+    "tabs and decimal commas": (
+        "t\tI\n" + rows(T, X, sep="\t", decimal=","), ["t", "I"], ["", ""], 1.0,
+    ),
+    "numpy.savetxt": ("# t I\n" + rows(T, X, sep=" "), ["t", "I"], ["", ""], 1.0),
+    "Fortran": ("\n" + rows(T, X, sep=" ").replace("e", "D"), ["0", "1"], ["", ""], 1.0),
+    "PicoScope": (
+        "Time;Channel A\n(us);(A)\n\n" + rows(1e6 * T, X, sep=";", decimal=","),
+        ["Time", "Channel A"], ["us", "A"], 1e6,
+    ),
+    "Tektronix MSO": (
+        "Model,MSO44\nFirmware,1.2\n\nHorizontal Scale,4e-6\n\n\nTIME,CH1\n" + rows(T, X),
+        ["TIME", "CH1"], ["", ""], 1.0,
+    ),
+    "Tektronix TDS": (
+        "".join(
+            f"{head},{t:.9g},{x:.9g},\n"
+            for head, t, x in zip(
+                ["Record Length,30,", "Sample Interval,1.5e-6,", "Source,CH1,", *[",,"] * 27],
+                T, X, strict=True,
+            )
+        ),
+        ["3", "4"], ["", ""], 1.0,
+    ),
+    "Keysight": (
+        "x-axis,1\nsecond,Ampere\n" + rows(T, X), ["x-axis", "1"], ["second", "ampere"], 1.0,
+    ),
+    "LeCroy": (
+        "LECROYWR104Xi,6262,Waveform\nSegments,1,SegmentSize,2002\nSegment,TrigTime,Time\n"
+        "#1,06-May-2010 11:11,0\nTime,Ampl\n" + rows(T, X),
+        ["Time", "Ampl"], ["", ""], 1.0,
+    ),
+    "units in names": (
+        "time (us);I [A]\n" + rows(1e6 * T, X, sep=";"), ["time", "I"], ["us", "A"], 1e6,
+    ),
+    "a separator at the end": ("t,I,\n" + rows(T, X, end=","), ["t", "I"], ["", ""], 1.0),
+    "quotes": (
+        '"t","I"\n' + rows(T, X).replace(",", '","').replace("\n", '"\n"')[:-1].join(['"', ""]),
+        ["t", "I"], ["", ""], 1.0,
+    ),
+    "a column of text": (
+        "t,I,note\n" + rows(T, X, end=",ok"), ["t", "I"], ["", ""], 1.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layouts_are_told_from_their_content(tmp_path: Path, layout: str, encoding: str) -> None:
+    text, names, units, factor = LAYOUTS[layout]
+    (tmp_path / "a.txt").write_text(text, encoding=encoding)
+    source = open_source(tmp_path / "a.txt")
+    assert list(source.names) == names
+    arrays = [source.read(name) for name in names]
+    assert [array.attrs["units"] for array in arrays] == units
+    np.testing.assert_allclose(arrays[0].values, factor * T, rtol=1e-8, atol=1e-14)
+    np.testing.assert_allclose(arrays[1].values, X, rtol=1e-8)
+
+
+@pytest.mark.parametrize("ending", ["csv", "tsv", "txt", "dat", "asc", "prn", "CSV"])
+def test_text_goes_by_many_endings_and_columns_by_their_number(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"a.{ending}"
+    path.write_text("when;current\n" + rows(T, X, sep=";", decimal=","))
+    field = open_field(path, variables={"I_d": Variable("1", "mA")}, time=Variable("0", "s"))
+    np.testing.assert_allclose(field["I_d"].values, 1e-3 * X, rtol=1e-8)
+
+
+def test_rigol_counts_its_samples_and_says_the_step_beside_the_names(tmp_path: Path) -> None:
+    text = "X,CH1,Start,Increment,\nSequence,Volt,-6.0e-03,1.5e-06\n"
+    (tmp_path / "a.csv").write_text(text + rows(np.arange(30), X, end=","))
+    field = open_field(tmp_path / "a.csv")
+    np.testing.assert_allclose(field["time"].values, T, atol=1e-18)
+    np.testing.assert_allclose(field["CH1"].values, X, rtol=1e-8)
+    assert field["CH1"].attrs["units"] == "V"
+
+
+def test_a_preamble_says_the_step_of_a_file_without_time(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("Sample Interval,1.5e-06\nI_d\n" + rows(X))
+    field = open_field(tmp_path / "a.csv")
+    np.testing.assert_allclose(field["time"].values, T, rtol=1e-12)
+    np.testing.assert_allclose(field["I_d"].values, X, rtol=1e-8)
+
+
+def test_empty_cells_and_words_for_missing_are_nan(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,x,y\n0,1,2\n1,,3\n2,4,NaN\n3,5,---\n4,6,inf\n5,7,8\n")
+    source = open_source(tmp_path / "a.csv")
+    np.testing.assert_array_equal(source.read("x").values, [1, np.nan, 4, 5, 6, 7])
+    np.testing.assert_array_equal(source.read("y").values, [2, 3, *[np.nan] * 3, 8])
+
+
+def test_a_preamble_of_thousands_of_rows_below_is_read_whole(tmp_path: Path) -> None:
+    n = 5000
+    (tmp_path / "a.csv").write_text("made by x\n\nt,x\n" + rows(np.arange(n), np.arange(n) / 2))
+    assert open_source(tmp_path / "a.csv").read("x").values[-1] == (n - 1) / 2
+
+
+MANY = rows(np.arange(3000.0), np.arange(3000.0))
+FAULTS = {
+    "one more in every row": (
+        "t,x\n0,1,5\n1,2,5\n2,3,5\n", r"has 2 names, \['t', 'x'\], and the rows have 3 columns",
+    ),
+    "one more in the first row": ("t,x\n0,1,5\n1,2\n2,3\n3,4\n", "rows have 3 columns"),
+    "one more in some row": ("t,x\n0,1\n1,2,5\n2,3\n3,4\n", "rows have 3 columns"),
+    "one more far below": (
+        f"t,x\n{MANY}3000,1,7\n", "as many cells as the first, 2: row 3001 has 3",
+    ),
+    "a word among the rows": (
+        "t,x\n0,1\n1,2\nover,load\n3,4\n4,5\n", "line 4 is 'over,load'",
+    ),
+    "a word far below": (f"t,x\n{MANY}3000,over\n", "'x' must hold numbers: row 3001 holds 'over'"),
+    "a header alone": ("t,x\n", "holds no rows of numbers"),
+    "bytes": ("\0\1\2\0", "bytes that are no text, as a binary file by another name"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_of_a_table_are_named(tmp_path: Path, fault: str) -> None:
+    text, message = FAULTS[fault]
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ValueError, match=f"a.csv cannot be .*{message}"):
+        open_field(tmp_path / "a.csv")
+
+
+def test_an_empty_file_and_a_folder_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b"")
+    with pytest.raises(ValueError, match="a.csv is empty: it holds no bytes"):
+        open_field(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match=r"a folder that ends in .zarr: .* is a folder"):
+        open_field(tmp_path)
+
+
+def test_a_binary_file_named_csv_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(np.linspace(0, 1, 100).tobytes())
+    with pytest.raises(ValueError, match=r"bytes that are no text"):
+        open_field(tmp_path / "a.csv")
+
+
+def test_a_unit_in_the_header_must_agree_with_the_mapping(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t (us),n (cm^-3)\n" + rows(1e6 * T, 1e12 * X))
+    with pytest.raises(ValueError, match=r"(?s)2 things .*the file 'cm\^-3'.*the file 'us'"):
+        open_field(
+            tmp_path / "a.csv",
+            variables={"n_i": Variable("n", "m^-3")},
+            time=Variable("t", "s"),
+        )
