@@ -29,7 +29,7 @@ def test_a_first_step_that_overflows_along_data_is_a_verdict() -> None:
     data = ep.Trajectory(
         t=np.arange(4.0), states=np.array([[1e40], [2e40], [3e40], [1e40]]), state_names=["x"]
     )
-    found = model({"x": {"x^2": 1e240}})
+    found = model({"x": {"x^2": 1e290}})
     assert found.rollout(data).message.startswith("the first step overflows")
 
 

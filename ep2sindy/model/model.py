@@ -238,8 +238,8 @@ class SparseModel:
         return "\n".join(model_lines(self))
 
     def __repr__(self) -> str:
-        n_terms = int(np.count_nonzero(self.coef))
-        head = f"SparseModel of {len(self.states)} equations, {n_terms} terms"
+        n = np.count_nonzero(self.coef)
+        head = f"SparseModel of {len(self.states)} equations, {n} terms"
         return "\n".join([head, *model_lines(self, n_lines=N_LINES - 1)])
 
     def _repr_html_(self) -> str:
@@ -296,6 +296,6 @@ def coef_matrix(
 def model_of(
     library: Library, equations: Mapping[str, Mapping[str, float]], **rest: Any
 ) -> SparseModel:
-    """A model from its coefficients by state and term name, and the rest of its fields."""
+    """A model from its coefficients by state and term; rest: its other fields."""
     coef = coef_matrix(library, list(equations.values()))
     return SparseModel(library, list(equations), coef, **rest)

@@ -56,11 +56,11 @@ class FieldSource:
         return [self.data.changed({"path": file}) for file in files]
 
     def _prepared(self, data: Deferred) -> xr.Dataset:
+        """What the data say of themselves stays: a step's arithmetic drops it, and a run that
+        diverged would be silent."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtfulUnit)  # said of the data that are used
             field: xr.Dataset = data.build()
-        # What the data say of themselves stays, whatever a step makes of them: arithmetic of
-        # xarray drops it, and a run that diverged would be silent.
         check_recorded(field)
         said = dict(field.attrs)
         for step in self.prepare:
