@@ -36,7 +36,7 @@ class Trajectory:
     units: name -> unit for any of the variables; a missing one reads "1".
     clock: the unit that people read its times in; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are
-    not finite (what is masked, too), not real numbers or of a size beyond 1e-50 to 1e50, repeated
+    not finite (what is masked, too), not real numbers or of a size below 1e-50, repeated
     names, fewer than two samples, or a state that never changes.
 
     >>> t = np.linspace(0.0, 1e-3, 101)

@@ -24,13 +24,14 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(".cache/attack"))
     asked = parser.parse_args()
     folder = asked.folder.absolute() / f"seed{asked.seed}"
-    work = folder / "work"
-    work.mkdir(parents=True, exist_ok=True)
+    places = [folder / name for name in ("files", "kills", "writes")]
+    for place in places:
+        place.mkdir(parents=True, exist_ok=True)
     found = {}
     for title, cases, attack in (
-        ("mutated files", files.cases(asked.files), files.attack(work, asked.seed)),
-        ("killed runs", map(str, range(asked.kills)), runs.kill(work, asked.seed)),
-        ("failing writes", map(str, range(1, asked.writes + 1)), runs.fail(work)),
+        ("mutated files", files.cases(asked.files), files.attack(places[0], asked.seed)),
+        ("killed runs", map(str, range(asked.kills)), runs.kill(places[1], asked.seed)),
+        ("failing writes", map(str, range(1, asked.writes + 1)), runs.fail(places[2])),
     ):
         found[title] = attacked(folder / f"{title.replace(' ', '_')}.jsonl", cases, attack)
     print("| attack | what became of it | cases |\n|---|---|---|")
