@@ -278,8 +278,8 @@ class SparseModel:
     @cached_property
     def _gather(self) -> np.ndarray:
         """Where each variable of the library stands among states, then inputs."""
-        known = [*self.states, *self.inputs]
-        return np.array([known.index(v) for v in self.library.variables], dtype=np.int64)
+        known = (*self.states, *self.inputs)
+        return np.array(list(map(known.index, self.library.variables)), dtype=np.int64)
 
 
 def coef_matrix(
@@ -288,8 +288,7 @@ def coef_matrix(
     """Coefficients by term name, as a matrix over the library."""
     coef = np.zeros((len(library), len(equations)))
     for k, terms in enumerate(equations):
-        for name, value in terms.items():
-            coef[library.index(name), k] = value
+        coef[[library.index(name) for name in terms], k] = list(terms.values())
     return coef
 
 
@@ -297,5 +296,5 @@ def model_of(
     library: Library, equations: Mapping[str, Mapping[str, float]], **rest: Any
 ) -> SparseModel:
     """A model from its coefficients by state and term; rest: its other fields."""
-    coef = coef_matrix(library, list(equations.values()))
-    return SparseModel(library, list(equations), coef, **rest)
+    values = list(equations.values())
+    return SparseModel(library, list(equations), coef_matrix(library, values), **rest)
