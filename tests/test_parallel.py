@@ -182,7 +182,12 @@ def test_workers_end_with_their_run(tmp_path: Path, name: str) -> None:
     script = tmp_path / "run.py"
     script.write_text(KILLED)
     with subprocess.Popen(
-        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        [sys.executable, script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        # nohup, under which tests may run, has SIGHUP ignored, and that is inherited.
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
     ) as run:
         assert run.stdout is not None
         workers = [int(run.stdout.readline()) for _ in range(2)]

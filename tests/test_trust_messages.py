@@ -44,6 +44,10 @@ def test_units_are_read_as_people_write_them(text: str, factor: float, unit: str
     assert conversion("x", text)[::2] == (pytest.approx(factor, rel=1e-12), unit)
 
 
+# Made by a helper, or errors that have words of their own.
+OWN_WORDS = ("_", "WriteError", "KeyboardInterrupt")
+
+
 def raises() -> list[tuple[str, ast.Raise, ast.expr]]:
     """Every `raise` of an error, with its place."""
     return [
@@ -77,7 +81,7 @@ def test_no_error_comes_without_words() -> None:
             assert error.id[0].islower(), f"{place}: an error without a message"
             continue
         assert isinstance(error, ast.Call), place
-        if isinstance(error.func, ast.Name) and error.func.id.startswith(("_", "WriteError")):
-            continue  # made by a helper, or of a kind that has words of its own
+        if isinstance(error.func, ast.Name) and error.func.id.startswith(OWN_WORDS):
+            continue
         message = error.args[0] if error.args else ast.Constant(None)
         assert has_words(message) or passes_on(node, message), f"{place}: {ast.unparse(error)}"

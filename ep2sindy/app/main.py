@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ep2sindy.app.typed_only import use_checked_loader
+from ep2sindy.app.typed_only import checked_loader
 from ep2sindy.machine.interruption import end_as_interrupted
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -48,7 +48,6 @@ def main() -> None:
             inspect_files(sys.argv[2:], conf)
             return
         prepare_arguments(conf)
-        use_checked_loader()
 
         @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")
         def job(config: DictConfig) -> None:
@@ -56,7 +55,8 @@ def main() -> None:
                 sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
             failed.extend(run_job(config, conf))
 
-        job()
+        with checked_loader():
+            job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
         sys.exit(f"error: {error or type(error).__name__}")
     except OSError as error:

@@ -8,6 +8,7 @@ schedulers, whose answers are trusted, are typed as well.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +46,15 @@ class CheckedLoader(ConfigLoaderImpl):
         return found
 
 
-def use_checked_loader() -> None:
-    """From here on the program composes no config that has not been checked."""
+@contextmanager
+def checked_loader() -> Iterator[None]:
+    """Within, Hydra's program composes no config that has not been checked."""
+    before = program.ConfigLoaderImpl
     program.ConfigLoaderImpl = CheckedLoader  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        program.ConfigLoaderImpl = before  # type: ignore[misc]
 
 
 def check_hydra(found: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
