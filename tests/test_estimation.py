@@ -465,6 +465,11 @@ def test_a_recipe_is_a_regression_where_something_of_one_is_asked_for() -> None:
     assert isinstance(ep.Recipe(selection=ep.FreeRunScore()).search, ep.BestSubset)
 
 
+def test_bootstraps_are_refused_where_there_are_no_rows() -> None:
+    with pytest.raises(ValueError, match=r"draws no bootstraps: .*bootstraps=none"):
+        ep.Recipe(search=ep.Joint(), bootstraps=ep.Bootstraps(n=2))
+
+
 def test_evidence_is_refused_for_fronts_of_rows() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     with pytest.raises(ValueError, match="Evidence weighs what a joint search found"):

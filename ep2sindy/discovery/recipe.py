@@ -108,7 +108,7 @@ class Recipe:
     formulation: None means WeightedWeak(). search: None means Joint(), or BestSubset() for a
     regression. bootstraps: None means none. selection: None means Evidence(), or EBIC() for one.
     depth: candidates kept per size: 3 lets a true support win that noise has put second or third.
-    Raises ValueError for a rule that does not go with the search.
+    Raises ValueError for a rule or bootstraps that do not go with the search.
 
     >>> thesis = ep.Recipe(ep.Differential(), ep.AdaptiveLasso(), ep.Bootstraps(), ep.Knee())
     >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
@@ -146,6 +146,11 @@ class Recipe:
                 "be Evidence() (selection=evidence), or a rule that runs models, such as "
                 f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, "
                 "such as BestSubset() (search=best_subset)"
+            )
+        if joint and self.bootstraps.n:
+            raise ValueError(
+                f"a joint search draws no bootstraps: {self.bootstraps!r} came; take "
+                "Bootstraps(n=0) (bootstraps=none), or a regression"
             )
         if type(self.depth) is not int or self.depth < 1:
             raise ValueError(f"depth must be a whole number, one or more: {self.depth!r} came")

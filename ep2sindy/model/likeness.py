@@ -133,8 +133,7 @@ class Record:
         middle = len(states) // 2
         if (states[middle:].std(axis=0) < DEAD * self.states[middle:].std(axis=0)).all():
             return Likeness(Verdict.DIES_OUT, np.nan, spectrum, by_state)
-        # What does not repeat itself is alike by its statistics alone.
-        if (self.cycle is None or self.cycle.share < REPEATS) and self._is_alike(states, bounds):
+        if not self._repeats and self._is_alike(by_state["distribution"], spectrum, bounds):
             return Likeness(Verdict.LIVES, np.nan, spectrum, by_state)
         if self.cycle is None:
             return Likeness(Verdict.WRONG_CYCLE, np.nan, spectrum, by_state)
@@ -146,9 +145,14 @@ class Record:
         return Likeness(verdict, f_error, spectrum, by_state)
 
     @property
+    def _repeats(self) -> bool:
+        """Whether it is one cycle over and over; what is not is alike by its statistics alone."""
+        return self.cycle is not None and self.cycle.share >= REPEATS
+
+    @property
     def _is_long(self) -> bool:
         """Whether half of it holds enough periods to compare."""
-        return self.cycle is not None and self.cycle.n_periods >= LONG
+        return self._repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
     def _with_period(
         self, f_error: float, amplitude: np.ndarray, waveform: np.ndarray, bounds: Bounds
@@ -157,15 +161,12 @@ class Record:
             return Verdict.WRONG_CYCLE
         return Verdict.LIVES if abs(f_error) <= bounds.frequency else Verdict.SLIPS
 
-    def _is_alike(self, states: np.ndarray, bounds: Bounds) -> bool:
-        """Whether a run is as near to the record as its quarters are to each other, about."""
+    def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: Bounds) -> bool:
+        """Whether a run is about as near to the record as its quarters are to each other."""
         apart, apart_spectrum = statistics_wander(self.t, self.states)
-        distribution = distribution_distances(self.states, states)
-        near = distribution <= np.maximum(bounds.distribution, apart)
-        spectrum = spectrum_distance(self.t, self.states, states)
-        return bool(
-            near.all() and spectrum <= max(bounds.spectrum, SPECTRUM_WANDERS * apart_spectrum)
-        )
+        near = (distribution <= np.maximum(bounds.distribution, apart)).all()
+        alike = spectrum <= max(bounds.spectrum, SPECTRUM_WANDERS * apart_spectrum)
+        return bool(near and alike)
 
 
 def record_of(run: Trajectory, states: Sequence[str]) -> Record:

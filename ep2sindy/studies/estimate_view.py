@@ -16,12 +16,17 @@ NOISE = (
     "from one sample to the next, 0 for white noise."
 )
 
+FITS = (
+    "The model explains the samples as far as their noise: what is left looks like noise, and "
+    "an exact trajectory is likelier than one that leaves the model."
+)
+
 
 def estimate_section(name: str, found: Estimate, data: Trajectory) -> Section:
     """What the samples say of their noise, whether the model explains them, and what else may."""
     blocks: list[Block] = [
         Table(noise_table(found, data), title="noise of the samples", note=NOISE),
-        Text(found.misfit or _fit(found), warning=bool(found.misfit)),
+        Text(found.misfit or FITS, warning=bool(found.misfit)),
     ]
     if found.few:
         blocks.append(Text(found.few, warning=True))
@@ -35,13 +40,6 @@ def estimate_section(name: str, found: Estimate, data: Trajectory) -> Section:
     elif not found.misfit:
         blocks.append(Text("No other support of an equation has odds above 1:1000."))
     return Section(f"{name}: what the samples say", blocks, level=3)
-
-
-def _fit(found: Estimate) -> str:
-    return (
-        "The model explains the samples as far as their noise: what is left looks like noise, and "
-        "an exact trajectory is likelier than one that leaves the model."
-    )
 
 
 def noise_table(found: Estimate, data: Trajectory) -> pd.DataFrame:

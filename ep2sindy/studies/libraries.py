@@ -109,6 +109,9 @@ class Study:
             )
             for (name, library), rng in zip(libraries.items(), streams, strict=True)
         }
+        for name, result in results.items():
+            if result.discovery.misfit:
+                run.warn(f"{name}: {result.discovery.misfit}")
         files = [str(field.attrs.get("file", "")) for field in opened]
         return Outcome(data, results, self.figures, files)
 
