@@ -67,6 +67,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.estimation.estimate import Estimate as Estimate
     from ep2sindy.estimation.estimate import estimate as estimate
     from ep2sindy.estimation.joint import Joint as Joint
+    from ep2sindy.estimation.size import SlowSearch as SlowSearch
     from ep2sindy.library.equations import equation_text as equation_text
     from ep2sindy.library.functions import register_function as register_function
     from ep2sindy.library.library import Library as Library
@@ -238,6 +239,7 @@ _FACE = {
     "discovery.shared_support": "JointDiscovery discover_jointly",
     "estimation.estimate": "Estimate estimate",
     "estimation.joint": "Joint",
+    "estimation.size": "SlowSearch",
     "library.equations": "equation_text",
     "library.functions": "register_function",
     "library.library": "Library polynomial named_terms",

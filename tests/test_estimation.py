@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,11 +12,13 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy.constraints.relations import parse_relation
+from ep2sindy.estimation import size
 from ep2sindy.estimation.kernels import departures, eliminated
 from ep2sindy.estimation.likelihood import Fit, Gram, Level, fitted, gram, squares
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import Problem, scaled_problem
 from ep2sindy.estimation.supports import alternatives, best_support, priced, term_prices
+from ep2sindy.machine import memory
 
 
 @pytest.fixture
@@ -507,3 +510,33 @@ def test_noise_that_the_model_leaves_is_measured_by_state() -> None:
         noise.std * problem.scale, (run.states - clean * problem.scale).std(axis=0), rtol=0.05
     )
     assert not noise.memory.any()
+
+
+def many_states(n_states: int) -> ep.Trajectory:
+    t = np.linspace(0.0, 20.0, 400)
+    states = np.stack([np.sin((1.0 + 0.1 * k) * t) for k in range(n_states)], axis=1)
+    return ep.Trajectory(t, states, [f"x{k}" for k in range(n_states)])
+
+
+def test_more_coefficients_than_memory_holds_are_refused_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(memory, "free_bytes", lambda: 5 * 10**8)
+    run = many_states(10)
+    library = ep.polynomial(run.state_names, degree=3)
+    said = r"2860 coefficients \(286 terms, 10 states\) .* 400 samples would take 0.628 GB.*fewer terms"
+    monkeypatch.setattr(size, "NUMBERS", 4.0)
+    with pytest.raises(ValueError, match=said):
+        ep.estimate([run], library)
+    run_of_known_terms = {name: ["x0", "x1"] for name in run.state_names}
+    size.check_size([run], library, run_of_known_terms)
+
+
+def test_a_long_search_is_told_of() -> None:
+    run = many_states(7)
+    small, large = (ep.polynomial(run.state_names, degree=degree) for degree in (2, 3))
+    with pytest.warns(ep.SlowSearch, match=r"840 coefficients .* takes minutes"):
+        size.check_size([run], large, {})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        size.check_size([run], small, {})

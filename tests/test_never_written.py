@@ -1,5 +1,6 @@
 """Numbers that a file packs, marks as missing, or never got: none is taken for a sample."""
 
+import struct
 from pathlib import Path
 
 import h5py
@@ -44,6 +45,28 @@ def test_chunks_that_hdf5_never_got_are_missing(tmp_path: Path) -> None:
         file["t"] = T
         file.create_dataset("n", (6,), chunks=(2,), dtype="i4")[:4] = [1, 0, 3, 4]
     np.testing.assert_array_equal(values(tmp_path / "a.h5"), [1, 0, 3, 4, np.nan, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("key", "damaged", "said"),
+    [
+        ((4, 0), (2, 0), "two of its chunks stand for the same"),
+        ((6, 8), (4, 0), "does not lead to .4,."),  # where the last chunk ends
+    ],
+)
+def test_a_damaged_index_of_chunks_is_no_missing_sample(
+    tmp_path: Path, key: tuple[int, int], damaged: tuple[int, int], said: str
+) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["t"] = T
+        file.create_dataset("n", data=np.arange(6.0), chunks=(2,))
+    sound = path.read_bytes()
+    before, after = struct.pack("<QQ", *key), struct.pack("<QQ", *damaged)
+    assert sound.count(before) == 1
+    path.write_bytes(sound.replace(before, after))
+    with pytest.raises(ValueError, match=f"'/n' is damaged: .*{said}"):
+        values(path)
 
 
 @pytest.mark.parametrize("chunks", [None, (2,)])

@@ -14,6 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.joint import SAMPLES_PER_TERM, Joint, Solution, enough_samples, solve
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.problem import Problem, scaled_problem
+from ep2sindy.estimation.size import check_size
 from ep2sindy.estimation.supports import priced, supports_by_size
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
@@ -99,6 +100,7 @@ def estimate(
     """
     search = search or Joint()
     check_runs(runs, library)
+    check_size(runs, library, terms or {})
     problem = scaled_problem(runs, library, relations, terms)
     found = solve(problem, max_terms=search.terms_for(problem))
     fit, level = found.annealed.fit, found.annealed.level

@@ -11,7 +11,7 @@ from pathlib import Path
 from tests.attack import files, runs
 from tests.attack.results import attacked, table
 
-GOOD = {"same", "different", "refused", "whole", "ended before", "refused with path",
+GOOD = {"same values", "other values", "refused", "whole", "ended before", "refused with path",
         "fewer writes", "went on"}  # fmt: skip
 
 

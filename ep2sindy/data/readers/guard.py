@@ -20,25 +20,25 @@ SPEED = 1e7  # bytes per s
 _LOCK = Lock()
 
 
-def look_through_first(path: Path) -> None:
+def look_through_first(path: Path, reader: str) -> None:
     """Raise ValueError for a file that cannot be read to its end, or that the library dies of.
 
-    The process is started once and kept. A file that was sound is not looked at again until it
-    changes.
+    reader: the name of the one that will read it. The process is started once and kept. A file that
+    was sound is not looked at again until it changes.
     """
     stat = path.stat()
-    if said := _verdict(path.absolute(), stat.st_size, stat.st_mtime_ns):
+    if said := _verdict(path.absolute(), reader, stat.st_size, stat.st_mtime_ns):
         raise ValueError(f"a file must be readable to its end: {said}")
 
 
 @cache
-def _verdict(path: Path, size: int, changed_ns: int) -> str:
+def _verdict(path: Path, reader: str, size: int, changed_ns: int) -> str:
     with _LOCK:
         prober = _prober(os.getpid())
         patience_s = PATIENCE_S + size_of(path) / SPEED
         assert prober.stdin is not None
         assert prober.stdout is not None
-        prober.stdin.write(json.dumps(str(path)).encode() + b"\n")
+        prober.stdin.write(json.dumps([str(path), reader]).encode() + b"\n")
         prober.stdin.flush()
         answered = _answers(prober, patience_s)
         line = prober.stdout.readline() if answered else b""

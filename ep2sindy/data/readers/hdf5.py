@@ -80,8 +80,8 @@ def holes_of(found: h5py.Dataset) -> list[tuple[slice, ...]]:
     counts = [ceil(n / step) for n, step in zip(found.shape, found.chunks, strict=True)]
     if found.id.get_num_chunks() == np.prod(counts, dtype=object):
         return []
-    places = range(found.id.get_num_chunks())
-    there = {found.id.get_chunk_info(k).chunk_offset for k in places}
+    there: set[tuple[int, ...]] = set()
+    found.id.chunk_iter(lambda chunk: there.add(chunk.chunk_offset))
     starts = product(*(range(0, n, s) for n, s in zip(found.shape, found.chunks, strict=True)))
     return [
         tuple(slice(a, a + step) for a, step in zip(start, found.chunks, strict=True))

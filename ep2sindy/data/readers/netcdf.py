@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.cdf5 import end_of_cdf5
+from ep2sindy.data.readers.classic import check_places
 from ep2sindy.data.readers.hdf5 import holes_of
 from ep2sindy.data.readers.source import UNDECODED, Reader, Source, dataset_source
 
@@ -26,14 +26,14 @@ FILLS = {
 def read_netcdf(path: Path) -> Source:
     """NetCDF 3 and 4, read when asked for; samples that were never written are NaN.
 
-    Raises ValueError for a classic file of 64-bit sizes that is shorter than its header says.
+    Raises ValueError for a classic file whose header does not fit it.
     """
     with path.open("rb") as file:
         head = file.read(4)
     # The netCDF library fills what a cut classic file lacks with zeros; SciPy raises.
     engine: Literal["scipy", "netcdf4"] = "scipy" if head in (b"CDF\x01", b"CDF\x02") else "netcdf4"
-    if head == b"CDF\x05":
-        _check_length(path)
+    if head.startswith(b"CDF"):
+        check_places(path)
     dataset = xr.open_dataset(path, engine=engine, decode_cf=False)
     for variable in dataset.variables.values():
         kind = variable.dtype.str[1:]
@@ -41,12 +41,6 @@ def read_netcdf(path: Path) -> Source:
             variable.attrs["_FillValue"] = variable.dtype.type(FILLS[kind])
     source = dataset_source(path, xr.decode_cf(dataset, decode_coords=False, **UNDECODED))
     return source if head.startswith(b"CDF") else _without_holes(source, _with_holes(path))
-
-
-def _check_length(path: Path) -> None:
-    end, size = end_of_cdf5(path), path.stat().st_size
-    if size < end:
-        raise ValueError(f"its header describes {end} bytes, and it has {size}")
 
 
 def _with_holes(path: Path) -> frozenset[str]:

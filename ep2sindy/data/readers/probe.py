@@ -1,7 +1,7 @@
 """The process that looks through a file first, for libraries in C may die of a damaged one.
 
-Run as `python -m ep2sindy.data.readers.probe`: a path a line comes in as JSON, and "" or what is
-wrong with the file goes out. It ends when its input does.
+Run as `python -m ep2sindy.data.readers.probe`: a path and the name of its reader come in as JSON,
+one line for each file, and "" or what is wrong with the file goes out. It ends when its input does.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ READ_THROUGH = 2**30  # bytes of an array that are all read; of a longer one its
 MEMORY = 2**31  # bytes of address space beyond twenty times the file
 
 
-def look_through(path: Path) -> None:
+def look_through(path: Path, reader: str) -> None:
     """Read all that a file holds, as its reader would; raises what is wrong with it."""
     with path.open("rb") as file:
         head = file.read(10)
     if head.startswith(b"MATLAB 5.0"):
         _matlab(path)
-    elif head.startswith(b"CDF"):
-        _netcdf(path)
-    else:
+    elif not head.startswith(b"CDF"):
         _hdf5(path)
+    if reader == "NetCDF":
+        _netcdf(path)
 
 
 def _matlab(path: Path) -> None:
@@ -47,8 +47,11 @@ def _netcdf(path: Path) -> None:
 
     with netCDF4.Dataset(path) as file:
         for name, found in file.variables.items():
-            check_declared(repr(name), found.size * found.dtype.itemsize, path)
-            found[...]
+            for attribute in found.ncattrs():
+                found.getncattr(attribute)
+            if not file.data_model.startswith("NETCDF4"):  # else HDF5 has read the values
+                check_declared(repr(name), found.size * found.dtype.itemsize, path)
+                found[...]
 
 
 def _hdf5(path: Path) -> None:
@@ -97,6 +100,23 @@ def _array(found: Any, path: Path) -> None:
     whole = found.size * found.dtype.itemsize <= READ_THROUGH
     for start in starts if whole else {0, starts[-1]}:
         found[start : start + rows]
+    if found.chunks and whole:
+        _chunks(found)
+
+
+def _chunks(found: Any) -> None:
+    """What the index lists must be found by it, or values read as if nobody had written them."""
+    places: list[tuple[int, ...]] = []
+    found.id.chunk_iter(lambda chunk: places.append(chunk.chunk_offset))
+    if len(set(places)) < len(places):
+        raise ValueError(f"{found.name!r} is damaged: two of its chunks stand for the same values")
+    for place in places:
+        try:
+            found.id.read_direct_chunk(place)
+        except (OSError, RuntimeError) as error:
+            raise ValueError(
+                f"{found.name!r} is damaged: the index of its chunks does not lead to {place}"
+            ) from error
 
 
 def _limit(path: Path) -> None:
@@ -113,10 +133,11 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     for line in sys.stdin:
-        path = Path(json.loads(line))
+        name, reader = json.loads(line)
+        path = Path(name)
         try:
             _limit(path)
-            look_through(path)
+            look_through(path, reader)
             said = ""
         except Exception as error:  # any: it goes to the one who asked
             said = str(error).strip() or type(error).__name__

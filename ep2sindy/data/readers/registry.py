@@ -30,7 +30,7 @@ def open_source(path: Path) -> Source:
     look = look_at(path)
     with damage_named(path):
         if look.form == "hdf5" or look.head.startswith(IN_C):
-            look_through_first(path)
+            look_through_first(path, reader.name)
         return reader.open(path)
 
 
