@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -125,9 +126,10 @@ def _said_to_hydra() -> dict[str, Case]:
     }
     found = {}
     for place, text in below.items():
-        said = config(f"hydra: {{{text}}}", "hydra")
+        # Hydra asks for the mode, hears of the refusal, and takes the one that is typed.
+        said = config(f"hydra: {{{text}}}", "hydra", may_pass=place == "mode")
         found[f"hydra.{place}"] = said
-        found[f"hydra.{place} in a sweep"] = Case(["-m", *said.arguments], said.files, "hydra")
+        found[f"hydra.{place} in a sweep"] = replace(said, arguments=["-m", *said.arguments])
     toy = {"conf/exp/toy.yaml": TOY}
     for group, kind in (("launcher", "BasicLauncher"), ("sweeper", "BasicSweeper")):
         module = f"basic_{group}.{kind}"
