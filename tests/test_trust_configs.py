@@ -6,6 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 from test_face import targets
 
@@ -14,6 +17,7 @@ from ep2sindy.app.build import call_of
 from ep2sindy.app.defaults import defaults_of, plain
 from ep2sindy.app.runner import run_config, study_class
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
+from ep2sindy.app.typed_only import CheckedLoader, check_places, resolved
 from ep2sindy.studies.functions import registered
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -123,6 +127,11 @@ ELSEWHERE = [
     ({"hydra": {"job": {"env_set": {"PATH": "."}}}}, "must not set hydra.job.env_set.PATH"),
     ({"hydra": {"launcher": {"_target_": "os.abort"}}}, "must not set hydra.launcher._target_"),
     ({"hydra": {"sweeper": {"params": {"seed": "0,1"}}}}, "must not set hydra.sweeper.params.seed"),
+    ({"hydra": {"mode": "MULTIRUN"}}, "must not set hydra.mode"),
+    ({"hydra": {"overrides": {"hydra": ["output=/x"]}}}, "must not set hydra.overrides.hydra"),
+    ({"hydra": {"overrides": {"task": ["output=/x"]}}}, "must not set hydra.overrides.task"),
+    ({"scan": {"cache": ["/elsewhere"]}}, "scan.cache to a folder below"),
+    ({"output": "a\0b"}, "output to a folder below"),
     ({"output": "../elsewhere"}, "output to a folder below the one that you start in"),
     ({"output": "${oc.env:PATH}"}, "output to a folder below"),
     ({"data": {"cache": "/elsewhere"}}, "data.cache to a folder below"),
@@ -135,23 +144,62 @@ def test_a_file_cannot_say_what_must_be_typed(
     said: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through Hydra's own door, in this process: what it would do with the config comes later."""
-    from hydra._internal.utils import create_config_search_path
-    from hydra.core.config_search_path import SearchPathQuery
-    from hydra.types import RunMode
-
-    from ep2sindy.app.typed_only import CheckedLoader
-
     (tmp_path / "exp").mkdir()
     text = "# @package _global_\ndefaults: [discover, _self_]\n" + OmegaConf.to_yaml(said)
     (tmp_path / "exp" / "theirs.yaml").write_text(text)
     monkeypatch.chdir(tmp_path)
-    path = create_config_search_path(str(ROOT / "conf"))
-    path.prepend("command-line", f"file://{tmp_path}", SearchPathQuery(provider="schema"))
-    loader = CheckedLoader(path)
+    loader = loader_of(tmp_path)
     assert loader.load_configuration("config", ["+exp=discover"], RunMode.RUN).seed == 0
     for mode in (RunMode.RUN, RunMode.MULTIRUN):
         with pytest.raises(ValueError, match=message):
             loader.load_configuration("config", ["+exp=theirs"], mode)
+
+
+def loader_of(folder: Path) -> CheckedLoader:
+    """As the program has it with the configs of a folder."""
+    path = create_config_search_path(str(ROOT / "conf"))
+    path.prepend("command-line", f"file://{folder}", SearchPathQuery(provider="schema"))
+    return CheckedLoader(path)
+
+
+@pytest.mark.filterwarnings("ignore:.*validated against ConfigStore")
+def test_a_folder_cannot_hide_what_hydra_itself_says(tmp_path: Path) -> None:
+    """A file of the name of Hydra's own sweeper would add to what is typed."""
+    file = tmp_path / "hydra" / "sweeper" / "basic.yaml"
+    file.parent.mkdir(parents=True)
+    kind = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+    file.write_text(f"_target_: {kind}\nmax_batch_size: null\nparams: {{output: ../elsewhere}}\n")
+    for mode in (RunMode.RUN, RunMode.MULTIRUN):
+        with pytest.raises(ValueError, match=r"must not set hydra\.sweeper\.params"):
+            loader_of(tmp_path).load_configuration("config", ["+exp=discover"], mode)
+
+
+BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
+TOO_MUCH = [
+    (BOMB, r"may hold up to 100000 values: with its anchors written out it has"),
+    ("a: &a {b: *a}", "may hold up to 100000 values"),
+    ("a: " + "[" * 3000 + "]" * 3000, "must not be nested"),
+    ("seed: 1" + "0" * 5000, "Exceeds the limit"),
+    ("null: 2", "Incompatible key type"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), TOO_MUCH, ids=lambda v: v[:9])
+def test_a_file_that_asks_for_too_much_is_refused_by_name(
+    text: str, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / "exp").mkdir()
+    (tmp_path / "exp" / "theirs.yaml").write_text(text)
+    with pytest.raises(ValueError, match=rf"theirs\.yaml:? {message}"):
+        loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
+
+
+def test_text_that_becomes_a_group_is_looked_at_as_one(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = {"data": "${oc.create:'{_target_: ep2sindy.simulate_cached, cache: ../elsewhere}'}"}
+    with pytest.raises(ValueError, match=r"data\.cache to a folder below"):
+        check_places(resolved(OmegaConf.create(said)), [])
+    check_places(resolved(OmegaConf.create(said)), ["data.cache=../elsewhere"])
 
 
 def test_what_is_typed_is_the_users_own_wish(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """A Zarr store from someone else: nothing but numbers is decoded."""
 
 import json
+import os
 from importlib.metadata import requires
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,24 @@ def test_objects_are_refused_wherever_a_type_names_them(kind: Any, tmp_path: Pat
     path = store(tmp_path / "a.zarr", 2)
     changed(path, "time", dtype=kind)
     with pytest.raises(ValueError, match="whose objects may run code when they are read"):
+        opened(path)
+
+
+def test_what_is_no_file_in_a_store_is_refused(tmp_path: Path) -> None:
+    """A pipe would be waited for, and a link leads to what is somebody else's."""
+    pipe, link = store(tmp_path / "a.zarr", 2), store(tmp_path / "b.zarr", 2)
+    os.mkfifo(pipe / "I" / "pipe")
+    (link / "I" / "1").symlink_to("/dev/zero")
+    for path in (pipe, link):
+        with pytest.raises(ValueError, match="is a link, a pipe or a device"):
+            opened(path)
+
+
+@pytest.mark.parametrize("changes", [{"shape": [-5]}, {"chunks": [0]}, {"shape": ["5"]}])
+def test_sizes_that_are_none_are_refused(changes: dict[str, Any], tmp_path: Path) -> None:
+    path = store(tmp_path / "a.zarr", 2)
+    changed(path, "I", **changes)
+    with pytest.raises(ValueError, match="a.zarr cannot be read"):
         opened(path)
 
 

@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ep2sindy.app.typed_only import checked_loader
+from ep2sindy.app.typed_only import check_places, checked_loader, resolved
 from ep2sindy.machine.interruption import end_as_interrupted
 from ep2sindy.machine.threads import start_on_one_thread
 
@@ -60,7 +60,7 @@ def main() -> None:
         with checked_loader():
             job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
-        sys.exit(f"error: {error or type(error).__name__}")
+        sys.exit(f"error: {str(error) or type(error).__name__}")
     except OSError as error:
         sys.exit(f"error: {error}; a folder that can be written is chosen with output=PATH")
     except KeyboardInterrupt:
@@ -115,7 +115,9 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
                 )
             from ep2sindy.app.runner import run_config
 
-            finished = run_config(config, overrides=HydraConfig.get().overrides.task)
+            typed = HydraConfig.get().overrides.task
+            check_places(resolved(config), typed)
+            finished = run_config(config, overrides=typed)
         except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
             ended_early(error)
             return [str(error)]

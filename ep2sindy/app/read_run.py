@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
+from ep2sindy.app.yaml_files import check_yaml
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
+
+# What a page is made of.
+SUMMARY = {"experiment": str, "seed": int, "headline": dict, "warnings": list, "data": dict}
+PROVENANCE = {"commit": str, "versions": dict}
+REQUIRED = {"experiment", "seed"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,24 +63,49 @@ def read_run(folder: Path, number: int) -> ReadRun:
     if not (folder / "summary.json").is_file():
         said = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
         raise ValueError(f"{folder} has no summary.json: {said}; {_nearby(folder)}")
-    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
     paths = sorted((folder / "models").glob("[!.]*.json"))
     return ReadRun(
         folder=folder,
         label=chr(ord("A") + number),
-        summary=_json(folder / "summary.json"),
-        provenance=_json(folder / "provenance.json"),
-        settings={k: v for key, each in config.items() for k, v in by_place(key, each).items()},
+        summary=_checked(folder / "summary.json", SUMMARY),
+        provenance=_checked(folder / "provenance.json", PROVENANCE),
+        settings=_settings(folder / "config.yaml"),
         models={path.stem: SparseModel.load(path) for path in paths},
     )
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        found: dict[str, Any] = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read ({error}): the run's folder is damaged") from error
+def _checked(path: Path, kinds: Mapping[str, Any]) -> dict[str, Any]:
+    """An object of JSON whose keys hold what a page makes of them."""
+    with _damage_named(path):
+        found = json.loads(path.read_text("utf-8"))
+        if not isinstance(found, dict) or not REQUIRED & {*kinds} <= {*found}:
+            raise ValueError(f"an object with {sorted(REQUIRED & {*kinds})} must stand there")
+        for name, kind in kinds.items():
+            if not isinstance(found.setdefault(name, kind()), kind):
+                raise ValueError(f"{name} cannot be {found[name]!r:.80}")
+        figures = found.get("headline", {})
+        if not all(isinstance(each, int | float | None) for each in figures.values()):
+            raise ValueError(f"headline must be of numbers: {figures!r:.80} came")
+        Clock.of(found.get("data", {}).get("time_unit", "s"))
     return found
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    """By dotted place."""
+    with _damage_named(path):
+        check_yaml(path)
+        config: Any = OmegaConf.to_container(OmegaConf.load(path))
+        if not isinstance(config, dict):
+            raise ValueError("a mapping must stand there")
+        return {k: v for key, each in config.items() for k, v in by_place(str(key), each).items()}
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, RecursionError, OmegaConfBaseException, YAMLError) as error:
+        raise ValueError(f"{path} cannot be read ({error}): the run's folder is damaged") from error
 
 
 def _nearby(folder: Path) -> str:

@@ -91,7 +91,9 @@ def known_studies() -> list[str]:
 
 
 def check_common(config: DictConfig) -> None:
-    """Raise ValueError for a seed or a name that cannot be."""
+    """Raise ValueError for a seed, a name or a folder that cannot be."""
+    if not isinstance(config.output, str) or not config.output:
+        raise ValueError(f"output must be a folder's name: {config.output!r} came")
     if not isinstance(config.seed, int) or isinstance(config.seed, bool) or config.seed < 0:
         raise ValueError(f"seed must be a whole number, zero or more: {config.seed!r} came")
     if not str(config.experiment).isidentifier():

@@ -7,20 +7,26 @@ schedulers, whose answers are trusted, are typed as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import hydra._internal.hydra as program
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ep2sindy.app.yaml_files import CheckedFiles
 
 FOLDERS = ("output", "keep", "cache")  # keys, at any depth, of what a run writes to
 SERVERS = ("address",)
-# What Hydra itself notes of a run.
-NOTED = ("runtime", "overrides", "mode", "job.override_dirname", "job.num", "job.id")
+# What Hydra itself notes of a run, and nobody obeys.
+NOTED = ("runtime.choices", "runtime.config_sources", "job.override_dirname")
 # What nobody may set, for it names what is called or made.
 SILENT = {"version": 1, "root": {"level": "ERROR"}, "disable_existing_loggers": True}
 FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_logging": SILENT}
@@ -28,6 +34,10 @@ FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_loggi
 
 class CheckedLoader(ConfigLoaderImpl):
     """Hydra's loader of configs, which looks at each before anything of it is obeyed."""
+
+    def __init__(self, config_search_path: ConfigSearchPath) -> None:
+        super().__init__(config_search_path)
+        self.repository = CheckedFiles(config_search_path)
 
     def load_configuration(
         self,
@@ -39,11 +49,24 @@ class CheckedLoader(ConfigLoaderImpl):
     ) -> DictConfig:
         how = (run_mode, from_shell, validate_sweep_overrides)
         found = super().load_configuration(config_name, overrides, *how)
-        typed = [text for text in overrides if text.lstrip("+~").startswith("hydra")]
-        without = super().load_configuration(config_name, typed, *how)
-        check_hydra(_settings(found), _settings(without))
-        check_places(found, overrides)
+        hydras = [text for text in overrides if re.match(r"[+~]*hydra[./=]", text)]
+        without = _without_folders(self, hydras).load_configuration(config_name, hydras, *how)
+        typed = _settings(without)
+        typed["overrides.task"] = [text for text in overrides if text not in hydras]
+        check_hydra(_settings(found), typed)
+        check_places(_places(found), overrides)
         return found
+
+
+def _without_folders(loader: ConfigLoaderImpl, hydras: Sequence[str]) -> ConfigLoaderImpl:
+    """A loader of the package's and Hydra's own configs, for a folder may hold some of their names.
+
+    With a group of Hydra's on the command line, such as a launcher, folders are trusted with it.
+    """
+    path = deepcopy(loader.config_search_path)
+    if not any("/" in text.partition("=")[0] for text in hydras):
+        path.get_path()[:] = [p for p in path.get_path() if p.provider != "command-line"]
+    return ConfigLoaderImpl(path)
 
 
 @contextmanager
@@ -79,29 +102,47 @@ def check_hydra(found: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
             )
 
 
-def check_places(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise ValueError for a folder elsewhere, or a server, that nobody has typed."""
+def check_places(settings: Iterable[tuple[str, Any]], overrides: Sequence[str]) -> None:
+    """Raise ValueError for a folder elsewhere, or a server, that nobody has typed.
+
+    settings: plain values by their dotted place.
+    """
     here = Path.cwd().resolve()
+    for place, value in settings:
+        key = place.rpartition(".")[2]
+        if key not in FOLDERS + SERVERS or _is_typed(place, overrides):
+            continue
+        for each in value if isinstance(value, list) else [value]:
+            if not isinstance(each, str) or each == "???":
+                continue  # whoever takes it refuses it
+            if key in SERVERS:
+                raise ValueError(
+                    f"a config must not set {place}, for what answers there is trusted: {each!r} "
+                    f"came; give it on the command line: {place}={each}"
+                )
+            if "\0" in each or not (here / each).resolve().is_relative_to(here):
+                raise ValueError(
+                    f"a config must set {place} to a folder below the one that you start in: "
+                    f"{each!r} came; give it on the command line: {place}={each}"
+                )
+
+
+def resolved(config: DictConfig) -> Iterator[tuple[str, Any]]:
+    """All that a config says, by dotted place, as a run will read it: text may make a group."""
+    for key in config:
+        with suppress(OmegaConfBaseException):  # told better by whoever reads it
+            node = config[key]
+            is_group = OmegaConf.is_config(node)
+            plain = OmegaConf.to_container(node, resolve=True) if is_group else node
+            yield from _leaves(plain, str(key))
+
+
+def _places(config: DictConfig) -> Iterator[tuple[str, Any]]:
+    """The same before all of it can be resolved: Hydra makes a folder first."""
     written: Any = OmegaConf.to_container(config, resolve=False)
     for place, value in _leaves({k: v for k, v in written.items() if k != "hydra"}, ""):
-        key = place.rpartition(".")[2]
-        if (
-            key not in FOLDERS + SERVERS
-            or not isinstance(value, str)
-            or _is_typed(place, overrides)
-        ):
-            continue
-        value = OmegaConf.select(config, place) if "${" in str(value) else value
-        if key in SERVERS and value != "???":
-            raise ValueError(
-                f"a config must not set {place}, for what answers there is trusted: {value!r} "
-                f"came; give it on the command line: {place}={value}"
-            )
-        if key in FOLDERS and not (here / str(value)).resolve().is_relative_to(here):
-            raise ValueError(
-                f"a config must set {place} to a folder below the one that you start in: "
-                f"{value!r} came; give it on the command line: {place}={value}"
-            )
+        known = place.rpartition(".")[2] in FOLDERS + SERVERS and "${" in str(value)
+        yield place, OmegaConf.select(config, place) if known else value
 
 
 def _is_typed(place: str, overrides: Sequence[str]) -> bool:

@@ -20,8 +20,8 @@ _NUMBER = rf"{NUMBER}(?!\w)"
 _TERM = rf"(?:1(?![\w.]|\s*/)|{PRODUCT})"
 
 _ADDEND = re.compile(
-    rf"\s*(?P<sign>[+-]?)\s*(?:(?:(?P<factor>[+-]?{_NUMBER})\s*\*\s*)?"
-    rf"(?P<state>{VARIABLE})\s*:\s*(?P<term>{_TERM})|(?P<number>[+-]?{_NUMBER}))\s*"
+    rf"\s*+(?P<sign>[+-]?)\s*+(?:(?:(?P<factor>[+-]?{_NUMBER})\s*+\*\s*+)?"
+    rf"(?P<state>{VARIABLE})\s*+:\s*+(?P<term>{_TERM})|(?P<number>[+-]?{_NUMBER}))\s*+"
 )
 
 _EXAMPLE = "write it like 'n_i: n_i*n_n == -1 * n_n: n_i*n_n'"

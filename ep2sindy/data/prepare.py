@@ -15,6 +15,7 @@ import xarray as xr
 
 from ep2sindy.data.fields import SPACE, check_field, grid_points, mask_outside
 from ep2sindy.library.names import check_variable
+from ep2sindy.machine.screen import cut
 
 OPERATORS: Mapping[type, Callable] = {
     ast.Add: operator.add,
@@ -30,6 +31,8 @@ OPERATORS: Mapping[type, Callable] = {
     ast.BitAnd: np.logical_and,
     ast.BitOr: np.logical_or,
 }
+
+LONGEST = 1000  # characters of an expression
 
 FUNCTIONS: Mapping[str, Callable] = {"abs": np.abs, "exp": np.exp, "log": np.log, "sqrt": np.sqrt}
 
@@ -91,10 +94,19 @@ def keep_where(field: xr.Dataset, *, condition: str) -> xr.Dataset:
 
 def evaluate(field: xr.Dataset, expression: str) -> xr.DataArray:
     """Value of an arithmetic expression of a field's variables and coordinates, in float64."""
+    shown = cut(repr(expression))
+    if len(expression) > LONGEST:
+        raise ValueError(
+            f"an expression may have up to {LONGEST} characters: {shown} has {len(expression)}"
+        )
     try:
-        return _value(ast.parse(expression.replace("^", "**"), mode="eval").body, field)
-    except SyntaxError as error:
-        raise ValueError(f"{expression!r} is no expression: {error.msg}") from None
+        tree = ast.parse(expression.replace("^", "**"), mode="eval")
+    except (SyntaxError, ValueError, RecursionError) as error:
+        raise ValueError(f"{shown} is no expression: {error or 'too deep'}") from None
+    try:
+        return _value(tree.body, field)
+    except (RecursionError, OverflowError) as error:
+        raise ValueError(f"the expression {shown} cannot be worked out: {error}") from None
 
 
 def _value(node: ast.expr, field: xr.Dataset) -> xr.DataArray:

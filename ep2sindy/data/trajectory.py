@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import html
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,15 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.machine.screen import html_table, one_screen, text_table
+
+
+def fixed(values: dict) -> MappingProxyType:
+    """A mapping that cannot be changed."""
+    return MappingProxyType(values)
+
+
+# Pickle does not know the kind, and trajectories and models go to other processes.
+copyreg.pickle(MappingProxyType, lambda kept: (fixed, (dict(kept),)))
 
 
 def read_only(values: np.ndarray) -> np.ndarray:

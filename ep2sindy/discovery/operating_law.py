@@ -17,9 +17,11 @@ from scipy.special import ndtri
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.equations import equation_text
+from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.machine.files import write_text
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 
@@ -56,11 +58,19 @@ class OperatingLaw:
                 "a law must have a finite number for every coefficient and function: shape "
                 f"{self.coef.shape} came for {shape}"
             )
+        for state, term in self.coefficients:
+            if state not in self.states or term not in self.library.names:
+                raise ValueError(
+                    f"a law's coefficients must be of {list(self.states)} and "
+                    f"{list(self.library.names)}: {term} of {state} came"
+                )
         if self.points.shape[1:] != (len(self.parameters),) or not len(self.points):
             raise ValueError(
                 f"points must have a column for each of {list(self.parameters)}: shape "
                 f"{self.points.shape} came"
             )
+        if not np.isfinite(self.points).all():
+            raise ValueError(f"points must be finite: {self.points.tolist()} came")
         if self.covariance is not None:
             object.__setattr__(self, "covariance", read_only(self.covariance))
             if self.covariance.shape != (self.coef.size, self.coef.size):
@@ -165,17 +175,19 @@ class OperatingLaw:
                 raise ValueError(f"format {content['format']!r}")
             known = content["covariance"]
             return OperatingLaw(
-                functions=named_terms(content["parameters"], content["functions"]),
-                library=named_terms(content["variables"], content["library"]),
-                states=tuple(content["states"]),
+                functions=named_terms(*(names_in(content[k]) for k in ("parameters", "functions"))),
+                library=named_terms(*(names_in(content[k]) for k in ("variables", "library"))),
+                states=tuple(names_in(content["states"])),
                 coefficients=tuple((state, term) for state, term in content["coefficients"]),
                 coef=np.array(content["coef"], dtype=np.float64),
                 points=np.array(content["points"], dtype=np.float64),
-                covariance=None if known is None else np.array(known, dtype=np.float64),
-                units=content["units"],
-                provenance=content["provenance"],
+                covariance=None if known is None else covariance_in(known),
+                units=texts_in(content["units"], "units"),
+                provenance=texts_in(content["provenance"], "provenance"),
             )
-        except (KeyError, TypeError, json.JSONDecodeError, ValueError) as error:
+        except UnknownFunctionError:
+            raise  # the file is sound: a function must be registered before it is read
+        except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
             raise ValueError(f"a law file must hold {FORMAT} JSON: {error}") from error
 
     def save(self, path: str | Path) -> None:
@@ -183,7 +195,7 @@ class OperatingLaw:
 
     @staticmethod
     def load(path: str | Path) -> OperatingLaw:
-        return OperatingLaw.from_json(Path(path).read_text(encoding="utf-8"))
+        return read_stored(Path(path), OperatingLaw.from_json)
 
     def _values(self, parameters: Mapping[str, float]) -> Float[np.ndarray, " parameters"]:
         names = list(self.parameters)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -194,6 +195,8 @@ def function_of(part: Part) -> Function:
             f"unknown function {name!r} in {part.text!r}; there are {function_names()}; register "
             f"your own before it is named: ep.register_function({name!r}, value, derivative)"
         )
+    if not (isfinite(part.scale) and isfinite(part.shift)):
+        raise ValueError(f"the numbers of a function must be finite: {part.text!r:.80} came")
     if not part.scale:
         raise ValueError(f"a function must be of its variable: {part.text!r} multiplies it by 0")
     return Function(_kinds[name], part.variable, part.scale, part.shift)

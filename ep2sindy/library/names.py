@@ -5,41 +5,42 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-# The grammar of terms, for expressions without groups of their own.
-VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*)"  # or the average of a product, in < >
+# The grammar of terms, for expressions without groups of their own. Nothing is tried twice (`++`,
+# `*+`): a term from someone else may be long.
+VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*+)"  # or the average of a product, in < >
 
-NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+NUMBER = r"(?:\d++\.?\d*+|\.\d++)(?:[eE][+-]?\d++)?"
 
 # x, 2*x, -x, 0.5 + x, 1 - 2*x, and x + 0.5
 ARGUMENT = (
-    rf"(?:-?\s*{NUMBER}\s*(?=[+-]))?\s*[+-]?\s*(?:{NUMBER}\s*\*\s*)?{VARIABLE}"
-    rf"(?:\s*[+-]\s*{NUMBER})?"
+    rf"(?:-?\s*+{NUMBER}\s*+(?=[+-]))?\s*+[+-]?\s*+(?:{NUMBER}\s*+\*\s*+)?{VARIABLE}"
+    rf"(?:\s*+[+-]\s*+{NUMBER})?"
 )
 
-_POWER = r"(?:\^\d+)?"
+_POWER = r"(?:\^\d++)?"
 
-_FACTOR = rf"(?:[^\W\d]\w*\(\s*{ARGUMENT}\s*\)|{VARIABLE}){_POWER}"
+_FACTOR = rf"(?:[^\W\d]\w*+\(\s*+{ARGUMENT}\s*+\)|{VARIABLE}){_POWER}"
 
-_DIVISOR = rf"(?:\(\s*{ARGUMENT}\s*\)|{VARIABLE}){_POWER}"
+_DIVISOR = rf"(?:\(\s*+{ARGUMENT}\s*+\)|{VARIABLE}){_POWER}"
 
-PRODUCT = rf"(?:1\s*/\s*{_DIVISOR}|{_FACTOR})(?:\s*\*\s*{_FACTOR}|\s*/\s*{_DIVISOR})*"
+PRODUCT = rf"(?:1\s*+/\s*+{_DIVISOR}|{_FACTOR})(?:\s*+\*\s*+{_FACTOR}|\s*+/\s*+{_DIVISOR})*"
 
 _PLAIN = rf"{VARIABLE}{_POWER}"
 
-_PLAIN_PRODUCT = re.compile(rf"\s*{_PLAIN}(?:\s*\*\s*{_PLAIN})*\s*")
+_PLAIN_PRODUCT = re.compile(rf"\s*+{_PLAIN}(?:\s*+\*\s*+{_PLAIN})*\s*+")
 
-_TERM = re.compile(rf"\s*{PRODUCT}\s*")
+_TERM = re.compile(rf"\s*+{PRODUCT}\s*+")
 
-_PARTS = re.compile(rf"({VARIABLE})(?:\^(\d+))?")
+_PARTS = re.compile(rf"({VARIABLE})(?:\^(\d++))?")
 
 _FACTORS = re.compile(
-    rf"(?P<over>/)?\s*(?:(?P<function>[^\W\d]\w*)?\(\s*(?P<argument>{ARGUMENT})\s*\)"
-    rf"|(?P<variable>{VARIABLE}))(?:\^(?P<power>\d+))?"
+    rf"(?P<over>/)?\s*+(?:(?P<function>[^\W\d]\w*+)?\(\s*+(?P<argument>{ARGUMENT})\s*+\)"
+    rf"|(?P<variable>{VARIABLE}))(?:\^(?P<power>\d++))?"
 )
 
 _ARGUMENT = re.compile(
-    rf"(?P<shift>-?\s*{NUMBER}(?=\s*[+-]))?\s*(?P<sign>[+-]?)\s*(?:(?P<scale>{NUMBER})\s*\*\s*)?"
-    rf"(?P<variable>{VARIABLE})\s*(?P<behind>[+-]\s*{NUMBER})?"
+    rf"(?P<shift>-?\s*+{NUMBER}(?=\s*+[+-]))?\s*+(?P<sign>[+-]?)\s*+(?:(?P<scale>{NUMBER})\s*+\*\s*+)?"
+    rf"(?P<variable>{VARIABLE})\s*+(?P<behind>[+-]\s*+{NUMBER})?"
 )
 
 
@@ -51,6 +52,8 @@ def check_variable(name: str) -> None:
             "came"
         )
 
+
+LONGEST_POWER = 100  # digits: what has more is no number of anything
 
 RECIPROCAL = "1/"  # the function of what stands below a fraction line
 
@@ -108,14 +111,20 @@ def split_term(name: str) -> list[Part]:
     if not _TERM.fullmatch(name):
         raise ValueError(
             f"a term is variables joined by *, with whole powers, and functions of one variable: "
-            f"{name!r} came; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
+            f"{name!r:.300} came; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
         )
     parts = []
     for found in _FACTORS.finditer(name):
         function = RECIPROCAL if found["over"] else found["function"] or ""
         variable, scale, shift = _split_argument(found["argument"] or found["variable"])
-        parts.append(Part(function, variable, scale, shift, int(found["power"] or 1)))
+        parts.append(Part(function, variable, scale, shift, _power(found["power"], name)))
     return parts
+
+
+def _power(text: str | None, name: str) -> int:
+    if len(text or "") > LONGEST_POWER:
+        raise ValueError(f"a power must have up to {LONGEST_POWER} digits: {name!r:.80} came")
+    return int(text or 1)
 
 
 def _split_argument(text: str) -> tuple[str, float, float]:
@@ -131,7 +140,7 @@ def split_factors(name: str) -> list[tuple[str, int]]:
     """Variables and powers of a product: `n_i^2*<n_n*R_ion>` -> (n_i, 2), (<n_n*R_ion>, 1)."""
     if not _PLAIN_PRODUCT.fullmatch(name):
         raise ValueError(
-            f"a product is variables joined by *, with whole powers: {name!r} came; write it like "
-            "'n_i^2*n_n'"
+            f"a product is variables joined by *, with whole powers: {name!r:.300} came; write it "
+            "like 'n_i^2*n_n'"
         )
-    return [(variable, int(power or 1)) for variable, power in _PARTS.findall(name)]
+    return [(variable, _power(power, name)) for variable, power in _PARTS.findall(name)]

@@ -25,7 +25,7 @@ from ep2sindy.model.inputs import sampled
 from ep2sindy.model.rates import rates
 from ep2sindy.model.rollout import Rollout, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
-from ep2sindy.model.storage import model_text, read_model
+from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:
@@ -268,7 +268,7 @@ class SparseModel:
 
     @staticmethod
     def load(path: str | Path) -> SparseModel:
-        return SparseModel.from_json(Path(path).read_text(encoding="utf-8"))
+        return read_stored(Path(path), SparseModel.from_json)
 
     def _equation(self, state: str) -> int:
         if state not in self.states:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.readers.limits import check_kind
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 
@@ -51,16 +53,16 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
         content = json.loads(text)
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
-        states, equations = _names(content["states"]), content["equations"]
+        states, equations = names_in(content["states"]), content["equations"]
         if sorted(equations) != sorted(states):
             raise ValueError(f"equations of {sorted(equations)}, but the states {states}")
         covariance = content.get("covariance")  # files of version 0.1 have none
         return make(
-            named_terms(_names(content["variables"]), _names(content["library"])),
+            named_terms(names_in(content["variables"]), names_in(content["library"])),
             {state: _numbers(equations[state], state) for state in states},
-            units=_texts(content["units"], "units"),
-            provenance=_texts(content["provenance"], "provenance"),
-            covariance=None if covariance is None else _covariance(covariance),
+            units=texts_in(content["units"], "units"),
+            provenance=texts_in(content["provenance"], "provenance"),
+            covariance=None if covariance is None else covariance_in(covariance),
         )
     except UnknownFunctionError:
         raise  # the file is sound: a function must be registered before it is read
@@ -70,7 +72,21 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
         raise ValueError(f"a model file must hold {FORMAT} JSON: {error}") from error
 
 
-def _names(value: Any) -> list[str]:
+def read_stored(path: Path, read: Callable[[str], Model]) -> Model:
+    """Read a file of JSON; what is wrong with it says which file it was.
+
+    Raises UnknownFunctionError or another ValueError.
+    """
+    check_kind(path)
+    try:
+        return read(path.read_text(encoding="utf-8"))
+    except UnknownFunctionError as error:
+        raise UnknownFunctionError(f"{path}: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def names_in(value: Any) -> list[str]:
     """A list of texts, each once."""
     if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
         raise ValueError(f"a list of names was to come, and not {value!r:.80}")
@@ -89,13 +105,13 @@ def _numbers(terms: Any, state: str) -> dict[str, float]:
     return {name: float(value) for name, value in terms.items()}
 
 
-def _texts(value: Any, what: str) -> dict[str, str]:
+def texts_in(value: Any, what: str) -> dict[str, str]:
     if not isinstance(value, dict) or not all(isinstance(each, str) for each in value.values()):
         raise ValueError(f"{what} that are no texts by name: {value!r:.80}")
     return value
 
 
-def _covariance(rows: Any) -> Float[np.ndarray, "_ _"]:
+def covariance_in(rows: Any) -> Float[np.ndarray, "_ _"]:
     """Rows of a stored matrix, which may be empty, and must be one that a covariance can be."""
     found = np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
     variances = np.diag(found)

@@ -93,7 +93,7 @@ def read_hallthruster_input(path: str | Path) -> HallThrusterInput:
         raise ValueError(f"no such input of HallThruster.jl: {path.absolute()}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} must be JSON: {error}") from error
     content = content.get("input", content) if isinstance(content, dict) else {}
     if "config" not in content:

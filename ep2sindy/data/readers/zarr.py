@@ -19,6 +19,7 @@ crc32 crc32c adler32 fletcher32 jenkins_lookup3
 """
 CODECS = frozenset(_NAMES.split())
 CODECS_V3 = frozenset({"bytes", "transpose", "sharding_indexed", "vlen-utf8"})
+ATTRIBUTES = ".zattrs"
 METADATA = (".zarray", "zarr.json")
 LARGEST_METADATA = 10_000_000  # bytes
 
@@ -36,7 +37,13 @@ def read_zarr(path: Path) -> Source:
 
 
 def check_store(path: Path) -> None:
-    """Hold every array of a store to numbers and text, by what its metadata say."""
+    """Hold every array of a store to numbers and text, by what its metadata say, and to files."""
+    for each in path.rglob("*"):
+        if each.is_symlink() or not (each.is_file() or each.is_dir()):
+            raise ValueError(f"{each.relative_to(path)} is a link, a pipe or a device, and no file")
+    for place in (path / ATTRIBUTES, *path.glob(f"*/{ATTRIBUTES}")):
+        if place.is_file():
+            _metadata(place)
     for name in METADATA:
         for place in (path / name, *path.glob(f"*/{name}")):
             if place.is_file():
@@ -54,6 +61,12 @@ def _metadata(place: Path) -> dict[str, Any]:
 
 def _check_array(place: Path, metadata: dict[str, Any]) -> None:
     """Of one array, or of a group, which names neither type nor codec."""
+    sizes, chunks = _list(metadata, "shape"), _list(metadata, "chunks")
+    wrong = [n for n in (*sizes, *chunks) if n is not None and not (type(n) is int and n >= 0)]
+    if wrong or 0 in chunks:
+        raise ValueError(
+            f"{place}: sizes must be whole numbers: {sizes} in chunks of {chunks} came"
+        )
     kind = metadata.get("dtype", metadata.get("data_type", ""))
     if "O" in json.dumps(kind) or "object" in json.dumps(kind):
         raise ValueError(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ep2sindy.machine.memory import check_memory
 from ep2sindy.thruster.axial.model import CFL
 
 MIN_STEPS = 16  # fewer samples leave nothing to judge an oscillation by
@@ -38,6 +39,12 @@ class Settings:
                 f"duration_s must hold at least {MIN_STEPS} sampling steps of "
                 f"{self.sample_s!r} s, got {self.duration_s!r} s"
             )
+        n_samples = self.duration_s / self.sample_s
+        check_memory(
+            32.0 * self.n_cells * (n_samples + MIN_STEPS),  # four profiles at least
+            f"duration_s / sample_s = {n_samples:.3g} samples of n_cells = {self.n_cells}",
+            way_out="simulate less of each",
+        )
         if not 0.0 < self.cfl <= 1.0:
             raise ValueError(f"cfl must be above 0 and at most 1, got {self.cfl!r}")
         if not 0.0 <= self.coldest_T_e_eV < np.inf:

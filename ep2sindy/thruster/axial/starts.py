@@ -13,6 +13,8 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
+from ep2sindy.data.readers.guard import look_through_first
+from ep2sindy.data.readers.source import damage_named
 from ep2sindy.thruster.axial.state_kernels import CURRENT, SERIES_SUMS, Model, State
 from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
@@ -224,8 +226,11 @@ def _ended(run: xr.Dataset | str | Path) -> xr.Dataset:
         path = Path(run)
         if not path.is_file():
             raise ValueError(f"no such run to go on from: {path.absolute()}")
-        with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
-            run = stored[[name for name in stored.data_vars if str(name).startswith(END)]].load()
+        with damage_named(path):
+            look_through_first(path)
+            with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
+                ends = [name for name in stored.data_vars if str(name).startswith(END)]
+                run = stored[ends].load()
     if END + "n_n" not in run or "parameters" not in run.attrs:
         raise ValueError(
             f"a restart must be a run of simulate, which keeps its end (end_n_n, ...): this one "
