@@ -12,9 +12,12 @@ import numpy as np
 import psutil
 
 EARLIER = "2000-01-01_000000"  # a run folder that was there before
-# Not the same in two runs, for what they hold: seconds of work, and that a run went on.
+# Lines that are not the same in two runs, for what they hold: seconds of work, that a run went on,
+# and the commit, which may change while the attack goes on.
 OF_TIME = re.compile(
-    rb'^.*("wall_s"|"points_per_s"|points in [\d.]+ s \(|going on with \d+ of).*\n', re.M
+    rb'^.*("wall_s"|"points_per_s"|points in [\d.]+ s \(|going on with \d+ of|"commit"|<p>Code: )'
+    rb".*\n",
+    re.M,
 )
 OF_TIME_ALONE = ("tensorboard/",)  # the time of every event; host and process in the name
 GROWS = ("run.log", *OF_TIME_ALONE)  # written line by line, so that it may be watched

@@ -111,9 +111,9 @@ def reference(folder: Path, name: str) -> Reference:
     kept = place / "reference.json"
     if not kept.exists():
         found = [_undisturbed(name, place) for _ in range(2)]
-        if found[0][1] != found[1][1]:
-            raise SystemExit(f"{name}: two undisturbed runs left different files in {place}")
         duration_s, files = found[1]
+        if differing := sorted({n for n, _ in files.items() ^ found[0][1].items()}):
+            raise SystemExit(f"{name}: two undisturbed runs differ in {differing}; see {place}")
         writes = (place / "writes").read_text()
         kept.write_text(json.dumps({"duration_s": duration_s, "files": files, "writes": writes}))
     return Reference(place, **json.loads(kept.read_text()))
@@ -133,12 +133,11 @@ def _undisturbed(name: str, place: Path) -> tuple[float, dict[str, str]]:
 
 
 def _code(name: str) -> str:
-    """What a reference depends on: the commit stands in its provenance."""
+    """What a reference depends on."""
     from ep2sindy.machine.files import fingerprint
-    from ep2sindy.report.provenance import commit
 
-    settings = json.dumps([RUNS[name], commit(ROOT)])
-    return fingerprint(settings, sources=ROOT / "ep2sindy")
+    configs = [path.read_text("utf-8") for path in sorted((ROOT / "conf").rglob("*.yaml"))]
+    return fingerprint(json.dumps([RUNS[name], configs]), sources=ROOT / "ep2sindy")
 
 
 def prepare(folder: Path) -> None:
