@@ -80,6 +80,7 @@ def paired(folder: Path, seed: int) -> Callable[[str], Outcome]:
         ends = [_end_of(each) for each in (first, second)]
         after = contents(place)
         wrong = living(place) + lost(after, before)
+        wrong += half_written(place, after, before, whole.files)
         for status, printed, errors in ends:
             if status == 0:
                 wrong += amiss(after, Path(printed.splitlines()[-1]), whole.files)

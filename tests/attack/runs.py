@@ -110,6 +110,7 @@ def reference(folder: Path, name: str) -> Reference:
     place = folder / f"{name}_{_code(name)}"
     kept = place / "reference.json"
     if not kept.exists():
+        print(f"the reference of {name}, twice ...", file=sys.stderr, flush=True)
         found = [_undisturbed(name, place) for _ in range(2)]
         duration_s, files = found[1]
         if differing := sorted({n for n, _ in files.items() ^ found[0][1].items()}):
