@@ -1,4 +1,3 @@
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -23,14 +22,6 @@ from ep2sindy.synthetic.systems import lotka_volterra
 
 PREY = lotka_volterra()
 DENSITY = 1e18
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @cache

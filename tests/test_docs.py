@@ -13,7 +13,6 @@ from shutil import which
 
 import numpy as np
 import pytest
-import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import ep2sindy as ep
@@ -57,7 +56,6 @@ def test_a_page_runs_and_prints_what_it_says(
         write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "grid.nc")
         write_h5(tmp_path / "run.h5")
     known: dict = {}
-    threads = torch.get_num_threads()
     for block in blocks(page):
         printed = io.StringIO()
         if block.language == "python":
@@ -68,7 +66,6 @@ def test_a_page_runs_and_prints_what_it_says(
                 printed.write(run(words))
         if block.printed is not None:
             assert not difference(block.printed, printed.getvalue()), block.text
-    torch.set_num_threads(threads)
 
 
 def run(words: list[str]) -> str:

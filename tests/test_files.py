@@ -1,4 +1,6 @@
+import errno
 import json
+import os
 from datetime import datetime
 from pathlib import Path
 
@@ -7,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ep2sindy.library.equations import equation_html
-from ep2sindy.machine.files import fingerprint, replacing, write_text
+from ep2sindy.machine.files import WriteError, fingerprint, replacing, write_text
 from ep2sindy.report.folder import RunFolder
 
 NOW = datetime(2026, 1, 2, 3, 4, 5)
@@ -27,6 +29,43 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, end: type) -> 
         write()
     assert target.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_name_and_then_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    names = {tmp_path.stat().st_ino: "folder"}
+    fsync, replace = os.fsync, os.replace
+
+    def synced(number: int) -> None:
+        done.append(f"sync {names.get(os.fstat(number).st_ino, 'file')}")
+        fsync(number)
+
+    def renamed(source: Path, target: Path) -> None:
+        done.append("rename")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    write_text(tmp_path / "b.txt", "text")
+    assert done == ["sync file", "rename", "sync folder"]
+
+
+def test_a_disk_that_is_full_at_the_sync_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(WriteError, match="a.txt could not be written .No space"):
+        write_text(target, "new")
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_a_write_creates_its_folder(tmp_path: Path) -> None:

@@ -1,4 +1,3 @@
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
 
@@ -24,15 +23,6 @@ from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
 
 PREY, LORENZ = lotka_volterra(), lorenz()
 LONG = replace(PREY, duration_s=300.0)  # 30 windows of 100 samples, none twice
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Batches this small only wait for each other."""
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 def off(model: SparseModel, factors: np.ndarray | float) -> SparseModel:

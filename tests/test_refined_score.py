@@ -1,9 +1,7 @@
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, polynomial
@@ -26,15 +24,6 @@ PREY = lotka_volterra()
 Terms = dict[str, float]
 # The limit of what follows exactly: two standard errors of one residual above the floor.
 EXACT = 17.0 * FLOOR
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Batches this small only wait for each other."""
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 def fronts_of(

@@ -1,12 +1,11 @@
 """One refinement of all operating points: laws that are known, and what must not change them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-import torch
 
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
@@ -22,15 +21,6 @@ POINTS = list(PARAMETERS)
 WINDOW, N_WINDOWS = 60, 4
 BASIS = LAW.evaluate(np.array([[PARAMETERS[p][v] for v in LAW.variables] for p in POINTS]))
 TRUE_LAW = np.array([row for terms in TRUTH.values() for row in terms.values()])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Batches this small only wait for each other."""
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @cache

@@ -23,6 +23,7 @@ from yaml import YAMLError
 
 from ep2sindy.app.typed_only import checked_loader
 from ep2sindy.machine.interruption import end_as_interrupted
+from ep2sindy.machine.threads import start_on_one_thread
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -32,6 +33,7 @@ def main() -> None:
     gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
     sys.path.insert(0, os.getcwd())  # as `python -m` does: studies and functions of one's own
     end_as_interrupted()
+    start_on_one_thread()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
     sweeps: list[Path] = []
     failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too

@@ -21,6 +21,7 @@ from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.screen import N_LINES, one_screen
+from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows
@@ -85,6 +86,7 @@ class Discovery:
         return f"Discovery of {len(self.chosen)} equations, chosen by {rule}"
 
 
+@one_thread()
 def discover(
     runs: Runs,
     library: Library | None = None,

@@ -23,9 +23,9 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float, Int
 from sklearn.mixture import GaussianMixture
-from threadpoolctl import threadpool_limits
 
 from ep2sindy.data.fields import SPACE
+from ep2sindy.machine.threads import one_thread
 
 N_STARTS = 20  # of the mixture's iteration, which may end in a poor optimum
 
@@ -185,8 +185,7 @@ def _mixture(
     if n_most == 1:
         return None
     sizes = np.arange(1, n_most + 1)
-    # On one thread: a step is so short that threads would wait for each other most of the time.
-    with threadpool_limits(limits=1):
+    with one_thread():  # a step is short
         candidates = [
             GaussianMixture(
                 n, covariance_type="spherical", reg_covar=floor, n_init=N_STARTS, random_state=seed

@@ -12,6 +12,7 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.discovery.last_fit import assemble_model, last_fit
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
+from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
@@ -53,6 +54,7 @@ class JointDiscovery:
     ambiguities: Mapping[str, Sequence[Ambiguity]] = field(repr=False)
 
 
+@one_thread()
 def discover_jointly(
     points: Mapping[str, Sequence[Trajectory]],
     library: Library,

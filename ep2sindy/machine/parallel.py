@@ -14,9 +14,9 @@ from threading import RLock
 from typing import Any, Protocol, runtime_checkable
 
 from joblib import Parallel, delayed
-from threadpoolctl import threadpool_limits
 
 from ep2sindy.machine.interruption import end_with
+from ep2sindy.machine.threads import one_thread
 
 # Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
 AHEAD = 2
@@ -37,7 +37,7 @@ class Workers(Protocol):
 
 def _on_one_thread(function: Callable[[Any], Any], numbered: tuple[int, Any]) -> tuple[int, Any]:
     number, piece = numbered
-    with threadpool_limits(limits=1):
+    with one_thread():
         return number, function(piece)
 
 

@@ -13,6 +13,7 @@ from torch import nn
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import FLAT
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
@@ -76,6 +77,7 @@ class Corrected:
         return rate.reshape(states.shape) * self.rate
 
 
+@one_thread()
 def refine_with_correction(
     model: SparseModel,
     trajectories: Sequence[Trajectory],

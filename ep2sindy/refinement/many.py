@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.constraints.relations import Constraint
+from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import closed
 from ep2sindy.refinement.ode import ODE, held, unconstrained
@@ -31,6 +32,7 @@ class Together:
     loss: Float[np.ndarray, " models"]
 
 
+@one_thread()
 def refine_together(
     models: Sequence[SparseModel],
     batch: WindowBatch,

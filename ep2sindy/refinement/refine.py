@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.machine.screen import N_LINES, one_screen
+from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import Verdict, judge
@@ -60,6 +61,7 @@ class Refinement:
         )
 
 
+@one_thread()
 def refine(
     model: SparseModel,
     trajectories: Sequence[Trajectory],
@@ -105,6 +107,7 @@ def refine(
     return found
 
 
+@one_thread()
 def refine_many(
     models: Sequence[SparseModel],
     trajectories: Sequence[Sequence[Trajectory]],

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import (
     FLAT,
@@ -54,6 +55,7 @@ class TiedRefinement:
     history: tuple[Iteration, ...]
 
 
+@one_thread()
 def refine_tied(
     models: Sequence[SparseModel],
     trajectories: Sequence[Sequence[Trajectory]],

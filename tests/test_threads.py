@@ -1,0 +1,111 @@
+"""One thread: what an experiment, a refinement or a discovery computes with."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from ep2sindy.app import main as program
+from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.machine.threads import NUMBERS, one_thread
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.problem import Fit, Problem
+from ep2sindy.refinement.refine import refine
+from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.search.front import ParetoFront
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.synthetic.systems import lotka_volterra
+
+PREY = lotka_volterra()
+
+
+@pytest.fixture(autouse=True)
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    with threadpool_limits(2):
+        yield
+    torch.set_num_threads(before)
+
+
+def threads() -> tuple[int, int]:
+    """Of NumPy's libraries, the most, and of PyTorch."""
+    blas = (pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+    return max(blas), torch.get_num_threads()
+
+
+@dataclass(frozen=True)
+class WatchedFit(MultipleShooting):
+    seen: list[tuple[int, int]] = field(default_factory=list)
+
+    def fit(self, problem: Problem) -> Fit:
+        self.seen.append(threads())
+        return super().fit(problem)
+
+
+@dataclass(frozen=True)
+class WatchedChoice:
+    label: ClassVar[str] = "EBIC"
+    seen: list[tuple[int, int]] = field(default_factory=list)
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[np.ndarray]:
+        self.seen.append(threads())
+        return EBIC().scores(fronts)
+
+
+def test_on_one_thread_and_then_on_as_many_as_before() -> None:
+    assert threads() == (2, 2)
+    with one_thread():
+        assert threads() == (1, 1)
+    assert threads() == (2, 2)
+
+
+def test_an_error_gives_the_threads_back() -> None:
+    with pytest.raises(ValueError, match="no"), one_thread():
+        raise ValueError("no")
+    assert threads() == (2, 2)
+
+
+def test_a_refinement_runs_on_one_thread() -> None:
+    method = WatchedFit()
+    rng = np.random.default_rng(0)
+    refine(PREY.model, [PREY.trajectory()], window=40, n_windows=3, method=method, rng=rng)
+    assert method.seen
+    assert set(method.seen) == {(1, 1)}
+    assert threads() == (2, 2)
+
+
+def test_a_discovery_runs_on_one_thread() -> None:
+    rule = WatchedChoice()
+    discover(PREY.trajectory(), recipe=Recipe(WeightedWeak(), selection=rule))
+    assert rule.seen == [(1, 1)]
+    assert threads() == (2, 2)
+
+
+def test_a_process_starts_on_one_thread_whatever_the_environment_says() -> None:
+    code = (
+        "from ep2sindy.machine.threads import start_on_one_thread as start; start()\n"
+        "import numpy, scipy.linalg, torch\n"
+        "from threadpoolctl import threadpool_info\n"
+        "print({p['num_threads'] for p in threadpool_info()}, torch.get_num_threads())"
+    )
+    env = {**os.environ, **dict.fromkeys(NUMBERS, "2")}
+    found = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+    assert found.stdout == "{1} 1\n", found.stderr
+
+
+def test_the_program_starts_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in NUMBERS:
+        monkeypatch.setenv(name, "2")
+    monkeypatch.setattr(sys, "argv", ["ep2sindy", "compare"])
+    with pytest.raises(SystemExit):
+        program.main()
+    assert [os.environ[name] for name in NUMBERS] == ["1"] * len(NUMBERS)
