@@ -25,7 +25,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--files", type=int, default=900, help="mutated files")
     parser.add_argument("--kills", type=int, default=7, help="runs ended at random moments")
-    parser.add_argument("--writes", type=int, default=14, help="writes made to fail, of about 900")
+    parser.add_argument("--writes", type=int, default=14, help="writes made to fail, of some 750")
     parser.add_argument("--pairs", type=int, default=3, help="two runs at once in one folder")
     parser.add_argument("--soak", type=int, default=5, help="rounds of short runs in one process")
     parser.add_argument("--seed", type=int, default=0)
