@@ -43,8 +43,9 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.joint
 	$(BIN)/python -m benchmarks.trajectory_scores
 
-# Mutated files, killed runs, failing writes: minutes, goes on where it was broken off, and prints
-# the table of docs/trust.md. More of each: ARGS="--files 5000 --kills 200 --writes 60".
+# Mutated files; runs that are killed, that cannot write, two at once, many in one process: a
+# quarter of an hour, goes on where it was broken off, and prints the table of docs/trust.md.
+# All of it: ARGS="--files 5000 --kills 200 --writes 9999 --pairs 21 --soak 50".
 attack: .venv/installed
 	$(BIN)/python -m tests.attack $(ARGS)
 

@@ -16,6 +16,7 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
+from ep2sindy.machine.files import WriteError
 from ep2sindy.studies.parametric import study as parametric
 from ep2sindy.studies.parametric.opening import point_sources
 from ep2sindy.studies.simulate import Study
@@ -170,6 +171,14 @@ def test_a_point_that_breaks_keeps_its_row_and_the_others_stand(scan: Path) -> N
 def test_scanned_runs_are_kept(scan: Path) -> None:
     (kept,) = [path for path in scan.parents if (path / "cache").exists()][:1]
     assert len(list((kept / "cache").glob("*.nc"))) == 3  # one of them diverged, one never ran
+
+
+def test_a_scan_ends_where_its_runs_cannot_be_kept(tmp_path: Path) -> None:
+    """A full disk is not the fault of a point: it had a row `failed`, and the scan went on."""
+    (tmp_path / "cache").write_text("a file, and no folder")
+    config = composed(*toy(tmp_path), "parallel=loky", "parallel.n_jobs=2", VOLTAGES)
+    with pytest.raises(WriteError, match="cache could not be written"):
+        run_config(config)
 
 
 def test_a_scan_where_nothing_can_be_run_is_an_error(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """A disk that takes no more: one message with the path and the way out, and whole files."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -54,6 +55,13 @@ def test_an_error_says_path_reason_and_way_out(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(WriteError, match=r"taken/x.txt could not be written \(.*\).*make room"):
         write_text(tmp_path / "taken" / "x.txt", "text")
+
+
+def test_an_error_of_a_worker_arrives_whole() -> None:
+    sent = WriteError(Path("kept/x.nc"), OSError(28, "No space left on device"))
+    arrived = pickle.loads(pickle.dumps(sent))
+    assert isinstance(arrived, WriteError)
+    assert (str(arrived), arrived.reason) == (str(sent), "No space left on device")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")

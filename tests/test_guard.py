@@ -85,6 +85,33 @@ def test_a_file_that_ends_its_library_ends_not_the_program(
     assert open_source(tmp_path / "b.mat").names == ["x"]
 
 
+def test_a_process_that_ended_between_two_files_is_started_again(tmp_path: Path) -> None:
+    """Ctrl-C in a notebook ends it: every file after it was refused for a broken pipe."""
+    for name in ("a", "b"):
+        savemat(tmp_path / f"{name}.mat", {"x": X})
+    open_source(tmp_path / "a.mat")
+    ended = guard._prober(os.getpid())
+    ended.kill()
+    ended.wait()
+    assert open_source(tmp_path / "b.mat").names == ["x"]
+
+
+def test_the_answer_on_an_interrupted_file_is_not_taken_for_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "damaged.mat").write_bytes(b"\0" * 200)
+    savemat(tmp_path / "sound.mat", {"x": X})
+
+    def interrupted(prober: object, patience_s: float) -> bool:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(guard, "_answers", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            guard.look_through_first(tmp_path / "damaged.mat")
+    assert open_source(tmp_path / "sound.mat").names == ["x"]
+
+
 def killed_at_once(process: int) -> object:
     import subprocess
     import sys

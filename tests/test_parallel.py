@@ -158,6 +158,32 @@ def test_a_number_of_processes_must_be_one() -> None:
         Loky(n_jobs=0)
 
 
+FAILING = """
+import time
+from ep2sindy.machine.parallel import Loky
+
+def failing(piece):
+    from tqdm import tqdm
+    for _ in tqdm(range(1), disable=True):
+        time.sleep(0.5 * piece)
+    raise ValueError("in our words")
+
+if __name__ == "__main__":
+    try:
+        list(Loky(2).run(failing, range(2)))
+    except ValueError as error:
+        print(error)
+"""
+
+
+def test_a_piece_that_fails_is_told_in_our_words_alone(tmp_path: Path) -> None:
+    """The other worker is ended, and left a semaphore of tqdm's: a warning came after the error."""
+    script = tmp_path / "run.py"
+    script.write_text(FAILING)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("in our words\n", "")
+
+
 KILLED = """
 import os, sys, time
 from ep2sindy.machine.interruption import end_as_interrupted

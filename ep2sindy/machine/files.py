@@ -27,6 +27,10 @@ class WriteError(OSError):
             f"{path} could not be written ({self.reason}); what was written before it is whole: "
             "make room there, or write elsewhere"
         )
+        self._made_of = path, self.reason
+
+    def __reduce__(self) -> tuple[Any, ...]:  # workers send their errors
+        return WriteError, self._made_of
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
+from threading import RLock
 from typing import Any, Protocol, runtime_checkable
 
 from joblib import Parallel, delayed
@@ -66,7 +67,10 @@ def rows_in_order(
 def _in_worker(
     function: Callable[[Any], Any], parent: int, numbered: tuple[int, Any]
 ) -> tuple[int, Any]:
+    from tqdm import tqdm
+
     end_with(parent)
+    tqdm.set_lock(RLock())  # by default a semaphore, of which the end of a worker would be told
     return _on_one_thread(function, numbered)
 
 

@@ -10,12 +10,13 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ep2sindy.machine.files import replacing, sweep, write_json, write_text
+from ep2sindy.machine.files import sweep, write_bytes, write_json, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.picture import DPI
 from ep2sindy.report.provenance import commit, versions
@@ -78,10 +79,10 @@ class RunFolder:
         for suffix in ("pdf", "png"):
             # Without a date the same run gives the same file.
             dated = {"CreationDate": None} if suffix == "pdf" else {}
-            path = self.file(f"{name}.{suffix}", "figures")
-            with replacing(path) as temporary:
-                figure.savefig(temporary, dpi=DPI, metadata=dated)
-        return path.read_bytes()
+            drawn = BytesIO()  # a PDF that finds no room fails again when it is closed, over zlib
+            figure.savefig(drawn, format=suffix, dpi=DPI, metadata=dated)
+            write_bytes(self.file(f"{name}.{suffix}", "figures"), drawn.getvalue())
+        return drawn.getvalue()
 
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> dict[str, Any]:
         """Which code a run is made by, in provenance.json; returned as well."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import struct
 import time
 from collections.abc import Mapping
@@ -13,7 +15,10 @@ from ep2sindy.machine.files import writing
 
 
 class Board:
-    """One run in TensorBoard; opened when something is written, for its import takes a while."""
+    """One run in TensorBoard; opened when something is written, for its import takes a while.
+
+    TensorBoard's own writer works in a thread, whose errors are printed in its words, not ours.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -25,8 +30,6 @@ class Board:
 
         values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()]
         self._add(Summary(value=values), step=step)
-        with writing(self._folder):
-            self._writer.flush()
 
     def equations(self, texts: Mapping[str, str]) -> None:
         """The equations of all models, by name: one block of lines as they are, in a fixed font."""
@@ -70,11 +73,24 @@ class Board:
                 writer.close()
 
     def _add(self, summary: Any, *, step: int = 0) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event
-
         with writing(self._folder):
             if self._writer is None:
-                from tensorboard.summary.writer.event_file_writer import EventFileWriter
+                self._writer = _opened(self._folder)
+                self._writer.write(_event(file_version="brain.Event:2"))
+            self._writer.write(_event(step=step, summary=summary))
+            self._writer.flush()
 
-                self._writer = EventFileWriter(str(self._folder))
-            self._writer.add_event(Event(wall_time=time.time(), step=step, summary=summary))
+
+def _opened(folder: Path) -> Any:
+    """An event file, named as TensorBoard looks for it."""
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"events.out.tfevents.{int(time.time()):010d}.{platform.node()}.{os.getpid()}.0"
+    return RecordWriter((folder / name).open("wb"))
+
+
+def _event(**content: Any) -> bytes:
+    from tensorboard.compat.proto.event_pb2 import Event
+
+    return Event(wall_time=time.time(), **content).SerializeToString()

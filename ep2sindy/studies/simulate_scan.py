@@ -14,6 +14,7 @@ from typing import Any
 import pandas as pd
 
 from ep2sindy.figures.stability import curves_figure, stability_figure
+from ep2sindy.machine.files import WriteError
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Section, Table, Text, pictures, places
 from ep2sindy.studies.kinds import Deferred
@@ -95,9 +96,14 @@ def compile_kernels(data: Sequence[Deferred]) -> None:
 
 
 def simulated(point: Point) -> Simulated:
-    """Run a point; one that cannot be run says why, and leaves the others alone."""
+    """Run a point; one that cannot be run says why, and leaves the others alone.
+
+    Raises WriteError where the simulation cannot be kept: that is none of the point's.
+    """
     try:
         run = point.data.build()
+    except WriteError:
+        raise
     except (ValueError, OSError, ArithmeticError) as error:
         return Simulated(FAILED, message=str(error) or type(error).__name__)
     attributes = getattr(run, "attrs", {})

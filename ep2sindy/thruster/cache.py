@@ -11,7 +11,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from ep2sindy.data.netcdf import write_netcdf
-from ep2sindy.machine.files import fingerprint, sweep
+from ep2sindy.machine.files import fingerprint, sweep, writing
 from ep2sindy.thruster.axial.model import CFL
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.simulate import as_start, simulate_as
@@ -74,16 +74,11 @@ def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
             return unsealed(read(path), parameters)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             tqdm.write(f"{path} cannot be read ({error}); simulating it again")
-    try:  # now, not after the simulation
+    with writing(path.parent):  # now, not after the simulation
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent)
         with TemporaryFile(dir=path.parent):
             pass
-    except OSError as error:
-        raise OSError(
-            f"simulations need a folder they can be kept in: {path.parent} failed with "
-            f"{error.strerror!r}; choose another cache"
-        ) from error
     field = run()
     write(sealed(field, parameters), path)
     return field

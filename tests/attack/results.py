@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from tqdm import tqdm
+
 Outcome = tuple[str, str]  # what became of a case, and words on it
 
 
@@ -18,10 +20,10 @@ def attacked(
     lines = file.read_text("utf-8").splitlines() if file.exists() else []
     done = {case: (kind, words) for case, kind, words in map(json.loads, lines)}
     with file.open("a", encoding="utf-8") as kept:
-        for case in cases:
-            if case not in done:
-                done[case] = attack(case)
-                print(json.dumps([case, *done[case]]), file=kept, flush=True)
+        waiting = [case for case in cases if case not in done]
+        for case in tqdm(waiting, desc=file.stem, disable=not waiting):
+            done[case] = attack(case)
+            print(json.dumps([case, *done[case]]), file=kept, flush=True)
     return done
 
 

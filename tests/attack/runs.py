@@ -1,144 +1,156 @@
-"""Runs that are killed, and runs of which one write fails: what is left is whole.
-
-`python -m tests.attack.runs K ARGUMENTS` runs the command line with its K-th opening of a file for
-writing failing, as on a full disk.
-"""
+"""Small runs of the experiments: how each is started, and what it leaves undisturbed."""
 
 from __future__ import annotations
 
-import builtins
-import errno
-import io
 import json
 import os
-import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
 
-import psutil
+from tests.attack.left import EARLIER, contents, finished
 
-from tests.attack.results import Outcome
+ROOT = Path(__file__).resolve().parents[2]
+LIMIT_S = 600.0  # for a run of seconds on a machine that does other things
 
-TOY = (
-    "+exp=pointwise", "data=file", "data.r.name=r", "parallel=loky", "parallel.n_jobs=2",
-    "bootstraps.n=6", "block_points=5", "max_regimes=3",
-    *(f"data.variables.{name}.name={name}" for name in ("u_iz", "u_ir", "R_ion")),
+SIMULATED = (
+    "data.cache=cache", "data.progress=false", "data.duration_s=2.0e-3", "data.warm_up_s=1.0e-3",
+    "data.n_cells=30",
 )  # fmt: skip
+RUNS = {
+    "discover": ("data=recognised", "data.path=data/lorenz.csv", "trajectory.states=[x,y,z]"),
+    "simulate": (
+        *SIMULATED, "thruster=two_cycles", "data.stretch=1.0", "data.duration_s=6.0e-4",
+        "data.warm_up_s=0.0", "data.n_cells=24", "scan={operating_point.voltage:[250.0,300.0]}",
+    ),
+    "pointwise": (
+        "data=file", "data.path=data/grid.nc", "data.r.name=r", "bootstraps.n=6",
+        "block_points=5", "max_regimes=3", "keep=kept",
+        *(f"data.variables.{name}.name={name}" for name in ("u_iz", "u_ir", "R_ion")),
+    ),
+    "weak": (*SIMULATED, "n_windows=500", "n_points=[10,50]"),
+    "breathing": (
+        *SIMULATED, "bootstraps.n=4", "~libraries.velocity", "living.search.max_terms=3",
+        "living.search.n_best=1", "living.depth=1",
+    ),
+    "parametric": (
+        *SIMULATED, "bootstraps.n=2", "bootstrap.n_draws=40", "refining.n_windows=20",
+        "library.variables=[n_i,n_n,R_ion]",
+        "points=[{V_D_V: 200.0, mdot_mg_s: 5.0},{V_D_V: 300.0, mdot_mg_s: 5.0},"
+        "{V_D_V: 300.0, mdot_mg_s: 2.0}]",
+    ),
+    "predict": (
+        *SIMULATED, "degrees=[1]", "windows.n_windows=4", "windows.periods=1.0", "map_points=2",
+        "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}]",
+    ),
+}  # fmt: skip
+SIDE_BY_SIDE = {"simulate", "pointwise", "parametric", "predict"}  # in two workers
 
 
-def arguments(folder: Path) -> list[str]:
-    """A toy run that searches a grid, keeps finished blocks and writes NetCDF."""
-    from ep2sindy.data.open import write_field
+def start(
+    name: str, folder: Path, *, fail: int = 0, full: bool = False, said: int = subprocess.DEVNULL
+) -> subprocess.Popen[str]:
+    """Start a small run in a folder, in which all its paths lie.
+
+    fail: which of its writes fails; full: on a full device, instead of at the opening.
+    """
+    temporary = folder / "tmp"
+    temporary.mkdir(exist_ok=True)
+    own = {
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent / "layer"), str(ROOT)]),
+        "EP2SINDY_ATTACK": json.dumps({"folder": str(folder), "fail": fail, "full": full}),
+        "OMP_NUM_THREADS": "1",
+        "TMPDIR": str(temporary),
+        "JOBLIB_TEMP_FOLDER": str(temporary),
+    }
+    side_by_side = ["parallel.n_jobs=2"] if name in SIDE_BY_SIDE else []
+    line = [f"+exp={name}", "output=out", *RUNS[name], *side_by_side]
+    return subprocess.Popen(
+        [sys.executable, "-m", "ep2sindy.app.main", *line],
+        cwd=folder, env={**os.environ, **own}, stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+        text=True, preexec_fn=_as_from_a_terminal,
+    )  # fmt: skip
+
+
+def _as_from_a_terminal() -> None:
+    """A job in the background, and nohup, have signals ignored, and that is inherited."""
+    for each in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(each, signal.SIG_DFL)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A run that nothing disturbed. files: what it left, by name; writes: a letter for each."""
+
+    place: Path
+    duration_s: float
+    files: dict[str, str]
+    writes: str
+
+    def copied(self, folder: Path) -> Path:
+        """A folder with its data and an earlier run folder: where the same run may start."""
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(self.place / "data", folder / "data")
+        for run in (self.place / "out").glob("*/*"):
+            shutil.copytree(run, folder / "out" / run.parent.name / EARLIER)
+        return folder
+
+
+@cache
+def reference(folder: Path, name: str) -> Reference:
+    """Made twice, for the first may compile, and the same bytes must come; kept in a folder.
+
+    Of other code, and other settings, it is another one.
+    """
+    place = folder / f"{name}_{_code(name)}"
+    kept = place / "reference.json"
+    if not kept.exists():
+        print(f"the reference of {name}, twice ...", file=sys.stderr, flush=True)
+        found = [_undisturbed(name, place) for _ in range(2)]
+        duration_s, files = found[1]
+        if differing := sorted({n for n, _ in files.items() ^ found[0][1].items()}):
+            raise SystemExit(f"{name}: two undisturbed runs differ in {differing}; see {place}")
+        writes = (place / "writes").read_text()
+        kept.write_text(json.dumps({"duration_s": duration_s, "files": files, "writes": writes}))
+    return Reference(place, **json.loads(kept.read_text()))
+
+
+def _undisturbed(name: str, place: Path) -> tuple[float, dict[str, str]]:
+    shutil.rmtree(place, ignore_errors=True)
+    prepare(place / "data")
+    (place / "out" / name).mkdir(parents=True)  # as where there was an earlier run
+    begin = time.monotonic()
+    run = start(name, place, said=subprocess.PIPE)
+    printed, errors = run.communicate(timeout=LIMIT_S)
+    if run.returncode:
+        raise SystemExit(f"{name} must run when nothing disturbs it:\n{errors}")
+    duration_s = time.monotonic() - begin
+    return duration_s, finished(contents(place), Path(printed.splitlines()[-1]))
+
+
+def _code(name: str) -> str:
+    """What a reference depends on."""
+    from ep2sindy.machine.files import fingerprint
+
+    configs = [path.read_text("utf-8") for path in sorted((ROOT / "conf").rglob("*.yaml"))]
+    return fingerprint(json.dumps([RUNS[name], configs]), sources=ROOT / "ep2sindy")
+
+
+def prepare(folder: Path) -> None:
+    """The data of all runs, the same bytes each time."""
+    import pandas as pd
+
+    import ep2sindy as ep
     from ep2sindy.synthetic.regions import three_regions
 
-    grid = folder / "grid.nc"
-    if not grid.exists():
-        write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, grid)
-    return [*TOY, f"data.path={grid}", f"output={folder / 'out'}", f"keep={folder / 'kept'}"]
-
-
-def damage_in(folder: Path) -> list[str]:
-    """Files under their final names that are not whole."""
-    import h5py
-    import numpy as np
-
-    wrong = []
-    for path in sorted(folder.rglob("*")):
-        if not path.is_file() or path.name.startswith("."):
-            continue
-        try:
-            if path.suffix == ".json":
-                json.loads(path.read_text("utf-8"))
-            elif path.suffix == ".nc":
-                with h5py.File(path) as file:
-                    file.visititems(lambda name, item: item[()] if hasattr(item, "dtype") else None)
-            elif path.suffix == ".npz":
-                with np.load(path) as arrays:
-                    dict(arrays)
-            elif path.suffix in (".png", ".pdf", ".html"):
-                ends = {".png": b"IEND\xaeB`\x82", ".pdf": b"%%EOF", ".html": b"</html>"}
-                if not path.read_bytes().rstrip().endswith(ends[path.suffix]):
-                    wrong.append(path.name)
-        except Exception as error:
-            wrong.append(f"{path.name}: {error!r}")
-    return wrong
-
-
-def kill(folder: Path, seed: int) -> Callable[[str], Outcome]:
-    """The attack on case K: a run is ended at a random moment by a random signal."""
-    line = [sys.executable, "-m", "experiments.run", *arguments(folder)]
-
-    def attacked(case: str) -> Outcome:
-        chance = random.Random(f"{seed} {case}")
-        moment_s = chance.uniform(1.0, 20.0)
-        name = chance.choice(["SIGINT", "SIGTERM", "SIGHUP", "SIGKILL"])
-        run = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(moment_s)
-        if run.poll() is not None:
-            return "ended before", f"{moment_s:.1f} s"
-        workers = psutil.Process(run.pid).children(recursive=True)
-        run.send_signal(getattr(signal, name))
-        run.wait()
-        _, alive = psutil.wait_procs(workers, timeout=10.0)
-        wrong = damage_in(folder)
-        for each in alive:
-            each.kill()
-        if wrong or alive:
-            return ("half-written" if wrong else "workers alive"), f"{name}: {wrong or alive}"
-        return "whole", f"{name} after {moment_s:.1f} s"
-
-    return attacked
-
-
-def fail(folder: Path) -> Callable[[str], Outcome]:
-    """The attack on case K: the K-th write of a run fails."""
-    line = [sys.executable, "-m", "tests.attack.runs"]
-
-    def attacked(case: str) -> Outcome:
-        run = subprocess.run(
-            [*line, case, *arguments(folder)], capture_output=True, text=True, check=False
-        )
-        said = run.stderr.strip().splitlines()[-1] if run.stderr.strip() else ""
-        if wrong := damage_in(folder):
-            return "half-written", str(wrong)
-        if "WRITE FAILED" not in run.stdout:
-            return "fewer writes", ""
-        if run.returncode == 0:
-            return "went on", said
-        spoken = run.returncode == 1 and said.startswith("error: ") and str(folder) in said
-        return ("refused with path" if spoken else "foreign"), f"{run.returncode} {said}"
-
-    return attacked
-
-
-def main() -> None:
-    """The command line, with a file layer whose K-th write under the output fails."""
-    left = [int(sys.argv[1])]
-    sys.argv[1:] = sys.argv[2:]
-    places = [text.partition("=")[2] for text in sys.argv if text.startswith(("output=", "keep="))]
-    opened = io.open
-
-    def opening(file: Any, mode: str = "r", *rest: Any, **named: Any) -> Any:
-        found = opened(file, mode, *rest, **named)
-        writes = set(mode) & set("wax+") and str(file).startswith(tuple(places))
-        left[0] -= bool(writes)
-        if writes and left[0] == 0:
-            left[0] = -1
-            found.close()
-            print("WRITE FAILED", file, flush=True)
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return found
-
-    io.open = builtins.open = opening  # type: ignore[assignment]
-    from ep2sindy.app.main import main as run
-
-    run()
-
-
-if __name__ == "__main__":
-    main()
+    folder.mkdir(parents=True)
+    ep.write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, folder / "grid.nc")
+    run = ep.lorenz().trajectory(noise=0.02, rng=0)
+    table = pd.DataFrame(run.states[:1000], columns=list(run.state_names))
+    table.insert(0, "time", run.t[:1000])
+    table.to_csv(folder / "lorenz.csv", index=False)

@@ -8,7 +8,7 @@ import select
 import signal
 import subprocess
 import sys
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from threading import Lock
 
@@ -31,26 +31,42 @@ def look_through_first(path: Path, reader: str) -> None:
         raise ValueError(f"a file must be readable to its end: {said}")
 
 
-@cache
+@lru_cache(maxsize=1000)  # a process may read files for weeks
 def _verdict(path: Path, reader: str, size: int, changed_ns: int) -> str:
     with _LOCK:
         prober = _prober(os.getpid())
+        if prober.poll() is not None:  # since the last file, as by Ctrl-C in a notebook
+            _ended(prober)
+            prober = _prober(os.getpid())
         patience_s = PATIENCE_S + size_of(path) / SPEED
-        assert prober.stdin is not None
-        assert prober.stdout is not None
-        prober.stdin.write(json.dumps([str(path), reader]).encode() + b"\n")
-        prober.stdin.flush()
-        answered = _answers(prober, patience_s)
-        line = prober.stdout.readline() if answered else b""
+        try:
+            line = _asked(prober, [str(path), reader], patience_s)
+        except BaseException:  # its answer would be taken for that on the next file
+            _ended(prober)
+            raise
         if line:
             return str(json.loads(line))
-        _prober.cache_clear()
-        prober.kill()
-        status = prober.wait()
-    if not answered:
+        status = _ended(prober)
+    if line is None:
         return f"reading it was given up after {patience_s:.0f} s"
     by = signal.Signals(-status).name if status < 0 else f"status {status}"
     return f"the library that reads it breaks down over it ({by})"
+
+
+def _asked(prober: subprocess.Popen, file: list[str], patience_s: float) -> bytes | None:
+    """What it says of a file; nothing, if it dies, and None, if it takes too long."""
+    assert prober.stdin is not None
+    assert prober.stdout is not None
+    prober.stdin.write(json.dumps(file).encode() + b"\n")
+    prober.stdin.flush()
+    return prober.stdout.readline() if _answers(prober, patience_s) else None
+
+
+def _ended(prober: subprocess.Popen) -> int:
+    """The status of a process that is ended here, if it has not ended itself."""
+    _prober.cache_clear()
+    prober.kill()
+    return prober.wait()
 
 
 def _answers(prober: subprocess.Popen, patience_s: float) -> bool:

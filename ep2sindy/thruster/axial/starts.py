@@ -227,7 +227,7 @@ def _ended(run: xr.Dataset | str | Path) -> xr.Dataset:
         if not path.is_file():
             raise ValueError(f"no such run to go on from: {path.absolute()}")
         with damage_named(path):
-            look_through_first(path)
+            look_through_first(path, "HDF5")
             with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
                 ends = [name for name in stored.data_vars if str(name).startswith(END)]
                 run = stored[ends].load()
