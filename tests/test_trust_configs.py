@@ -18,6 +18,7 @@ from ep2sindy.app.defaults import defaults_of, plain
 from ep2sindy.app.runner import run_config, study_class
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
 from ep2sindy.app.typed_only import CheckedLoader, check_places, resolved
+from ep2sindy.app.yaml_files import check_references
 from ep2sindy.studies.functions import registered
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -192,6 +193,31 @@ def test_a_file_that_asks_for_too_much_is_refused_by_name(
     (tmp_path / "exp" / "theirs.yaml").write_text(text)
     with pytest.raises(ValueError, match=rf"theirs\.yaml:? {message}"):
         loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
+
+
+DOUBLED = {
+    "text": "x0: 0123456789\n"
+    + "".join(f"x{k}: ${{x{k - 1}}}${{x{k - 1}}}\n" for k in range(1, 40)),
+    "lists": "x0: [1]\n"
+    + "".join(f"x{k}: ['${{x{k - 1}}}', '${{x{k - 1}}}']\n" for k in range(1, 40)),
+    "places": "x: [aaaa, " + ", ".join(f"'${{x.{k}}}${{x[{k}]}}'" for k in range(40)) + "]",
+    "groups": "".join(f"a-{k}: {{v: '${{a-{k + 1}.v}}${{a-{k + 1}.v}}'}}\n" for k in range(40))
+    + "a-40: {v: aaaa}\n",
+}
+
+
+@pytest.mark.parametrize("text", DOUBLED.values(), ids=DOUBLED)
+def test_references_that_double_are_refused_before_they_are_written_out(
+    text: str, tmp_path: Path
+) -> None:
+    (tmp_path / "exp").mkdir()
+    (tmp_path / "exp" / "theirs.yaml").write_text(f"# @package _global_\n{text}")
+    with pytest.raises(ValueError, match="may stand for up to"):
+        loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
+
+
+def test_a_long_list_is_no_reference() -> None:
+    check_references({"a": [1.5] * 1_000_000, "b": "${a}", "c": {"d": "${b}", "e": "${.d}"}})
 
 
 def test_text_that_becomes_a_group_is_looked_at_as_one(tmp_path: Path, monkeypatch: Any) -> None:

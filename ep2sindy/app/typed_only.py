@@ -21,7 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ep2sindy.app.yaml_files import CheckedFiles
+from ep2sindy.app.yaml_files import CheckedFiles, check_references
 
 FOLDERS = ("output", "keep", "cache")  # keys, at any depth, of what a run writes to
 SERVERS = ("address",)
@@ -140,7 +140,9 @@ def resolved(config: DictConfig) -> Iterator[tuple[str, Any]]:
 def _places(config: DictConfig) -> Iterator[tuple[str, Any]]:
     """The same before all of it can be resolved: Hydra makes a folder first."""
     written: Any = OmegaConf.to_container(config, resolve=False)
-    for place, value in _leaves({k: v for k, v in written.items() if k != "hydra"}, ""):
+    settings = {key: value for key, value in written.items() if key != "hydra"}
+    check_references(settings)
+    for place, value in _leaves(settings, ""):
         known = place.rpartition(".")[2] in FOLDERS + SERVERS and "${" in str(value)
         yield place, OmegaConf.select(config, place) if known else value
 

@@ -296,6 +296,11 @@ def _large() -> dict[str, Case]:
     model = "libraries: {model: {variables: [x, y], %s}}"
     texts = {
         "anchors": (bomb, "theirs.yaml"),
+        "doubling interpolations": (
+            "x0: 0123456789\n"
+            + "".join(f"x{k}: ${{x{k - 1}}}${{x{k - 1}}}\n" for k in range(1, 40)),
+            "may stand for",
+        ),
         "an anchor in itself": ("a: &a {b: *a}", "theirs.yaml"),
         "an interpolation of itself": ("data: {path: '${data.path}'}", "data.path"),
         "deep lists": ("a: " + "[" * 3000 + "]" * 3000, "theirs.yaml"),
