@@ -108,7 +108,7 @@ def test_the_answer_on_an_interrupted_file_is_not_taken_for_the_next(
     with monkeypatch.context() as patched:
         patched.setattr(guard, "_answers", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            guard.look_through_first(tmp_path / "damaged.mat")
+            guard.look_through_first(tmp_path / "damaged.mat", "HDF5")
     assert open_source(tmp_path / "sound.mat").names == ["x"]
 
 

@@ -191,7 +191,7 @@ def test_a_file_that_asks_for_too_much_is_refused_by_name(
 ) -> None:
     (tmp_path / "exp").mkdir()
     (tmp_path / "exp" / "theirs.yaml").write_text(text)
-    with pytest.raises(ValueError, match=rf"theirs\.yaml:? {message}"):
+    with pytest.raises(ValueError, match=rf"theirs\.yaml.* {message}"):
         loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
 
 

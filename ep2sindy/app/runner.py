@@ -92,14 +92,15 @@ def known_studies() -> list[str]:
 
 def check_common(config: DictConfig) -> None:
     """Raise ValueError for a seed, a name or a folder that cannot be."""
-    if not isinstance(config.output, str) or not config.output:
-        raise ValueError(f"output must be a folder's name: {config.output!r} came")
     if not isinstance(config.seed, int) or isinstance(config.seed, bool) or config.seed < 0:
         raise ValueError(f"seed must be a whole number, zero or more: {config.seed!r} came")
     if not str(config.experiment).isidentifier():
         raise ValueError(
             f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
         )
+    output = config.get("output")
+    if not isinstance(output, str) or not output:
+        raise ValueError(f"output must be a folder's name: {output!r} came")
 
 
 def check_overrides(overrides: Iterable[str], *, used: Collection[str], experiment: str) -> None:

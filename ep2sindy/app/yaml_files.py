@@ -35,7 +35,9 @@ class CheckedFiles(ConfigRepository):
             raise ValueError(f"{path} must not be nested hundreds of levels deep") from error
         except (ValueError, OmegaConfBaseException) as error:
             said = str(error) or type(error).__name__
-            raise ValueError(said if str(path) in said else f"{path}: {said}") from error
+            if str(path) in said:
+                raise
+            raise ValueError(f"{path} cannot be read as a config: {said}") from error
 
 
 def check_yaml(path: Path) -> None:
