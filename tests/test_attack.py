@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.attack import left
+from tests.attack import crafted, left
+from tests.attack.payloads import Case
 from tests.attack.writes import _spoken
 
 RUN = Path("out/weak/2026-01-01_000000")
@@ -123,3 +124,23 @@ def test_an_end_in_foreign_words_is_told_from_one_in_ours() -> None:
     assert _spoken(1, f"a warning\n{ours}\n", failed)[0] == "refused with path"
     for status, errors in ((0, ours), (1, f"Traceback\n{ours}"), (1, "error: no space"), (1, "")):
         assert _spoken(status, errors, failed)[0] == "foreign"
+
+
+SONGS = {
+    "writes": ("open('../elsewhere/song', 'w').write('x')", "opens ../elsewhere/song for writing"),
+    "runs": ("import os; os.system('true')", "os.system"),
+    "starts": ("import subprocess; subprocess.run(['true'])", "starts ['true']"),
+    "removes": ("import os; os.remove('../elsewhere/there')", "os.remove"),
+    "talks": ("import socket; socket.socket(type=2).connect(('127.0.0.1', 9))", "socket.connect"),
+}
+
+
+@pytest.mark.parametrize(("code", "noted"), SONGS.values(), ids=SONGS)
+def test_a_config_that_runs_something_is_betrayed(code: str, noted: str, tmp_path: Path) -> None:
+    """A module of one's own may be run, and stands here for what must not be."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "there").write_text("")
+    case = Case(("+exp=weak", "study=own.song"), {"own/song.py": code}, names="own")
+    kind, words = crafted.judged(case, tmp_path)
+    assert kind == "ran or wrote", words
+    assert noted in words
