@@ -69,15 +69,19 @@ def _line(rows: Sequence[dict[str, float]]) -> str:
     )
 
 
-ROUTES = {"joint": ep.Recipe(), "regression": ep.Recipe(ep.WeightedWeak())}
+ROUTES = {
+    "joint": ep.Recipe(),
+    "weighted rows": ep.Recipe(ep.WeightedWeak()),
+    "differential rows": ep.Recipe(ep.Differential(), ep.BestSubset()),
+}
 
 
 def misfits(systems: Sequence[str], n: int) -> None:
     """With a true term left out, and with the whole library where that is found."""
-    print("called a misfit:  a term left out, joint and regression; right equations, both")
-    totals = np.zeros((2, 2, 2), dtype=int)
+    print(f"called a misfit:  a term left out, by {', '.join(ROUTES)}; right equations, by all")
+    totals = np.zeros((2, len(ROUTES), 2), dtype=int)
     for name in systems:
-        counts = np.zeros((2, 2, 2), dtype=int)  # library, route, (called, of)
+        counts = np.zeros((2, len(ROUTES), 2), dtype=int)  # library, route, (called, of)
         for number in range(n):
             system, run = noisy(name, 0.05, number)
             library, true = system.model.library, system.model.coef != 0.0

@@ -116,3 +116,38 @@ def test_an_equation_that_is_given_is_not_held_down() -> None:
     found = discover(PELTS, None, Recipe(WeightedWeak()), terms=known)
     assert set(found.model.terms("hare")) == set(given)
     assert not any("rows are few" in a.message for a in found.ambiguities)
+
+
+ROWS = [Recipe(WeightedWeak()), Recipe(Differential(), BestSubset(), Bootstraps(n=0))]
+
+
+@pytest.mark.parametrize("recipe", ROWS, ids=["weighted", "differential"])
+def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: Recipe) -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=0)
+    full = polynomial(["x", "y"], degree=2)
+    found = discover(run, full, recipe)
+    for chosen in found.chosen.values():
+        assert chosen.chi_squared == pytest.approx(1.0, abs=0.3)
+        assert chosen.autocorrelation == pytest.approx(0.0, abs=0.2)
+        assert chosen.leaves_noise
+    assert found.misfit == ""
+    lacking = discover(run, full.take(np.array(full.names) != "x*y"), recipe)
+    assert not any(chosen.leaves_noise for chosen in lacking.chosen.values())
+    assert min(chosen.autocorrelation for chosen in lacking.chosen.values()) > 0.3
+    assert "no equation of this library leaves white noise of x'" in lacking.misfit
+    assert lacking.model.covariance is None
+
+
+def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=0)
+    only_one = polynomial(["x", "y"], degree=0)
+    found = discover(run, only_one, Recipe(Differential(), BestSubset(), Bootstraps(n=0)))
+    assert found.misfit
+
+
+def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=0)
+    few = Trajectory(t=run.t[:12], states=run.states[:12], state_names=run.state_names)
+    recipe = Recipe(Differential(), BestSubset(), Bootstraps(n=0))
+    found = discover(few, polynomial(["x", "y"], degree=1), recipe)
+    assert found.misfit == ""

@@ -8,9 +8,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.search.front import Candidate, ParetoFront
 
@@ -18,15 +21,46 @@ from ep2sindy.search.front import Candidate, ParetoFront
 # the noise is estimated from the samples that it judges. Measured: 0.7 to 1.3 with 70 rows.
 MOST_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
 
+SMALLEST = np.finfo(np.float64).tiny  # an exact fit leaves nothing
+
 
 def last_fit(front: ParetoFront, candidate: Candidate) -> Candidate:
     """A selected candidate as it goes into the model: weighted, where the noise is known."""
     return candidate if front.problem.noisy is None else reweighted(front.problem, candidate)
 
 
+def judged(
+    chosen: Sequence[Candidate], runs: Sequence[Trajectory], library: Library
+) -> list[Candidate]:
+    """Candidates with what their terms leave of the noise, also where their rows do not know it.
+
+    Then weak rows of the same runs are asked; coefficients stay as they are. Where there are none,
+    as of a record of a few samples, nothing is said.
+    """
+    unknown = [c for c in chosen if c.chi_squared is None]
+    if not unknown or not runs:
+        return list(chosen)
+    try:
+        rows = Weak(split=RandomSplit(0.0)).assemble(runs, library, rng=np.random.default_rng(0))
+        found = {problem.equations[0]: problem for problem in rows}
+        fitted = {c.equation: reweighted(found[c.equation], c) for c in unknown}
+    except (ValueError, np.linalg.LinAlgError):
+        return list(chosen)
+    return [_as_judged(c, fitted.get(c.equation, c)) for c in chosen]
+
+
+def _as_judged(candidate: Candidate, fitted: Candidate) -> Candidate:
+    return replace(
+        candidate,
+        chi_squared=fitted.chi_squared,
+        autocorrelation=fitted.autocorrelation,
+        leaves_noise=fitted.leaves_noise,
+    )
+
+
 def misfit_of(chosen: Sequence[Candidate]) -> str:
     """Which equations leave more than noise, in a sentence; empty where none does."""
-    left = {c.equation: c.chi_squared for c in chosen if c.chi_squared and c.covariance is None}
+    left = {c.equation: c.chi_squared for c in chosen if c.leaves_noise is False}
     if not left:
         return ""
     parts = ", ".join(f"{state}' ({value:.3g} times its size)" for state, value in left.items())
@@ -74,10 +108,12 @@ def reweighted(problem: Regression, candidate: Candidate, *, n_steps: int = 8) -
     left = rows.target - theta @ fitted
     freedom = max(len(left) - len(order), 1)
     chi_squared = float(left @ left) / freedom
-    explained = chi_squared <= MOST_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
+    leaves_noise = chi_squared <= MOST_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
     return replace(
         candidate,
         coef=fitted * scale[order],
-        covariance=root @ root.T if explained else None,
+        covariance=root @ root.T if leaves_noise else None,
         chi_squared=chi_squared,
+        autocorrelation=float(left[1:] @ left[:-1]) / max(float(left @ left), SMALLEST),
+        leaves_noise=bool(leaves_noise),
     )

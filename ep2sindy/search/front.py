@@ -27,7 +27,9 @@ class Candidate:
     covariance: (support, support) of coef, in SI, where noise has been followed to it.
     deviance: -2 log likelihood of whole trajectories plus the price of the terms, beside the best
     system's; None where rows alone were fitted. chi_squared: per row, of what the terms leave,
-    whitened by the noise that reaches the rows: 1 where the noise is all that is left.
+    whitened by the noise that reaches the rows: 1 where the noise is all that is left; then
+    autocorrelation, of a row's residual with the next, is 0, and leaves_noise is true. None where
+    the noise of the rows is not known.
     """
 
     equation: str
@@ -40,6 +42,8 @@ class Candidate:
     covariance: Float[np.ndarray, "support support"] | None = None
     deviance: float | None = None
     chi_squared: float | None = None
+    autocorrelation: float | None = None
+    leaves_noise: bool | None = None
 
     @property
     def n_terms(self) -> int:

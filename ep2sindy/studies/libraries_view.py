@@ -25,6 +25,7 @@ from ep2sindy.report.document import (
     pictures,
     places,
 )
+from ep2sindy.search.front import Candidate
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.estimate_view import estimate_section, estimate_summary
 from ep2sindy.studies.front_view import candidate_text, column_note, front_table, readable_front
@@ -233,8 +234,19 @@ def _library_section(name: str, result: LibraryResult, clock: Clock) -> Section:
         )
     for state in found.fronts:
         blocks.append(readable_front(result, state, clock))
+        blocks += [Text(each) for each in left_over(found.chosen[state])]
     blocks.append(Text(column_note(result.recipe.selection.label), page_only=True))
     return Section(f"{name}: candidates", [*blocks, Picture(f"front_{name}")])
+
+
+def left_over(chosen: Candidate) -> list[str]:
+    """A line on what the selected terms leave of the rows, where their noise is known."""
+    if chosen.chi_squared is None or chosen.autocorrelation is None:
+        return []
+    return [
+        f"left over of {chosen.equation}': {chosen.chi_squared:.3g} times the noise, "
+        f"autocorrelation {chosen.autocorrelation:.2f} (1 and 0 where noise alone is left)"
+    ]
 
 
 def _trajectory_summary(integrated: FreeRun, state: str) -> dict[str, Any]:
@@ -271,6 +283,8 @@ def _equation_summary(result: LibraryResult, state: str) -> dict[str, Any]:
         "r2_test": chosen.r2_test,
         "r2_train": chosen.r2_train,
         result.recipe.selection.label: float(scores.min()),
+        "chi_squared": chosen.chi_squared,
+        "residual_autocorrelation": chosen.autocorrelation,
         "share": chosen.share,
         "inclusion": dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True)),
         "text": equation_text(state, terms),
