@@ -1,6 +1,7 @@
 """A simulation that diverges or does not oscillate says so, whatever is done to it."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,3 +61,11 @@ def test_no_step_makes_a_simulation_silent(status: str, k: int) -> None:
 def test_a_run_that_broke_at_once_is_no_data() -> None:
     with pytest.raises(DivergedError, match="it diverged after 3; try shorter steps"):
         FieldSource(Data(simulation("diverged", 3))).field()
+
+
+@pytest.mark.parametrize("status", ["diverged", "steady", "decaying"])
+def test_a_file_of_a_simulation_says_what_it_is(status: str, tmp_path: Path) -> None:
+    ep.write_field(simulation(status).assign_attrs(channel_m=0.025), tmp_path / "run.nc")
+    field = ep.open_field(tmp_path / "run.nc")
+    assert is_simulation(field.attrs)
+    assert amiss(field.attrs) == amiss(simulation(status).attrs)

@@ -69,6 +69,7 @@ def open_field(
         axes = {axis: given or found.axes.get(axis) for axis, given in axes.items()}
     with file_named(source.path):
         field = _field(source, variables, axes, dt_s, mask, chunks)
+    field.attrs.update(source.attributes)
     if (length := channel_m or source.channel_m) is not None:
         field.attrs["channel_m"] = length
     field.attrs["file"] = str(path)

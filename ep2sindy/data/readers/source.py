@@ -27,7 +27,8 @@ class Source:
     it answers to, such as a column's number. units: name -> unit that all files of the kind have.
     step_s: of time, where the file says it elsewhere than in an array. channel_m: length of a
     thruster's channel, where the file says it. words: how it was read, for those who look into it.
-    is_table: whether its arrays are columns.
+    is_table: whether its arrays are columns. attributes: texts and numbers that are said of the
+    file as a whole.
     """
 
     path: Path
@@ -40,6 +41,7 @@ class Source:
     channel_m: float | None = None
     words: str = ""
     is_table: bool = False
+    attributes: Mapping[str, str | float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
             array.compute()  # damage is told here, with the file's name; the array stays on disk
         return array
 
-    return Source(path, names, read, dims_named=True, channel_m=length)
+    said = {str(k): v for k, v in dataset.attrs.items() if isinstance(v, str | int | float)}
+    return Source(path, names, read, dims_named=True, channel_m=length, attributes=said)
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:
