@@ -333,6 +333,16 @@ def test_a_library_without_a_true_term_is_called_a_misfit(term: str) -> None:
     assert "no model of this library fits these data" in found.misfit
 
 
+def test_an_equation_with_all_the_terms_that_it_may_have_is_a_misfit() -> None:
+    system = ep.lorenz()
+    run, library = system.trajectory(noise=0.05, rng=0), system.model.library
+    found = ep.estimate([run], library, ep.Joint(max_terms=3))
+    assert found.misfit.startswith("y' with as many terms as may be (max_terms=3): they may stand")
+    assert found.model.covariance is None
+    known = {"y": ["x", "y", "x*z"]}
+    assert ep.estimate([run], library, ep.Joint(max_terms=3), terms=known).misfit == ""
+
+
 def test_random_times_serve_as_well() -> None:
     system = ep.lorenz()
     run = system.trajectory(noise=0.05, rng=0)

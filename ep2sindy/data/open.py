@@ -69,7 +69,6 @@ def open_field(
         axes = {axis: given or found.axes.get(axis) for axis, given in axes.items()}
     with file_named(source.path):
         field = _field(source, variables, axes, dt_s, mask, chunks)
-    field.attrs.update(source.attributes)
     if (length := channel_m or source.channel_m) is not None:
         field.attrs["channel_m"] = length
     field.attrs["file"] = str(path)
@@ -119,7 +118,7 @@ def _field(
             field = mask_outside(field, inside[ours] != 0) if inside else field
     problems.check(source)
     check_field(field)
-    return field
+    return field.assign_attrs(source.attributes)
 
 
 def _placed(

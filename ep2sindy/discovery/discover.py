@@ -15,7 +15,7 @@ from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import choose
 from ep2sindy.discovery.estimated import estimated
-from ep2sindy.discovery.last_fit import misfit_of
+from ep2sindy.discovery.last_fit import judged, misfit_of
 from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.estimation.joint import Joint
@@ -118,23 +118,23 @@ def discover(
     asked = Asked(relations_of(relations), terms or {})
     check_asked(asked, library, trajectories[0].state_names)
     estimate, fronts = _searched(trajectories, library, recipe, asked, seed)
-    labels = ", ".join(run.label for run in trajectories)
     choice = choose(
         list(fronts.values()),
         recipe.selection,
         asked.relations,
         units=trajectories[0].units,
-        provenance=recipe.provenance | {"trajectories": labels},
+        provenance=recipe.provenance | {"trajectories": ", ".join(r.label for r in trajectories)},
         estimate=estimate,
     )
+    chosen = choice.chosen if estimate else judged(choice.chosen, trajectories, library)
     findings = _findings([front.problem for front in fronts.values()], recipe, asked)
     return Discovery(
         fronts=fronts,
         scores=dict(zip(fronts, choice.scores, strict=True)),
-        chosen=dict(zip(fronts, choice.chosen, strict=True)),
+        chosen=dict(zip(fronts, chosen, strict=True)),
         model=choice.model,
         ambiguities=findings,
-        note=choice.note,
+        note=choice.note or ("" if estimate else misfit_of(chosen)),
         estimate=estimate,
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -109,13 +109,16 @@ def estimate(
         state: _weighed(problem, pair, found, block, search)
         for block, state in enumerate(problem.states)
     }
+    misfit = _misfit(problem, found) or _at_limit(problem, found, search)
+    model = _model(problem, library, found, units or runs[0].units, provenance or {})
     return Estimate(
-        model=_model(problem, library, found, units or runs[0].units, provenance or {}),
+        # The intervals of a model that leaves more than noise would not hold the truth.
+        model=replace(model, covariance=None) if misfit else model,
         paths=tuple(path * problem.scale for path in fit.paths),
         noise_std=found.noise.std * problem.scale,
         memory=found.noise.memory,
         flow_error=found.flow_error,
-        misfit=_misfit(problem, found),
+        misfit=misfit,
         few=_few(problem, search.terms_for(problem)),
         weighed=weighed,
         rivals=_rivals(problem, found, weighed),
@@ -171,7 +174,6 @@ def _model(
     used = values != 0.0
     order = np.lexsort((problem.column[used], problem.equation[used]))
     rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
-    # The intervals of a model that leaves more than noise would not hold the truth.
     free_cov = covariance(problem, fit, found.annealed.level) if found.fits else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
     return SparseModel(library, problem.states, coef, units, provenance, cov)
@@ -236,4 +238,23 @@ def _misfit(problem: Problem, found: Solution) -> str:
         "no model of this library fits these data as far as their noise: "
         + "; ".join(signs)
         + ". The equations are the nearest found; add terms or states, or judge them by free run"
+    )
+
+
+def _at_limit(problem: Problem, found: Solution, search: Joint) -> str:
+    """A word where an equation takes all the terms that it may: many that stand in for another."""
+    if search.terms_for(problem) < search.max_terms:
+        return ""  # too few samples: that is told of anyway
+    used = _coef_SI(problem, found.annealed.fit.free) != 0.0
+    full = [
+        f"{state}'"
+        for block, state in enumerate(problem.states)
+        if used[own := problem.equation == block].sum() >= search.max_terms < own.sum()
+    ]
+    if not full:
+        return ""
+    return (
+        f"{', '.join(full)} with as many terms as may be (max_terms={search.max_terms}): they may "
+        "stand for one that the library lacks, and intervals are not given; add terms to it, or "
+        "raise max_terms"
     )
