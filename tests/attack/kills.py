@@ -92,6 +92,18 @@ def paired(folder: Path, seed: int) -> Callable[[str], Outcome]:
     return attacked
 
 
+def threaded(folder: Path) -> Callable[[str], Outcome]:
+    """The attack on case RUN: the environment asks for two threads."""
+
+    def attacked(case: str) -> Outcome:
+        whole = reference(folder, case)
+        place = whole.copied(folder / "threaded")
+        wrong = ended_well(start(case, place, threads=2, said=subprocess.PIPE), place, whole)
+        return (wrong[0].partition(":")[0] if wrong else "same bytes"), f"{wrong or ''}"
+
+    return attacked
+
+
 def _end_of(run: subprocess.Popen[str]) -> tuple[int, str, str]:
     """Status, what it printed, and the last line of its errors."""
     try:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from ep2sindy.machine.threads import NUMBERS
 from tests.attack.left import EARLIER, contents, finished
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -53,18 +54,25 @@ SIDE_BY_SIDE = {"simulate", "pointwise", "parametric", "predict"}  # in two work
 
 
 def start(
-    name: str, folder: Path, *, fail: int = 0, full: bool = False, said: int = subprocess.DEVNULL
+    name: str,
+    folder: Path,
+    *,
+    fail: int = 0,
+    full: bool = False,
+    threads: int = 1,
+    said: int = subprocess.DEVNULL,
 ) -> subprocess.Popen[str]:
     """Start a small run in a folder, in which all its paths lie.
 
-    fail: which of its writes fails; full: on a full device, instead of at the opening.
+    fail: which of its writes fails; full: on a full device, instead of at the opening. threads:
+    what the environment asks for.
     """
     temporary = folder / "tmp"
     temporary.mkdir(exist_ok=True)
     own = {
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent / "layer"), str(ROOT)]),
         "EP2SINDY_ATTACK": json.dumps({"folder": str(folder), "fail": fail, "full": full}),
-        "OMP_NUM_THREADS": "1",
+        **dict.fromkeys(NUMBERS, str(threads)),
         "TMPDIR": str(temporary),
         "JOBLIB_TEMP_FOLDER": str(temporary),
     }
