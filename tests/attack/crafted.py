@@ -24,8 +24,8 @@ ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S, MEMORY = 90.0, 3 * 2**30
 CASES: Mapping[str, Case] = {**crafted_configs.cases(), **crafted_files.cases()}
 
-# Processes that the package starts itself, whatever it is given.
-OURS = ("rev-parse", "status", "ep2sindy.data.readers.probe", "uname")
+# Processes that the package and its libraries start themselves, whatever they are given.
+OURS = ("rev-parse", "status", "ep2sindy.data.readers.probe", "uname", "fc-list")
 RUNS = {"os.system", "os.exec", "os.posix_spawn", "os.startfile", "pty.spawn"}
 TALKS = {"socket.connect", "socket.bind", "socket.getaddrinfo", "socket.sendto"}
 CHANGES = {
