@@ -39,6 +39,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"covariance": (2.0 * np.ones((N, N)) - np.eye(N)).tolist()}, "no variance"),
     ({"covariance": np.eye(N - 1).tolist()}, "a row and a column per coefficient"),
     ({"covariance": [[1.0]] * N}, "must hold"),
+    ({"covariance": [["1"] * N] * N}, "a covariance that is not of numbers"),
+    ({"covariance": [[True] * N] * N}, "a covariance that is not of numbers"),
     ({"covariance": 5}, "must hold"),
 ]
 

@@ -113,6 +113,8 @@ def texts_in(value: Any, what: str) -> dict[str, str]:
 
 def covariance_in(rows: Any) -> Float[np.ndarray, "_ _"]:
     """Rows of a stored matrix, which may be empty, and must be one that a covariance can be."""
+    if not all(type(value) in (int, float) for row in rows for value in row):
+        raise ValueError("a covariance that is not of numbers")
     found = np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))
     variances = np.diag(found)
     if not np.isfinite(found).all() or (variances < 0.0).any():
