@@ -6,6 +6,7 @@ import html
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from ep2sindy.data.held import Held
@@ -151,13 +152,17 @@ class Inspection:
                 self._role(one) + step]  # fmt: skip
 
     def _role(self, one: Held) -> str:
-        roles = {**self.found.axes, **self.found.variables}
-        named = [
-            f"{ours} in {v.unit}"
-            for ours, v in roles.items()
-            if v.name == one.name or str(v.name).startswith(f"{one.name}[")
-        ]
-        return ", ".join(named) or "-"
+        return ", ".join(self._roles.get(one.name, [])) or "-"
+
+    @cached_property
+    def _roles(self) -> dict[str, list[str]]:
+        """What arrays of the file, or parts of one, are for us."""
+        roles: dict[str, list[str]] = {}
+        for ours, variable in {**self.found.axes, **self.found.variables}.items():
+            name = str(variable.name)
+            for each in {name, name.partition("[")[0]}:
+                roles.setdefault(each, []).append(f"{ours} in {variable.unit}")
+        return roles
 
 
 def inspect(path: str | Path) -> Inspection:

@@ -121,11 +121,10 @@ def read_array(source: Source, ours: str, name: str) -> xr.DataArray:
 
 def _parted(source: Source, name: str) -> tuple[str | None, tuple[int | slice, ...]]:
     """The array that a name means, and the part of it; None where there is no such array."""
-    names = {*source.names, *source.aliases}
-    if name in names:
+    if name in source.known:
         return name, ()
     found = PART.fullmatch(name)
-    if found is None or found[1] not in names:
+    if found is None or found[1] not in source.known:
         return None, ()
     parts = [part.strip() for part in found[2].split(",")]
     if not all(re.fullmatch(r":|-?\d+", part) for part in parts):

@@ -175,21 +175,25 @@ def _variables(
     """Arrays that fit the axes in one way, under our names where theirs are known."""
     fit = [each for each in rest if _fits(each, axes, held, lengths, questions)]
     found: dict[str, Variable] = {}
+    meant = {each.name: meant_by(each.name) for each in fit}
     for ours, quantity in QUANTITIES.items():
-        options = [each for each in fit if ours in meant_by(each.name) and _may_be(ours, each)]
+        options = [each for each in fit if ours in meant[each.name] and _may_be(ours, each)]
         exact = [each for each in options if each.name == ours] or options
         if len(exact) == 1:
             found[ours] = with_unit(ours, exact[0], quantity, guesses)
         elif exact:
             names = " or ".join(repr(each.name) for each in exact)
             questions.append(f"{ours} may be {names}: name one")
-    taken = {variable.name for variable in found.values()}
+    taken, used = {variable.name for variable in found.values()}, {*found, *lengths, "time"}
     for each in fit:
         if each.name not in taken:
-            ours = _own_name(each.name, {*found, *lengths, "time"})
+            ours = _own_name(each.name, used)
             found[ours] = Variable(each.name, own_unit(ours, each))
+            used.add(ours)
     for each in rest:
-        found |= _columns(each, lengths, {*found, *lengths, "time"})
+        columns = _columns(each, lengths, used)
+        found |= columns
+        used |= columns.keys()
     return found
 
 

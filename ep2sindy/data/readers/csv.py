@@ -35,9 +35,10 @@ def read_csv(path: Path) -> Source:
     header = layout.header
     names = {header.names[j]: j for j in layout.columns if j < len(header.names)}
     numbered = {str(j): j for j in layout.columns}
+    places = numbered | names
 
     def read(name: str) -> xr.DataArray:
-        j = (numbered | names)[name]
+        j = places[name]
         values = _numbers(frame[j], name, layout)
         return xr.DataArray(values, attrs={"units": header.units[j]})
 

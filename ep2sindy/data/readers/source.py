@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,6 +43,11 @@ class Source:
     words: str = ""
     is_table: bool = False
     attributes: Mapping[str, str | float] = field(default_factory=dict)
+
+    @cached_property
+    def known(self) -> frozenset[str]:
+        """All that may be read: names, and aliases."""
+        return frozenset([*self.names, *self.aliases])
 
 
 @dataclass(frozen=True)
