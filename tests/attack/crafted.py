@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import resource
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -37,7 +38,13 @@ MODULES = {"this", "antigravity", "idlelib.idle"}  # that nothing here needs
 
 def attack(folder: Path) -> Callable[[str], Outcome]:
     """The attack on one case, in a folder of its own."""
-    return lambda name: judged(CASES[name], folder / re.sub(r"\W+", "_", name))
+
+    def attacked(name: str) -> Outcome:
+        own = folder / re.sub(r"\W+", "_", name)
+        shutil.rmtree(own, ignore_errors=True)  # of a time before
+        return judged(CASES[name], own)
+
+    return attacked
 
 
 def cases(n: int) -> Iterator[str]:
