@@ -45,7 +45,7 @@ benchmark: .venv/installed
 
 # Mutated files; runs that are killed, that cannot write, two at once, many in one process: a
 # quarter of an hour, goes on where it was broken off, and prints the table of docs/trust.md.
-# All of it: ARGS="--files 5000 --kills 200 --writes 9999 --pairs 21 --soak 50".
+# How to ask for all of it stands there, too.
 attack: .venv/installed
 	$(BIN)/python -m tests.attack $(ARGS)
 

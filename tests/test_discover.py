@@ -6,12 +6,14 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.library.library import polynomial
+from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
+from ep2sindy.selection.criteria import BIC
+from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.knees import Knee
 from ep2sindy.synthetic.systems import lotka_volterra
 
@@ -141,8 +143,30 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: Recipe)
 def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     only_one = polynomial(["x", "y"], degree=0)
-    found = discover(run, only_one, Recipe(Differential(), BestSubset(), Bootstraps(n=0)))
+    found = discover(run, only_one, Recipe(Differential(), BestSubset(), Bootstraps(n=0), BIC()))
+    assert {chosen.terms for chosen in found.chosen.values()} == {()}
+    assert "x'" in found.misfit
+
+
+def test_intervals_under_relations_are_withheld_where_a_term_is_missing() -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=0)
+    full, recipe = polynomial(["x", "y"], degree=2), Recipe(WeightedWeak())
+    relation = "x: x*y == -1 * y: x*y"
+    found = discover(run, full, recipe, relations=[relation])
+    assert found.misfit == ""
+    assert found.model.covariance is not None
+    lacking = full.take(np.array(full.names) != "x*y")
+    found = discover(run, lacking, recipe, relations=["x: x^2 == -1 * y: x^2"])
     assert found.misfit
+    assert found.model.covariance is None
+
+
+def test_a_rule_that_judges_free_runs_says_nothing_of_the_noise_of_rows() -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=0)
+    recipe = Recipe(WeightedWeak(), BestSubset(max_terms=2), Bootstraps(n=0), FreeRunScore())
+    found = discover(run, named_terms(["x", "y"], ["x", "y", "x*y"]), recipe)
+    assert [chosen.chi_squared for chosen in found.chosen.values()] == [None, None]
+    assert found.misfit == ""
 
 
 def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:

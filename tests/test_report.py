@@ -154,6 +154,8 @@ def test_marks_of_a_figure_say_more_under_the_mouse() -> None:
         (None, "a template must be a file of HTML for Jinja2: .* is none; leave it out"),
         ("{{ nothing }}", "cannot be filled: 'nothing' is undefined"),
         ("{% if %}", "cannot be filled: Expected an expression"),
+        ("{{ title.__class__.__mro__ }}", "cannot be filled: .* attribute '__class__' .* unsafe"),
+        ("{{ parts.clear() }}", "cannot be filled: .* attribute 'clear' .* unsafe"),
     ],
 )
 def test_a_template_that_cannot_be_filled_is_refused(

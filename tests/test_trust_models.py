@@ -95,6 +95,16 @@ def test_gram_matrices_are_counted_before_they_are_made(monkeypatch: pytest.Monk
         ep.discover(run, library, recipe)
 
 
+def test_a_search_of_all_subsets_counts_what_it_carries_along(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """600 terms at sizes up to 100: 101 matrices of 601 x 601."""
+    monkeypatch.setattr(memory, "free_bytes", lambda: 200_000_000)
+    message = r"600 terms at each of 100 sizes would take 0.292 GB .* lower max_terms"
+    with pytest.raises(ValueError, match=message):
+        ep.BestSubset(max_terms=100).supports(np.eye(600), np.ones(600), 600.0)
+
+
 def test_values_are_counted_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "free_bytes", lambda: 1_000_000)
     samples = np.broadcast_to(np.ones(3), (10_000_000, 3))

@@ -62,7 +62,10 @@ def main() -> None:
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
         sys.exit(f"error: {str(error) or type(error).__name__}")
     except OSError as error:
-        sys.exit(f"error: {error}; a folder that can be written is chosen with output=PATH")
+        sys.exit(
+            f"error: {error}; where a run writes is chosen with output=PATH, and where it keeps "
+            "what it can use again with data.cache=PATH or keep=PATH"
+        )
     except KeyboardInterrupt:
         sys.exit("interrupted: files under their final names are whole")
     finally:

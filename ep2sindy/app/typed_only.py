@@ -54,7 +54,9 @@ class CheckedLoader(ConfigLoaderImpl):
         typed = _settings(without)
         typed["overrides.task"] = [text for text in overrides if text not in hydras]
         check_hydra(_settings(found), typed)
-        check_places(_places(found), overrides)
+        written = _written(found)
+        check_references(written)
+        check_places(_places(found, written), overrides)
         return found
 
 
@@ -137,12 +139,15 @@ def resolved(config: DictConfig) -> Iterator[tuple[str, Any]]:
             yield from _leaves(plain, str(key))
 
 
-def _places(config: DictConfig) -> Iterator[tuple[str, Any]]:
-    """The same before all of it can be resolved: Hydra makes a folder first."""
+def _written(config: DictConfig) -> dict[str, Any]:
+    """All that a config says but Hydra's own, as it is written."""
     written: Any = OmegaConf.to_container(config, resolve=False)
-    settings = {key: value for key, value in written.items() if key != "hydra"}
-    check_references(settings)
-    for place, value in _leaves(settings, ""):
+    return {key: value for key, value in written.items() if key != "hydra"}
+
+
+def _places(config: DictConfig, written: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The same before all of it can be resolved: Hydra makes a folder first."""
+    for place, value in _leaves(written, ""):
         known = place.rpartition(".")[2] in FOLDERS + SERVERS and "${" in str(value)
         yield place, OmegaConf.select(config, place) if known else value
 

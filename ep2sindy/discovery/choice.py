@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Relation, constraint
 from ep2sindy.constraints.support import binding
-from ep2sindy.discovery.last_fit import assemble_model, last_fit, misfit_of
+from ep2sindy.discovery.last_fit import assemble_model, last_fit
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.model.model import SparseModel
 from ep2sindy.search.front import Candidate, ParetoFront
@@ -76,7 +76,7 @@ def choose(
     best = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
     chosen = [last_fit(*pair) for pair in zip(fronts, best, strict=True)]
     model = assemble_model(library, chosen, units=units, provenance=provenance)
-    return Choice(scores, chosen, model, misfit_of(chosen))
+    return Choice(scores, chosen, model)
 
 
 def _least_sum(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from ep2sindy.constraints.relations import Relation
 from ep2sindy.constraints.support import relations_of
 from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import choose
+from ep2sindy.discovery.choice import Choice, choose
 from ep2sindy.discovery.estimated import estimated
 from ep2sindy.discovery.last_fit import judged, misfit_of
 from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
@@ -27,6 +27,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows
 from ep2sindy.regression.rows import Regression
 from ep2sindy.search.front import Candidate, ParetoFront
+from ep2sindy.selection.rule import SystemSelection
 
 MOST_NOTES = 6  # on a screen
 
@@ -126,17 +127,28 @@ def discover(
         provenance=recipe.provenance | {"trajectories": ", ".join(r.label for r in trajectories)},
         estimate=estimate,
     )
-    chosen = choice.chosen if estimate else judged(choice.chosen, trajectories, library)
+    choice = _judged(choice, trajectories, library, recipe)
     findings = _findings([front.problem for front in fronts.values()], recipe, asked)
     return Discovery(
         fronts=fronts,
         scores=dict(zip(fronts, choice.scores, strict=True)),
-        chosen=dict(zip(fronts, chosen, strict=True)),
+        chosen=dict(zip(fronts, choice.chosen, strict=True)),
         model=choice.model,
         ambiguities=findings,
-        note=choice.note or ("" if estimate else misfit_of(chosen)),
+        note=choice.note,
         estimate=estimate,
     )
+
+
+def _judged(choice: Choice, runs: Sequence[Trajectory], library: Library, recipe: Recipe) -> Choice:
+    """A choice among rows that says what it leaves of the noise, without intervals where that is
+    more than noise. Estimates, and rules that judge whole systems, have judged by then."""
+    if isinstance(recipe.search, Joint) or isinstance(recipe.selection, SystemSelection):
+        return choice
+    chosen = judged(choice.chosen, runs, library)
+    misfit = misfit_of(chosen)
+    model = replace(choice.model, covariance=None) if misfit else choice.model
+    return replace(choice, chosen=chosen, model=model, note=choice.note or misfit)
 
 
 def _findings(

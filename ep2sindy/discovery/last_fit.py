@@ -52,6 +52,7 @@ def judged(
 def _as_judged(candidate: Candidate, fitted: Candidate) -> Candidate:
     return replace(
         candidate,
+        covariance=candidate.covariance if fitted.leaves_noise else None,
         chi_squared=fitted.chi_squared,
         autocorrelation=fitted.autocorrelation,
         leaves_noise=fitted.leaves_noise,

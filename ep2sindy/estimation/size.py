@@ -37,7 +37,7 @@ def check_size(
     )
     if n > SOON:
         warnings.warn(
-            f"{what} are searched together, which takes minutes, and hours from 1000 on: fewer "
+            f"{what} are searched together, which may take many minutes: fewer "
             "terms, or a search equation by equation, Recipe(WeightedWeak()), take seconds",
             SlowSearch,
             stacklevel=2,

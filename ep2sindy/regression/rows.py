@@ -145,22 +145,27 @@ class Regression:
     def test_gram(self) -> Grams:
         return self._grams((self.test_rows.T @ self.test_rows)[None])
 
+    def check_grams(self, n_draws: int) -> None:
+        """Raise ValueError where the Gram matrices of so many draws are more than memory holds."""
+        n_columns = self.train_rows.shape[1]
+        each = 8.0 * 5.0 * n_columns**2  # whole, and what is scaled of it
+        products_of_rows = 3.0 * 4.0 * n_columns**2 * min(ROW_BLOCK, len(self.train_rows))
+        check_memory(
+            each * n_draws + products_of_rows,
+            f"Gram matrices of {len(self.library)} terms in {n_draws} bootstraps",
+            way_out="lower bootstraps.n, take fewer terms, or a lower degree",
+            each=each,
+        )
+
     def resampled_grams(self, weights: Float[np.ndarray, "draws train"]) -> Grams:
         """Gram matrices of the training rows, each row counted `weights` times, per draw.
 
         All draws share the products of pairs of columns, so each draw is one row of a matrix
         product; blocks of rows keep those products small.
         """
+        self.check_grams(len(weights))
         rows = self.train_rows
         n_columns = rows.shape[1]
-        each = 8.0 * 5.0 * n_columns**2  # whole, and what is scaled of it
-        products_of_rows = 3.0 * 4.0 * n_columns**2 * min(ROW_BLOCK, len(rows))
-        check_memory(
-            each * len(weights) + products_of_rows,
-            f"Gram matrices of {len(self.library)} terms in {len(weights)} bootstraps",
-            way_out="lower bootstraps.n, take fewer terms, or a lower degree",
-            each=each,
-        )
         first, second = np.triu_indices(n_columns)
         sums = np.zeros((len(weights), len(first)))
         for start in range(0, len(rows), ROW_BLOCK):

@@ -51,17 +51,23 @@ def page_html(
 
 
 def _environment(template: Path) -> Environment:
-    """Templates beside this one, then the package's; functions for what HTML does not know."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    """Templates beside this one, then the package's; functions for what HTML does not know.
 
-    environment = Environment(
+    Sandboxed: a template from someone else reads what it is given, and runs nothing.
+    """
+    from jinja2 import FileSystemLoader, StrictUndefined
+    from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+    environment = ImmutableSandboxedEnvironment(
         loader=FileSystemLoader([template.parent, TEMPLATES]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(equation=equation_html, cell=cell_html, classes=_classes)
+    environment.globals.update(
+        equation=equation_html, cell=cell_html, classes=_classes, kind_of=_kind
+    )
     environment.filters.update(numeric=numeric_columns, raised=raised_html)
     return environment
 
@@ -109,6 +115,10 @@ def numeric_columns(table: Table) -> list[bool]:
 def _is_number(value: Any) -> bool:
     """A number, perhaps with a unit, or the dash for none."""
     return bool(re.fullmatch(r"-|[+-]?\d[\d.e+-]*( ?[%µ\w/^-]{1,5})?", cell_text(value)))
+
+
+def _kind(block: object) -> str:
+    return type(block).__name__
 
 
 def _classes(table: Table, row: int) -> str:

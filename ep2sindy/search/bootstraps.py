@@ -147,6 +147,8 @@ def resamples(
 
     Terms that are zero, or depend on simpler ones, are left out (see `ambiguities`).
     """
+    if bootstraps.n:
+        problem.check_grams(bootstraps.n)  # before the work on terms, which may take minutes
     grams, kept = bootstraps.draw(problem, usable_terms(problem), rng)
     # A resample changes the norms: unit columns again, so that no unit or draw leaks in; a
     # culled term becomes a column of zeros.

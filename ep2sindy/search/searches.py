@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.machine.memory import check_memory
 from ep2sindy.search.kernels import adaptive_lasso_supports, best_subsets, thresholded_supports
 
 
@@ -124,6 +125,12 @@ class BestSubset:
         their own in every problem, that is the largest likelihood when all have as many rows. No
         weight is needed, since the scale of one problem multiplies all products alike.
         """
+        depth = min(self.max_terms, xy.shape[1])
+        check_memory(
+            8.0 * (depth + 1) * len(xy) * (xy.shape[1] + 1.0) ** 2,
+            f"Gram matrices of {xy.shape[1]} terms at each of {depth} sizes",
+            way_out="lower max_terms, take fewer terms, or a lower degree",
+        )
         # Branches are cut sooner when the columns closest to the targets come first.
         order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
         found = best_subsets(

@@ -15,7 +15,7 @@ from tests.attack.runs import RUNS
 
 GOOD = {
     "same values", "other values", "refused", "harmless",  # files, crafted ones too
-    "same bytes",  # killed runs, and two threads
+    "same bytes",  # killed runs, two threads, one core
     "refused with path", "recovered", "fewer writes",  # failing writes
     "both ended", "one refused",  # two runs at once
     "no growth",  # soaks
@@ -28,7 +28,9 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=7, help="runs ended at random moments")
     parser.add_argument("--writes", type=int, default=14, help="writes made to fail, of some 750")
     parser.add_argument("--pairs", type=int, default=3, help="two runs at once in one folder")
-    parser.add_argument("--threads", type=int, default=2, help="runs on two threads, of 7")
+    parser.add_argument(
+        "--machines", type=int, default=2, help="runs on two threads, and on one core, of 7"
+    )
     parser.add_argument("--soak", type=int, default=5, help="rounds of short runs in one process")
     parser.add_argument("--crafted", type=int, default=40, help="crafted files, of some 260")
     parser.add_argument("--seed", type=int, default=0)
@@ -64,7 +66,8 @@ def attacks(
         ("killed runs", kills.in_turn(asked.kills), kills.killed(runs, seed)),
         ("failing writes", failing, writes.failing(runs)),
         ("two runs at once", kills.in_turn(asked.pairs), kills.paired(runs, seed)),
-        ("two threads", list(RUNS)[: asked.threads], kills.threaded(runs)),
+        ("two threads", list(RUNS)[: asked.machines], kills.elsewhere(runs, threads=2)),
+        ("one core", list(RUNS)[: asked.machines], kills.elsewhere(runs, cores=1)),
         ("crafted files", crafted.cases(asked.crafted), crafted.attack(folder / "crafted")),
         ("soaks", rounds, soak.soaked(runs)),
     ]

@@ -23,7 +23,7 @@ TIMES = 1e-6 * np.arange(40)
 VALUES = 1e18 * (2.0 + np.sin(0.3 * np.arange(40)))
 ENDINGS = ("nc", "nc3", "nc5", "h5", "mat", "mat73", "npz", "csv", "json", "zarr2", "zarr3")
 LIMIT_S, MEMORY = 60.0, 2**31
-OTHER, WRONGLY = "other values", " without damage to numbers"
+SAME, OTHER, WRONGLY = "same values", "other values", " without damage to numbers"
 
 
 Sound = dict[str, bytes]  # the files of a store by their names; of a single file, by "."
@@ -66,6 +66,11 @@ def whole(folder: Path) -> dict[str, Sound]:
 def _files(place: Path) -> Sound:
     found = [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.is_file())
     return {str(path.relative_to(place)): path.read_bytes() for path in found}
+
+
+def file_ending(kind: str) -> str:
+    """What a file of a kind is called: its version is inside."""
+    return kind.rstrip("2357")
 
 
 def payload(name: str, data: bytes) -> list[range]:
@@ -123,7 +128,7 @@ def attack(folder: Path, seed: int) -> Callable[[str], Outcome]:
     readers: list[subprocess.Popen] = []
 
     def asked(ending: str, content: Sound) -> Outcome:
-        path = folder / f"case.{ending.rstrip('2357')}"
+        path = folder / f"case.{file_ending(ending)}"
         shutil.rmtree(path, ignore_errors=True)
         for name, data in content.items():
             (path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -191,7 +196,7 @@ def read(path: Path) -> Outcome:
     except Exception as error:
         return "foreign error", repr(error)
     same = np.array_equal(field["n_i"].values, VALUES) and np.array_equal(field["time"], TIMES)
-    return ("same values", "") if same else (OTHER, "")
+    return (SAME if same else OTHER), ""
 
 
 def main() -> None:

@@ -92,13 +92,13 @@ def paired(folder: Path, seed: int) -> Callable[[str], Outcome]:
     return attacked
 
 
-def threaded(folder: Path) -> Callable[[str], Outcome]:
-    """The attack on case RUN: the environment asks for two threads."""
+def elsewhere(folder: Path, **machine: int) -> Callable[[str], Outcome]:
+    """The attack on case RUN: another number of threads, or of cores and so of workers."""
 
     def attacked(case: str) -> Outcome:
         whole = reference(folder, case)
-        place = whole.copied(folder / "threaded")
-        wrong = ended_well(start(case, place, threads=2, said=subprocess.PIPE), place, whole)
+        place = whole.copied(folder / "elsewhere")
+        wrong = ended_well(start(case, place, **machine, said=subprocess.PIPE), place, whole)
         return (wrong[0].partition(":")[0] if wrong else "same bytes"), f"{wrong or ''}"
 
     return attacked

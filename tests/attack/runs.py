@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from ep2sindy.machine.threads import NUMBERS
@@ -50,7 +50,6 @@ RUNS = {
         "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}]",
     ),
 }  # fmt: skip
-SIDE_BY_SIDE = {"simulate", "pointwise", "parametric", "predict"}  # in two workers
 
 
 def start(
@@ -60,12 +59,13 @@ def start(
     fail: int = 0,
     full: bool = False,
     threads: int = 1,
+    cores: int = 0,
     said: int = subprocess.DEVNULL,
 ) -> subprocess.Popen[str]:
     """Start a small run in a folder, in which all its paths lie.
 
     fail: which of its writes fails; full: on a full device, instead of at the opening. threads:
-    what the environment asks for.
+    what the environment asks for. cores: on how many of the machine's it runs; 0, on all.
     """
     temporary = folder / "tmp"
     temporary.mkdir(exist_ok=True)
@@ -76,19 +76,20 @@ def start(
         "TMPDIR": str(temporary),
         "JOBLIB_TEMP_FOLDER": str(temporary),
     }
-    side_by_side = ["parallel.n_jobs=2"] if name in SIDE_BY_SIDE else []
-    line = [f"+exp={name}", "output=out", *RUNS[name], *side_by_side]
+    line = [f"+exp={name}", "output=out", *RUNS[name]]
     return subprocess.Popen(
         [sys.executable, "-m", "ep2sindy.app.main", *line],
         cwd=folder, env={**os.environ, **own}, stdin=subprocess.DEVNULL, stdout=said, stderr=said,
-        text=True, preexec_fn=_as_from_a_terminal,
+        text=True, preexec_fn=partial(_as_from_a_terminal, cores),
     )  # fmt: skip
 
 
-def _as_from_a_terminal() -> None:
+def _as_from_a_terminal(cores: int) -> None:
     """A job in the background, and nohup, have signals ignored, and that is inherited."""
     for each in (signal.SIGINT, signal.SIGHUP):
         signal.signal(each, signal.SIG_DFL)
+    if cores:
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
 
 
 @dataclass(frozen=True)

@@ -63,13 +63,14 @@ def run_freely() -> None:
 def files() -> None:
     """Every kind is written and read, those of C libraries in a process of their own first."""
     import ep2sindy as ep
-    from tests.attack.files import read, whole
+    from tests.attack.files import SAME, file_ending, read, whole
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for ending in whole(folder):
-            path = (folder / f"a.{ending}").rename(folder / f"b.{ending.rstrip('357')}")
-            assert read(path)[0] == "same", path
+            (folder / ending).mkdir()
+            path = (folder / f"a.{ending}").rename(folder / ending / f"b.{file_ending(ending)}")
+            assert read(path)[0] == SAME, path
         model = ep.lorenz().model
         model.save(folder / "model.json")
         assert ep.SparseModel.load(folder / "model.json").to_json() == model.to_json()

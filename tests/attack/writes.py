@@ -12,7 +12,12 @@ from tests.attack.results import Outcome
 from tests.attack.runs import LIMIT_S, RUNS, Reference, reference, start
 
 REASON = "No space left on device"
-WAYS_OUT = ("make room", "choose another", "is chosen with output=PATH", "start the same run again")
+WAYS_OUT = (
+    "make room",
+    "choose another",
+    "where a run writes is chosen with output=PATH",
+    "start the same run again",
+)
 
 
 def failing(folder: Path) -> Callable[[str], Outcome]:
