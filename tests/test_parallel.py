@@ -186,12 +186,15 @@ def test_a_piece_that_fails_is_told_in_our_words_alone(tmp_path: Path) -> None:
 
 KILLED = """
 import os, sys, time
+import numpy as np
 from ep2sindy.machine.interruption import end_as_interrupted
 from ep2sindy.machine.parallel import Loky
+from ep2sindy.search.searches import BestSubset
 
 def slow(piece):
+    columns = np.random.default_rng(0).standard_normal((99, 60))
     os.write(1, f"{os.getpid()}\\n".encode())
-    time.sleep(60)
+    WORK
 
 if __name__ == "__main__":
     end_as_interrupted()
@@ -202,11 +205,16 @@ if __name__ == "__main__":
 """
 
 
+WAITING = "time.sleep(60)"
+COMPUTING = "BestSubset(max_terms=20).supports(columns.T @ columns, np.ones(60), 1e9)"  # for hours
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGKILL"])
-def test_workers_end_with_their_run(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("work", [WAITING, COMPUTING], ids=["waiting", "computing"])
+def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> None:
     script = tmp_path / "run.py"
-    script.write_text(KILLED)
+    script.write_text(KILLED.replace("WORK", work))
     with subprocess.Popen(
         [sys.executable, script],
         stdout=subprocess.PIPE,
@@ -218,6 +226,7 @@ def test_workers_end_with_their_run(tmp_path: Path, name: str) -> None:
         assert run.stdout is not None
         workers = [int(run.stdout.readline()) for _ in range(2)]
         assert all(map(psutil.pid_exists, workers))
+        time.sleep(2.0)  # they are at work
         run.send_signal(getattr(signal, name))
         said = run.stdout.read()  # to the end, which comes when the last of them has ended
     assert said == ("" if name == "SIGKILL" else f"interrupted by {name}\n")

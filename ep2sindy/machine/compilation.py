@@ -16,13 +16,14 @@ from numba.core import event
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """`numba.njit` with its cache on; as `@compiled` or `@compiled(inline="always")`.
 
+    Other threads go on meanwhile: a worker in a long call still sees that its run was killed.
     What a kernel calls is compiled into it, so a change in any kernel of its folder, or in the
     columns that they share, compiles it anew: numba itself looks at the kernel's own file alone.
     """
     if function is None:
         return lambda each: compiled(each, **options)
     _announce()
-    kernel = numba.njit(cache=True, **options)(function)
+    kernel = numba.njit(cache=True, nogil=True, **options)(function)
     kept: Any = getattr(kernel._cache, "_cache_file", None)
     if hasattr(kept, "_source_stamp"):  # numba has no public way
         kept._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
@@ -39,9 +40,9 @@ def _kept_if_room(save: Callable, *compiled: Any) -> None:
 
 @cache
 def _stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
-    """Names, dates and sizes of all that is compiled in a folder."""
+    """Names, dates and sizes of all that is compiled in a folder, and of what says how."""
     sources = [*sorted(folder.glob("*.py")), *sorted(folder.parent.glob("closures.py"))]
-    stats = [(source.name, source.stat()) for source in sources]
+    stats = [(source.name, source.stat()) for source in [*sources, Path(__file__)]]
     return tuple((name, stat.st_mtime, stat.st_size) for name, stat in stats)
 
 
