@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--soak", type=int, default=5, help="rounds of short runs in one process")
     parser.add_argument("--crafted", type=int, default=40, help="crafted files, of some 260")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--part", type=part, default="1/1", help="K/N: the K-th of N parts")
     parser.add_argument("--folder", type=Path, default=Path(".cache/attack"))
     asked = parser.parse_args()
     folder = asked.folder.absolute() / f"seed{asked.seed}"
@@ -41,7 +42,8 @@ def main() -> None:
         (folder / name).mkdir(parents=True, exist_ok=True)
     found = {}
     for title, cases, attack in attacks(asked, folder):
-        found[title] = attacked(folder / f"{title.replace(' ', '_')}.jsonl", cases, attack)
+        mine = list(cases)[asked.part]
+        found[title] = attacked(folder / f"{title.replace(' ', '_')}.jsonl", mine, attack)
     print("| attack | what became of it | cases |\n|---|---|---|")
     print("\n".join(row for title, done in found.items() for row in table(title, done)))
     wrong = [
@@ -52,6 +54,14 @@ def main() -> None:
     ]
     if wrong:
         raise SystemExit("\n".join(wrong))
+
+
+def part(text: str) -> slice:
+    """Of cases that are attacked in several folders side by side, which are for this one."""
+    k, n = map(int, text.split("/"))
+    if not 1 <= k <= n:
+        raise ValueError
+    return slice(k - 1, None, n)
 
 
 def attacks(

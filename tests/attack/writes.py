@@ -68,12 +68,18 @@ def _spoken(status: int, errors: str, failed: Path) -> Outcome:
 
 
 def drawn(folder: Path, n: int, seed: int) -> list[str]:
-    """Some of all writes of all runs: refused when they begin, or on a device that is full."""
-    every = [
-        f"{name}-{k}-{how}"
-        for name in RUNS
-        for k, letter in enumerate(reference(folder, name).writes, start=1)
-        for how in (("refused", "full") if letter == "o" else ("refused",))
-        if how == "refused" or Path("/dev/full").exists()
-    ]
-    return random.Random(seed).sample(every, min(n, len(every)))
+    """Some of all writes of all runs, each once before one comes again.
+
+    A new file finds a device that is full, and is refused when it comes again; any other write,
+    and all where there is no such device, can only be refused.
+    """
+    chance, has_full = random.Random(seed), Path("/dev/full").exists()
+    first, again = [], []
+    for name in RUNS:
+        for k, letter in enumerate(reference(folder, name).writes, start=1):
+            twice = letter == "o" and has_full
+            first.append(f"{name}-{k}-{'full' if twice else 'refused'}")
+            again += [f"{name}-{k}-refused"] * twice
+    for each in (first, again):
+        chance.shuffle(each)
+    return [*first, *again][:n]
