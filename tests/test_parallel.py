@@ -184,6 +184,30 @@ def test_a_piece_that_fails_is_told_in_our_words_alone(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("in our words\n", "")
 
 
+WITHIN = """
+import time
+from ep2sindy.machine.parallel import Loky
+
+def slow(piece):
+    time.sleep(1.5)  # longer than a worker needs to see that its parent has gone
+    return piece
+
+def nested(piece):
+    return list(Loky(2).run(slow, range(piece)))
+
+if __name__ == "__main__":
+    print(sorted(Loky(1).run(slow, range(2))), sorted(Loky(2).run(nested, range(2))))
+"""
+
+
+def test_pieces_on_one_core_and_in_workers_come_to_their_end(tmp_path: Path) -> None:
+    """Where there are no workers, the run itself took its own parent for a run that had gone."""
+    script = tmp_path / "run.py"
+    script.write_text(WITHIN)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert done.stdout == "[(0, 0), (1, 1)] [(0, []), (1, [(0, 0)])]\n"
+
+
 KILLED = """
 import os, sys, time
 import numpy as np

@@ -69,8 +69,9 @@ def _in_worker(
 ) -> tuple[int, Any]:
     from tqdm import tqdm
 
-    end_with(parent)
-    tqdm.set_lock(RLock())  # by default a semaphore, of which the end of a worker would be told
+    if os.getpid() != parent:  # on one core, and within a worker, joblib stays in the process
+        end_with(parent)
+        tqdm.set_lock(RLock())  # by default a semaphore, of which the end of a worker would be told
     return _on_one_thread(function, numbered)
 
 
