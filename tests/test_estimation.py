@@ -550,3 +550,11 @@ def test_a_long_search_is_told_of() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         size.check_size([run], small, {})
+
+
+def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
+    nothing = np.zeros(0)
+    fit = Fit((), nothing, nothing.astype(np.bool_), np.full(2, 1.5e308))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fit.total == np.inf

@@ -61,7 +61,8 @@ class Fit:
 
     @property
     def total(self) -> float:
-        return float(self.squares.sum())
+        with np.errstate(over="ignore"):  # infinite then, as where one of them is
+            return float(self.squares.sum())
 
 
 @dataclass(frozen=True, eq=False)
