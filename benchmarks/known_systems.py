@@ -6,6 +6,7 @@ Equations and parameters are the textbooks'; each is sampled over some twenty of
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,9 +132,7 @@ def noisy(name: str, noise: float, number: int, kind: str = "white") -> tuple[Sy
         system, (clean,) = realization(name, 0.0, number)
     else:
         system = OTHERS[name].system(name)
-        spread = 0.3 * (np.abs(system.initial) + 0.1)
-        start = system.initial + spread * rng.uniform(-1.0, 1.0, len(spread))
-        clean = system.trajectory(initial=start)
+        clean = _from_nearby(system, rng)
     rms = np.sqrt(np.square(clean.states).mean(axis=0))
     kept = _kept(kind, clean.n_samples, rng)
     t, states = clean.t[kept], clean.states[kept]
@@ -143,6 +142,15 @@ def noisy(name: str, noise: float, number: int, kind: str = "white") -> tuple[Sy
         clean.state_names,
         label=name,
     )
+
+
+def _from_nearby(system: System, rng: np.random.Generator) -> Trajectory:
+    """From within 30 % of the system's own start; one that escapes is drawn again."""
+    spread = 0.3 * (np.abs(system.initial) + 0.1)
+    while True:
+        start = system.initial + spread * rng.uniform(-1.0, 1.0, len(spread))
+        with suppress(ValueError):
+            return system.trajectory(initial=start)
 
 
 def _kept(kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
