@@ -1,6 +1,5 @@
 """Runs of models: they end, and say when and why."""
 
-import time
 from collections.abc import Mapping
 
 import numpy as np
@@ -63,15 +62,6 @@ def test_what_is_fast_but_does_not_decay_is_given_up_after_its_evaluations() -> 
     assert run.diverged
     assert "after 402" in run.message
     assert "its steps became too small for the samples" in run.message
-
-
-def test_a_run_ends_after_its_time() -> None:
-    began = time.monotonic()
-    stiff = model({"x": {"x": -1e9}})
-    run = stiff.simulate(np.linspace(0.0, 10.0, 101), [1.0], limit_s=0.05)
-    assert run.diverged
-    assert "s of work" in run.message
-    assert time.monotonic() - began < 2.0
 
 
 def test_a_system_that_cannot_be_integrated_says_so() -> None:

@@ -170,12 +170,10 @@ class Library:
         that gives the terms (of some rows) where it stands.
         """
         n = len(known)
-        columns = np.ones(n + 1 + len(self.functions))
-        places = np.array([*map(list(known).index, self.variables), *range(n, len(columns))])
-        table = places[self.table if rows is None else self.table[rows]]
+        columns, table = np.ones(n + 1 + len(self.functions)), self.columns_of(known, rows)
         functions = [
-            (n + 1 + k, f, places[v])
-            for k, (f, v) in enumerate(zip(self.functions, self._arguments, strict=True))
+            (n + 1 + k, f, list(known).index(f.variable))
+            for k, f in enumerate(self.functions)
             if n + 1 + k in table
         ]
 
@@ -185,6 +183,15 @@ class Library:
             return columns[table].prod(axis=1)
 
         return columns[:n], terms
+
+    def columns_of(
+        self, known: Sequence[str], rows: np.ndarray | None = None
+    ) -> Int[np.ndarray, "rows degree"]:
+        """As `table`, for columns of `known`, which holds all variables, a one, the functions."""
+        n = len(known)
+        others = range(n, n + 1 + len(self.functions))
+        places = np.array([*map(list(known).index, self.variables), *others])
+        return places[self.table if rows is None else self.table[rows]]
 
     def jacobian(self, values: Any) -> Any:
         """Derivative of every term by every variable, at every sample.

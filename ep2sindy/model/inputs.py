@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from math import factorial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
 
 Drive = Callable[[float], np.ndarray]
 
@@ -70,7 +70,28 @@ def spline(
     t: Float[np.ndarray, " samples"], inputs: Float[np.ndarray, "samples n_inputs"]
 ) -> Drive:
     """Inputs between their samples, by cubics."""
+    from scipy.interpolate import make_interp_spline  # for those alone who have inputs
+
     return make_interp_spline(t, inputs, k=min(3, len(inputs) - 1))
+
+
+def spline_pieces(
+    drive: Drive | None, n_inputs: int
+) -> tuple[Float[np.ndarray, " breaks"], Float[np.ndarray, "order spans n_inputs"]] | None:
+    """Breaks of such a spline, and powers of the time since the last one, the highest first.
+
+    Both are empty where nothing is driven. None for inputs that are functions of one's own.
+    """
+    if drive is None:
+        return np.zeros(0), np.zeros((0, 0, n_inputs))
+    from scipy.interpolate import BSpline
+
+    if not isinstance(drive, BSpline):
+        return None
+    breaks = np.unique(drive.t[drive.k : len(drive.t) - drive.k])
+    powers = range(drive.k, -1, -1)
+    pieces = [drive.derivative(m)(breaks[:-1]) / factorial(m) for m in powers]
+    return breaks, np.ascontiguousarray(pieces)
 
 
 def _check_names(names: Sequence[str], given: Mapping[str, Any]) -> None:

@@ -14,9 +14,9 @@ from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.edges import Border, edges_of
-from ep2sindy.model.inputs import Drive, driven, spline
+from ep2sindy.model.inputs import Drive, driven, spline, spline_pieces
 from ep2sindy.model.rates import used_terms
-from ep2sindy.model.solve import Rates, solved
+from ep2sindy.model.solve import Products, Rates, solved
 
 
 @runtime_checkable
@@ -232,8 +232,11 @@ def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.
 def _scaled_rhs(model: Equations, drive: Drive | None, scale: np.ndarray) -> Rates:
     """The right-hand side for scaled states, with the absent terms left out."""
     present = np.flatnonzero(model.coef.any(axis=1))
-    coef = model.coef[present] / scale
-    values, terms = model.library.at_points([*model.states, *model.inputs], present)
+    coef, known = model.coef[present] / scale, [*model.states, *model.inputs]
+    curves = spline_pieces(drive, len(model.inputs))
+    if curves is not None and not model.library.take(present).functions:
+        return Products(model.library.columns_of(known, present), coef, scale, *curves)
+    values, terms = model.library.at_points(known, present)
     n = len(model.states)
 
     def rhs(t: float, y: np.ndarray) -> np.ndarray:

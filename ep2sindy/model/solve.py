@@ -1,15 +1,14 @@
-"""Integration in time with a budget, by an implicit method where equations are stiff."""
+"""Integration in time with a budget: compiled, by SciPy for functions, implicit where stiff."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from time import monotonic
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.integrate import solve_ivp
+from jaxtyping import Float, Int
 
 from ep2sindy.model.edges import Border, Edge
 
@@ -20,8 +19,51 @@ EXPLICIT, IMPLICIT = "DOP853", "Radau"
 # Whether a run is stiff is asked after so many evaluations, and each time that they have doubled.
 FIRST_LOOK, CALLS_PER_STEP = 5_000, 12
 STABLE = 2.0  # the fastest rate times a step, which accuracy keeps well below and stability below 6
+# Evaluations of compiled equations after which the clock is looked at: a tenth of a second.
+CALLS_PER_LOOK = 100_000
 
 Rates = Callable[[float, np.ndarray], np.ndarray]
+Clock = Callable[[], float]  # seconds that have passed since whenever
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """A right-hand side of products of scaled states and of inputs, which can be compiled.
+
+    table: which columns each term multiplies, of the states, the inputs and a one. coef: in units
+    of the scale. breaks, pieces: the inputs as cubics in the time since the last break.
+    """
+
+    table: Int[np.ndarray, "terms degree"]
+    coef: Float[np.ndarray, "terms n_states"]
+    scale: Float[np.ndarray, " n_states"]
+    breaks: Float[np.ndarray, " _"]
+    pieces: Float[np.ndarray, "order spans n_inputs"]
+
+    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        from ep2sindy.model import kernels
+
+        slope = np.empty(len(y))
+        columns = np.ones(len(y) + self.pieces.shape[2] + 1)
+        kernels.rates(self.parts, float(t), np.asarray(y), columns, slope)
+        return slope
+
+    @property
+    def parts(self) -> tuple[np.ndarray, ...]:
+        """What compiled functions take: see `model.kernels`."""
+        return self.table, self.coef, self.scale, self.breaks, self.pieces
+
+
+@cache
+def scheme() -> tuple[np.ndarray, ...]:
+    """Coefficients of the explicit method, from SciPy's table of them: see `model.kernels`."""
+    from scipy.integrate import DOP853
+
+    tables = (
+        DOP853.A, DOP853.B, DOP853.C, DOP853.E3, DOP853.E5,
+        DOP853.A_EXTRA, DOP853.C_EXTRA, DOP853.D,
+    )  # fmt: skip
+    return tuple(np.ascontiguousarray(table) for table in tables)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +87,8 @@ class Counted:
     rates: Rates
     border: Border
     budget: int
-    deadline: float = np.inf
+    clock: Clock
+    deadline: float
     began_s: float = np.inf
     calls: int = 0
     look_at: int = FIRST_LOOK
@@ -68,7 +111,7 @@ class Counted:
             if self.calls > self.look_at:
                 self.look_at *= 2
                 self.stiff = self._is_stiff(t, y)
-            if self.stiff or self.calls > self.budget or monotonic() > self.deadline:
+            if self.stiff or self.calls > self.budget or self.clock() > self.deadline:
                 self.given_up_s = t
         return self.given_up_s - t
 
@@ -77,6 +120,24 @@ class Counted:
         fastest = fastest_rate(self.rates, t, y)
         step_s = CALLS_PER_STEP * (t - self.began_s) / self.calls
         return bool(fastest.real < -abs(fastest.imag) and abs(fastest) * step_s > STABLE)
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What one method made of a run: states at the times reached, and why it stopped there.
+
+    status: of SciPy's `solve_ivp`, 0 at the end, 1 at an event and -1 where steps became too
+    small. last_s, last: the time and state of the event, if there was one. crossed: whether that
+    was a border of the equations' domain.
+    """
+
+    t: Float[np.ndarray, " samples"]
+    y: Float[np.ndarray, "samples n_states"]
+    status: int
+    message: str = ""
+    last_s: float = np.nan
+    last: Float[np.ndarray, " n_states"] | None = None
+    crossed: bool = False
 
 
 def solved(
@@ -89,64 +150,119 @@ def solved(
     bound: str,
     rtol: float,
     limit_s: float,
+    clock: Clock = monotonic,
 ) -> Solved:
     """From y over t, until a state exceeds `blow_up`, a domain is left or the budget is spent.
 
-    A run whose steps stability keeps short goes on from there by an implicit method, with as many
-    evaluations again. bound: what `blow_up` is a multiple of, in words.
+    `Products` are integrated by compiled functions. A run whose steps stability keeps short goes
+    on from there by an implicit method, with as many evaluations again. bound: what `blow_up` is
+    a multiple of, in words. clock: what `limit_s` is measured by.
     """
-    began = monotonic()
-    rhs = Counted(rates, border, CALLS + CALLS_PER_SAMPLE * len(t), began + limit_s, float(t[0]))
+    began = clock()
+    budget = CALLS + CALLS_PER_SAMPLE * len(t)
+    rhs = Counted(rates, border, budget, clock, began + limit_s, float(t[0]))
     with np.errstate(over="ignore", invalid="ignore"):  # on the way to a blow-up
         if not np.isfinite(rhs(t[0], y)).all():
             text = f"the first step overflows: a rate at t = {t[0]:.6g} s is not finite"
             return Solved(t[:1], y[None], True, text)
-        found = _stage(rhs, EXPLICIT, t, y, blow_up, rtol)
+        explicit = _compiled_stage if isinstance(rates, Products) else _explicit_stage
+        found = explicit(rhs, t, y, blow_up, rtol)
         if rhs.stiff:
-            at, state = float(found.t_events[0][0]), found.y_events[0][0]
-            return _implicit(found, rhs, t, at, state, blow_up, bound, rtol)
-    return _outcome(found, rhs, len(y), blow_up, bound, monotonic() - began)
+            return _implicit(found, rhs, t, blow_up, bound, rtol)
+    return _outcome(found, rhs, blow_up, bound, clock() - began)
 
 
 def _implicit(
-    before: Any,
-    rhs: Counted,
-    t: np.ndarray,
-    at: float,
-    state: np.ndarray,
-    blow_up: float,
-    bound: str,
-    rtol: float,
+    before: Stage, rhs: Counted, t: np.ndarray, blow_up: float, bound: str, rtol: float
 ) -> Solved:
     """The rest of a run that was stiff, behind what had been reached."""
-    began = monotonic()
-    rest = Counted(rhs.rates, rhs.border, rhs.budget, rhs.deadline)  # never stiff: no began_s
-    ahead = t[t > at]
+    began, at, state = rhs.clock(), before.last_s, before.last
+    assert state is not None, "a run that is found to be stiff has been stopped there"
+    # Never stiff itself: it does not say when it began.
+    rest = Counted(rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline)
     try:
-        found = _stage(rest, IMPLICIT, np.append(at, ahead), state, blow_up, rtol)
+        found = _scipy_stage(rest, IMPLICIT, np.append(at, t[t > at]), state, blow_up, rtol)
     except (ValueError, np.linalg.LinAlgError):  # slopes that are not finite
         text = f"the equations are stiff, and overflow, at t = {at:.6g} s"
-        return Solved(before.t, _states(before, len(state)), True, text)
-    ended = _outcome(found, rest, len(state), blow_up, bound, monotonic() - began)
+        return Solved(before.t, before.y, True, text)
+    ended = _outcome(found, rest, blow_up, bound, rhs.clock() - began)
     text = f"{ended.message}; stiff from t = {at:.6g} s on, and implicit there"
-    states = np.concatenate([_states(before, len(state)), ended.y[1:]])
+    states = np.concatenate([before.y, ended.y[1:]])
     times = np.append(before.t, ended.t[1:])
     return Solved(times, states, ended.ended_early, text, ended.edge)
 
 
-def _stage(
+def _explicit_stage(
+    rhs: Counted, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
+) -> Stage:
+    return _scipy_stage(rhs, EXPLICIT, t, y, blow_up, rtol)
+
+
+def _scipy_stage(
     rhs: Counted, method: str, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
-) -> Any:
+) -> Stage:
     """Of one method; the first event is a blow-up or the end of the budget."""
+    from scipy.integrate import solve_ivp
 
     def ends(t: float, y: np.ndarray) -> float:
         return min(blow_up - float(np.abs(y).max()), rhs.left_s(t, y))
 
     ends.terminal = True  # type: ignore[attr-defined]
     events = [ends, rhs.border] if rhs.border.edges else [ends]
-    return solve_ivp(
+    found = solve_ivp(
         rhs, (t[0], t[-1]), y, method=method, t_eval=t, events=events, rtol=rtol, atol=rtol
     )
+    # A solver that failed in its first step gives an empty list.
+    states = np.asarray(found.y, dtype=np.float64).reshape(len(y), -1).T
+    times = np.asarray(found.t, dtype=np.float64)
+    met = [k for k, at in enumerate(found.t_events) if at.size] if found.status == 1 else []
+    if not met:
+        return Stage(times, states, found.status, found.message)
+    first = met[-1]  # a border comes before a budget that ends in the same step
+    last_s, last = float(found.t_events[first][0]), found.y_events[first][0]
+    return Stage(times, states, found.status, found.message, last_s, last, crossed=first == 1)
+
+
+def _compiled_stage(
+    rhs: Counted, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
+) -> Stage:
+    """The explicit method, compiled: step by step what SciPy's does."""
+    from ep2sindy.model import kernels
+
+    assert isinstance(rhs.rates, Products)
+    equations, times = rhs.rates.parts, np.ascontiguousarray(t)
+    now, state, out = float(t[0]), np.array(y), np.empty((len(t), len(y)))
+    slope = rhs.rates(now, state)
+    h = _first_step(rhs.rates, now, float(t[-1]) - now, state, slope, rtol)
+    rhs.calls += 2
+    place, status = 0, kernels.LOOK
+    while status == kernels.LOOK and rhs.left_s(now, state) > 0.0:
+        limit = min(rhs.look_at, rhs.budget, rhs.calls + CALLS_PER_LOOK)
+        status, now, h, place, rhs.calls = kernels.advance(
+            equations, scheme(), times, out, state, slope, now, h, place, rhs.calls, limit,
+            blow_up, rtol,
+        )  # fmt: skip
+    if status == kernels.FINISHED:
+        return Stage(times, out, 0)
+    if status == kernels.FAILED:
+        text = "Required step size is less than spacing between numbers."
+        return Stage(times[:place], out[:place], -1, text)
+    return Stage(times[:place], out[:place], 1, "", now, state)
+
+
+def _first_step(
+    rates: Rates, t: float, span: float, y: np.ndarray, slope: np.ndarray, rtol: float
+) -> float:
+    """By the size of the first two derivatives: Hairer, Norsett & Wanner 1993, II.4."""
+    allowed = rtol + np.abs(y) * rtol
+    size, fast = (float(np.sqrt(np.mean(np.square(v / allowed)))) for v in (y, slope))
+    h = min(1e-6 if size < 1e-5 or fast < 1e-5 else 0.01 * size / fast, span)
+    h = max(h, float(np.finfo(np.float64).tiny))  # the slope may be too large to be squared
+    bend = rates(t + h, y + h * slope) - slope
+    bent = float(np.sqrt(np.mean(np.square(bend / allowed)))) / h
+    if fast <= 1e-15 and bent <= 1e-15:
+        return min(100.0 * h, max(1e-6, h * 1e-3), span)
+    return min(100.0 * h, (0.01 / max(fast, bent)) ** (1.0 / 8.0), span)
 
 
 def fastest_rate(rates: Rates, t: float, y: np.ndarray) -> complex:
@@ -161,29 +277,23 @@ def fastest_rate(rates: Rates, t: float, y: np.ndarray) -> complex:
     return complex(values[np.argmax(np.abs(values))])
 
 
-def _outcome(
-    found: Any, rhs: Counted, n_states: int, blow_up: float, bound: str, took_s: float
-) -> Solved:
-    edge, t = _left(found, rhs), np.asarray(found.t, dtype=np.float64)
+def _outcome(found: Stage, rhs: Counted, blow_up: float, bound: str, took_s: float) -> Solved:
+    edge = _left(found, rhs)
     message = _text(found, rhs, blow_up, bound, took_s)
     if edge:
-        message = f"the run left {edge.text}, at t = {t[-1] if len(t) else np.nan:.6g} s"
-    return Solved(t, _states(found, n_states), found.status != 0, message, edge)
+        at = found.t[-1] if len(found.t) else np.nan
+        message = f"the run left {edge.text}, at t = {at:.6g} s"
+    return Solved(found.t, found.y, found.status != 0, message, edge)
 
 
-def _states(found: Any, n_states: int) -> np.ndarray:
-    """(samples, n_states); a solver that failed in its first step gives an empty list."""
-    return np.asarray(found.y, dtype=np.float64).reshape(n_states, -1).T
-
-
-def _left(found: Any, rhs: Counted) -> Edge | None:
+def _left(found: Stage, rhs: Counted) -> Edge | None:
     """The edge that a run ended at, if it did: crossed, or too steep for a solver to cross."""
-    if rhs.border.edges and found.status == 1 and found.t_events[1].size:
-        return rhs.border.nearest(found.t_events[1][0], found.y_events[1][0])
+    if found.crossed and found.last is not None:
+        return rhs.border.nearest(found.last_s, found.last)
     return rhs.beyond if found.status == -1 else None
 
 
-def _text(found: Any, rhs: Counted, blow_up: float, bound: str, took_s: float) -> str:
+def _text(found: Stage, rhs: Counted, blow_up: float, bound: str, took_s: float) -> str:
     last = found.t[-1] if len(found.t) else float("nan")
     if found.status == 0:
         return f"integrated to t = {last:.6g} s"

@@ -1,0 +1,198 @@
+"""Compiled integration of one free run: the Dormand-Prince scheme of eighth order.
+
+The equations are sums of products: a tuple (table, coef, scale, breaks, pieces). Row k of `table`
+names the columns that term k multiplies, of the states, the inputs and a one; coef: (terms, n),
+already divided by the scale of the state; scale: (n,), what turns the solver's states into SI.
+breaks: (m + 1,), pieces: (order, m, inputs): the inputs as cubics in the time since the last break;
+no inputs make pieces of shape (0, 0, 0).
+
+The scheme is a tuple of its coefficients (a, b, c, e3, e5, a_dense, c_dense, dense), as published:
+Hairer, Norsett & Wanner 1993, Solving Ordinary Differential Equations I, II.5, II.6 and II.10;
+`solve.SCHEME` has them. Steps, errors and dense output are those of SciPy's `DOP853`, so that a
+run differs from one of SciPy's by rounding alone.
+"""
+
+import numpy as np
+
+from ep2sindy.machine.compilation import compiled
+
+FINISHED, LOOK, CROSSED, FAILED = 0, 1, 2, 3  # why `advance` returns
+
+SAFETY, LEAST_FACTOR, MOST_FACTOR = 0.9, 0.2, 10.0  # of a step from the one before
+EXPONENT = -1.0 / 8.0  # of the error that chooses a step; its estimate is of seventh order
+
+
+@compiled(error_model="numpy")
+def rates(equations, t, y, columns, slope):
+    """The right-hand side at one state, into `slope`; columns is room for values in SI."""
+    table, coef, scale, breaks, pieces = equations
+    n, n_inputs = len(y), pieces.shape[2]
+    for i in range(n):
+        columns[i] = y[i] * scale[i]
+        slope[i] = 0.0
+    if n_inputs:
+        place, above = 0, pieces.shape[1]
+        while above - place > 1:  # by halves: the span that t is in
+            middle = (place + above) // 2
+            if breaks[middle] <= t:
+                place = middle
+            else:
+                above = middle
+        since = t - breaks[place]
+        for j in range(n_inputs):
+            value = 0.0
+            for power in range(len(pieces)):
+                value = value * since + pieces[power, place, j]
+            columns[n + j] = value
+    for k in range(len(table)):
+        value = columns[table[k, 0]]
+        for factor in range(1, table.shape[1]):
+            value *= columns[table[k, factor]]
+        for i in range(n):
+            slope[i] += value * coef[k, i]
+
+
+@compiled(error_model="numpy")
+def _stage(equations, t, y, h, weights, n_before, slopes, at, columns):
+    """Slope number `n_before` of a step of length h from y, from those before it."""
+    for i in range(len(y)):
+        value = 0.0
+        for s in range(n_before):
+            value += slopes[s, i] * weights[s]
+        at[i] = y[i] + value * h
+    rates(equations, t, at, columns, slopes[n_before])
+
+
+@compiled(error_model="numpy")
+def _error(e3, e5, slopes, h, y, at, rtol):
+    """Size of a step's error, one where it is as large as the tolerance."""
+    fifth, third = 0.0, 0.0
+    for i in range(len(y)):
+        allowed = rtol + max(abs(y[i]), abs(at[i])) * rtol
+        five, three = 0.0, 0.0
+        for s in range(len(e5)):
+            five += slopes[s, i] * e5[s]
+            three += slopes[s, i] * e3[s]
+        fifth += (five / allowed) ** 2
+        third += (three / allowed) ** 2
+    if fifth == 0.0 and third == 0.0:
+        return 0.0
+    return abs(h) * fifth / np.sqrt((fifth + 0.01 * third) * len(y))
+
+
+@compiled(error_model="numpy")
+def _polynomial(equations, scheme, t, h, start, end, slopes, at, columns, shape):
+    """Dense output of a step: rows of `shape`, for `_between`. Takes three evaluations."""
+    a_dense, c_dense, dense = scheme[5], scheme[6], scheme[7]
+    for k in range(3):
+        _stage(equations, t + c_dense[k] * h, start, h, a_dense[k], 13 + k, slopes, at, columns)
+    for i in range(len(start)):
+        moved = end[i] - start[i]
+        shape[0, i] = moved
+        shape[1, i] = h * slopes[0, i] - moved
+        shape[2, i] = 2.0 * moved - h * (slopes[12, i] + slopes[0, i])
+        for k in range(4):
+            value = 0.0
+            for s in range(16):
+                value += dense[k, s] * slopes[s, i]
+            shape[3 + k, i] = h * value
+
+
+@compiled(error_model="numpy")
+def _between(shape, start, share, out):
+    """The state at a share of a step, into `out`."""
+    for i in range(len(start)):
+        value = 0.0
+        for k in range(7):
+            value = (value + shape[6 - k, i]) * (share if k % 2 == 0 else 1.0 - share)
+        out[i] = start[i] + value
+
+
+@compiled(error_model="numpy")
+def _room(y, blow_up):
+    """How far the largest state is from `blow_up`; negative beyond it."""
+    largest = 0.0
+    for i in range(len(y)):
+        largest = max(largest, abs(y[i]))
+    return blow_up - largest
+
+
+@compiled(error_model="numpy")
+def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
+    """One step that keeps the tolerance: from y to `at`, whose slope is row 12 of `slopes`.
+
+    Returns the time reached, that step's length, the length to try next and how many evaluations
+    it took; the time is where it began if the step became too small.
+    """
+    a, b, c, e3, e5 = scheme[0], scheme[1], scheme[2], scheme[3], scheme[4]
+    least = 10.0 * (np.nextafter(t, np.inf) - t)
+    h, calls, again = max(h, least), 0, False
+    while h >= least:
+        ahead = min(t + h, end_t)
+        h = ahead - t
+        for s in range(1, 12):
+            _stage(equations, t + c[s] * h, y, h, a[s], s, slopes, at, columns)
+        for i in range(len(y)):
+            value = 0.0
+            for s in range(12):
+                value += slopes[s, i] * b[s]
+            at[i] = y[i] + h * value
+        rates(equations, ahead, at, columns, slopes[12])
+        calls += 12
+        error = _error(e3, e5, slopes, h, y, at, rtol)
+        if error < 1.0:
+            factor = MOST_FACTOR
+            if error > 0.0:
+                factor = min(MOST_FACTOR, SAFETY * error**EXPONENT)
+            if again:
+                factor = min(1.0, factor)
+            return ahead, h, h * factor, calls
+        # What is not finite shortens the step as far as a step may be shortened.
+        factor = SAFETY * error**EXPONENT
+        h *= factor if factor > LEAST_FACTOR else LEAST_FACTOR
+        again = True
+    return t, h, h, calls
+
+
+@compiled(error_model="numpy")
+def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, blow_up, rtol):
+    """Integrate to the last of `times`, filling rows of `out` from `place` on; y and slope move.
+
+    h: the step to try. Returns why it ended, the time, the step to try next, the next place and
+    the number of evaluations. LOOK: `limit` evaluations have been passed. CROSSED: the largest
+    state crossed `blow_up` in the last step, whose samples are filled up to there. FAILED: the
+    step became too small.
+    """
+    n = len(y)
+    slopes, shape = np.empty((16, n)), np.empty((7, n))
+    at, room, columns = np.empty(n), np.empty(n), np.ones(n + equations[4].shape[2] + 1)
+    for i in range(n):  # array expressions take seconds more to compile
+        slopes[0, i] = slope[i]
+    inside = _room(y, blow_up) >= 0.0
+    while t < times[-1]:
+        ahead, length, h, n_calls = _step(
+            equations, scheme, t, h, times[-1], y, at, slopes, columns, rtol
+        )
+        calls += n_calls
+        if ahead == t:
+            return FAILED, t, h, place, calls
+        over = calls > limit  # before the evaluations of dense output, as SciPy's events see it
+        crossed = (_room(at, blow_up) >= 0.0) != inside
+        if times[place] <= ahead:
+            _polynomial(equations, scheme, t, length, y, at, slopes, room, columns, shape)
+            calls += 3
+            while place < len(times) and times[place] <= ahead:
+                _between(shape, y, (times[place] - t) / length, out[place])
+                if crossed and (_room(out[place], blow_up) >= 0.0) != inside:
+                    break
+                place += 1
+        for i in range(n):
+            y[i] = at[i]
+            slopes[0, i] = slopes[12, i]
+            slope[i] = slopes[12, i]
+        t = ahead
+        if crossed:
+            return CROSSED, t, h, place, calls
+        if over:
+            return LOOK, t, h, place, calls
+    return FINISHED, t, h, place, calls
