@@ -12,8 +12,10 @@ import ep2sindy as ep
 from ep2sindy.model import kernels
 from ep2sindy.model.edges import Border
 from ep2sindy.model.inputs import spline, spline_pieces
+from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import _scaled_rhs
+from ep2sindy.model.runge_kutta import rk4_step
 from ep2sindy.model.solve import Products, Solved, _first_step, scheme, solved
 
 NO_BORDER = Border((), lambda _, y: y)
@@ -162,3 +164,27 @@ def test_evaluations_are_counted_alike(compiled: bool) -> None:
     message = run(rates, np.linspace(0.0, 10.0, 101), y).message
     calls = int(message.split(" evaluations")[0].split()[-1])
     assert 40_200 < calls <= 40_200 + 15  # the budget, and one step with its dense output
+
+
+def test_many_compiled_runs_are_runge_kutta_steps_to_the_last_digit() -> None:
+    """Against the scheme written for arrays; one start leaves the bounds, and stays there."""
+    system, rng = ep.lotka_volterra(), np.random.default_rng(0)
+    coef = system.model.coef[..., None] * (1.0 + 0.1 * rng.standard_normal((1, 1, 5)))
+    ensemble = Ensemble(system.model.library, system.model.states, coef)
+    start = np.array([[1.0, 0.5, 40.0], [0.5, 1.0, 3.0]])
+    windows = DrivenWindows.free(start, step_s=0.1, n_samples=80)
+    paths = ensemble.paths(windows, centre=np.zeros(2), spread=np.ones(2))
+    for m in range(5):
+
+        def slope(x: np.ndarray, _: np.ndarray, m: int = m) -> np.ndarray:
+            terms = system.model.library.evaluate(x.T).T
+            return sum(c[:, m, None] * term for c, term in zip(coef, terms, strict=True))
+
+        x = start.copy()
+        for k in range(80):
+            far = (np.abs(x) > 20.0).any(axis=0)
+            np.testing.assert_array_equal(np.isnan(paths[m, :, k]).any(axis=1), far & (k > 0))
+            np.testing.assert_array_equal(paths[m, ~far, k], x[:, ~far].T)
+            for _ in range(2):
+                x = rk4_step(slope, x, (np.empty(0),) * 3, 0.05)
+                x[:, far] = 100.0  # beyond the bounds, and finite

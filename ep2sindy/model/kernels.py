@@ -196,3 +196,62 @@ def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, 
         if over:
             return LOOK, t, h, place, calls
     return FINISHED, t, h, place, calls
+
+
+@compiled(error_model="numpy")
+def run_many(table, coefs, start, steps_s, drive, n_substeps, centre, reach):
+    """Many models from many starts, by classical Runge-Kutta steps: states and what is bounded.
+
+    table: as above. coefs: (terms, states, models); start: (states, windows); steps_s: (steps,
+    windows); drive: (inputs, steps, 3, windows), at the start, middle and end of a step. Returns
+    states (samples, states, models, windows) after every `n_substeps`, and (samples, models,
+    windows), whether all have kept within reach (states,) of the centre; one that has not stays
+    where it last was. Source of the scheme: Hairer, Norsett & Wanner 1993, II.1.
+    """
+    n, n_models, n_windows = start.shape[0], coefs.shape[2], start.shape[1]
+    n_inputs, n_samples = drive.shape[0], len(steps_s) // n_substeps
+    paths = np.empty((n_samples, n, n_models, n_windows))
+    inside = np.empty((n_samples, n_models, n_windows), dtype=np.bool_)
+    x, moved, total = np.empty(n), np.empty(n), np.empty(n)
+    slope, columns = np.empty(n), np.ones(n + n_inputs + 1)
+    for m in range(n_models):
+        for w in range(n_windows):
+            bounded = True
+            for i in range(n):
+                x[i] = start[i, w]
+            for k in range(n_samples):
+                for i in range(n):
+                    moved[i] = x[i]
+                for step in range(k * n_substeps, (k + 1) * n_substeps):
+                    if not bounded:
+                        break
+                    h = steps_s[step, w]
+                    for stage in range(4):
+                        ahead = 0.0 if stage == 0 else (0.5 * h if stage < 3 else h)
+                        for i in range(n):
+                            columns[i] = moved[i] + ahead * slope[i] if stage else moved[i]
+                        for j in range(n_inputs):
+                            columns[n + j] = drive[j, step, (stage + 1) // 2, w]
+                        for i in range(n):
+                            slope[i] = 0.0
+                        for term in range(len(table)):
+                            value = columns[table[term, 0]]
+                            for factor in range(1, table.shape[1]):
+                                value *= columns[table[term, factor]]
+                            for i in range(n):
+                                slope[i] += coefs[term, i, m] * value
+                        for i in range(n):
+                            if stage == 0:
+                                total[i] = slope[i]
+                            else:
+                                total[i] += (2.0 if stage < 3 else 1.0) * slope[i]
+                    for i in range(n):
+                        moved[i] = moved[i] + h / 6.0 * total[i]
+                for i in range(n):
+                    bounded = bounded and abs(moved[i] - centre[i]) <= reach[i]
+                for i in range(n):
+                    if bounded:
+                        x[i] = moved[i]
+                    paths[k, i, m, w] = x[i]
+                inside[k, m, w] = bounded
+    return paths, inside

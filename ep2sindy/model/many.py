@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.model import kernels
 from ep2sindy.model.runge_kutta import rk4_step
 
 # Steps of the integration per sample. One would do for the truth of every noise-free system of
@@ -57,6 +57,8 @@ class DrivenWindows:
         nodes = begins[:, None] + np.array([0.0, 0.5, 1.0])[:, None] * steps_s[:, None]
         drive = np.empty((0, *nodes.shape))
         if inputs:
+            from scipy.interpolate import make_interp_spline  # for those alone who have inputs
+
             spline = make_interp_spline(run.t, run.columns(inputs), k=min(3, run.n_samples - 1))
             drive = np.moveaxis(spline(nodes), -1, 0)
         return DrivenWindows(
@@ -155,6 +157,18 @@ class Ensemble:
 
         A run that left its bounds stays where it last was inside.
         """
+        library, coef = self._used
+        if not library.functions:
+            known = [*self.states, *self.inputs]
+            yield from zip(
+                *kernels.run_many(
+                    library.columns_of(known), np.ascontiguousarray(coef),
+                    np.ascontiguousarray(windows.start), windows.steps_s, windows.drive,
+                    N_SUBSTEPS, centre[:, 0, 0], BLOW_UP * spread[:, 0, 0],
+                ),
+                strict=True,
+            )  # fmt: skip
+            return
         # States first: each operation then runs along models and windows, in one stretch.
         x = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)
         bounded = np.ones(x.shape[1:], dtype=np.bool_)
