@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -21,7 +21,7 @@ from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.machine.own import own_module
 from ep2sindy.report.about import ASIDE, About, asked_of, by_place
-from ep2sindy.report.folder import RunFolder
+from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import drawn
 from ep2sindy.report.run import Run
@@ -50,7 +50,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
     with started_run(config) as run:
         outcome = study.compute(run)
-        headline = write(run, outcome, study)
+        headline = write(run, outcome, study, formats_of(config))
     return Finished(run.folder.path, headline)
 
 
@@ -101,6 +101,22 @@ def check_common(config: DictConfig) -> None:
     output = config.get("output")
     if not isinstance(output, str) or not output:
         raise ValueError(f"output must be a folder's name: {output!r} came")
+    formats_of(config)
+
+
+def formats_of(config: DictConfig) -> list[str]:
+    """The files that are made of each figure, png among them, which pages are made of.
+
+    Raises ValueError for another list.
+    """
+    given: Any = OmegaConf.select(config, "figures.formats", default=["png"])
+    formats = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
+    if not isinstance(formats, list) or "png" not in formats or not {*formats} <= {*FORMATS}:
+        raise ValueError(
+            f"figures.formats must be a list of {', '.join(FORMATS)} that has png, which pages "
+            f"are made of: {formats!r} came; figures.formats=[png,pdf] adds drawings for print"
+        )
+    return formats
 
 
 def check_overrides(overrides: Iterable[str], *, used: Collection[str], experiment: str) -> None:
@@ -132,7 +148,9 @@ def started_run(config: DictConfig) -> Iterator[Run]:
         screen.close()
 
 
-def write(run: Run, outcome: Outcome, study: Experiment) -> dict[str, float]:
+def write(
+    run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str]
+) -> dict[str, float]:
     """Everything of an outcome into the run folder; what no view may lose comes first."""
     folder, models = run.folder, outcome.models()
     for name, model in models.items():
@@ -144,7 +162,7 @@ def write(run: Run, outcome: Outcome, study: Experiment) -> dict[str, float]:
     figures = {}
     for name, captioned in outcome.figures().items():
         figure = captioned.draw()
-        png = folder.write_figure(name, figure)
+        png = folder.write_figure(name, figure, formats)
         run.board.image(name, png)
         figures[name] = drawn(figure, png, captioned.caption)
     run.board.equations({name: model.text() for name, model in models.items()})

@@ -16,7 +16,7 @@ from ep2sindy.studies.kinds import Deferred, Kind
 from ep2sindy.studies.source import FieldSource, Source, Step
 
 # Keys of conf/config.yaml that every run has.
-COMMON = ("experiment", "study", "seed", "output")
+COMMON = ("experiment", "study", "seed", "output", "figures")
 # Fields of these types take their own fields from the top level: a recipe is five groups.
 GATHERED = (Recipe, Source, FieldSource)
 # Groups of conf/config.yaml that a study may leave aside.
@@ -47,7 +47,19 @@ def study_of(study: type, config: DictConfig) -> Any:
         if "thruster" in unknown:  # a file of ./conf/thruster without its first line
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
         raise ValueError(f"unknown keys {sorted(unknown)}; there are {sorted(known)}{hint}")
-    return _filled(study, config)
+    return _filled(study, _without_formats(config, has_own="figures" in keys_of(study)))
+
+
+def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:
+    """What is left to a study: `figures.formats`, the files that are made, is the runner's."""
+    own = {name: v for name, v in (config.get("figures") or {}).items() if name != "formats"}
+    if own and not has_own:
+        first = f"figures.{next(iter(own))}"
+        raise ValueError(f"{first!r} would do nothing: this experiment has figures.formats alone")
+    found = config.copy()
+    OmegaConf.set_struct(found, False)
+    found.figures = own
+    return found
 
 
 def _filled(study: type, config: DictConfig) -> Any:

@@ -1,7 +1,7 @@
 """A run's folder: everything a figure needs to be redrawn, and one page to read.
 
 config.yaml  provenance.json  run.log  summary.json  report.html
-models/*.json  tables/*.csv  figures/*.png, *.pdf  tensorboard/
+models/*.json  tables/*.csv  figures/*.png  tensorboard/
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from ep2sindy.report.provenance import commit, versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# What a figure can be written as, and what its file says: without a date it is the same each time.
+FORMATS: Mapping[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}}
 
 
 @dataclass(frozen=True)
@@ -73,16 +76,19 @@ class RunFolder:
     def write_table(self, name: str, table: pd.DataFrame) -> None:
         write_text(self.file(f"{name}.csv", "tables"), table.to_csv(index=False))
 
-    def write_figure(self, name: str, figure: Figure) -> bytes:
-        """As PDF and PNG of one layout, which the figure keeps; returns what is in the PNG."""
+    def write_figure(self, name: str, figure: Figure, formats: Sequence[str] = ("png",)) -> bytes:
+        """As files of one layout, which the figure keeps; returns what is in the PNG.
+
+        formats: some of FORMATS, png among them.
+        """
         freeze_layout(figure)
-        for suffix in ("pdf", "png"):
-            # Without a date the same run gives the same file.
-            dated = {"CreationDate": None} if suffix == "pdf" else {}
+        contents = {}
+        for suffix in formats:
             drawn = BytesIO()  # a PDF that finds no room fails again when it is closed, over zlib
-            figure.savefig(drawn, format=suffix, dpi=DPI, metadata=dated)
-            write_bytes(self.file(f"{name}.{suffix}", "figures"), drawn.getvalue())
-        return drawn.getvalue()
+            figure.savefig(drawn, format=suffix, dpi=DPI, metadata=FORMATS[suffix])
+            contents[suffix] = drawn.getvalue()
+            write_bytes(self.file(f"{name}.{suffix}", "figures"), contents[suffix])
+        return contents["png"]
 
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> dict[str, Any]:
         """Which code a run is made by, in provenance.json; returned as well."""
