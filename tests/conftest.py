@@ -9,7 +9,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from tests import type_checks
-from tests.warm import compile_kernels
+from ep2sindy.app.warm import warm
 
 type_checks.install()
 # Workers share the cores: threads of their own would only get in each other's way.
@@ -20,7 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # of PyTorch, which is imported l
 def pytest_configure(config: pytest.Config) -> None:
     """Before workers start; a run of one process compiles as it goes."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
-        compile_kernels()
+        warm()
 
 
 @pytest.fixture(scope="session")

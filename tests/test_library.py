@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library import units
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.terms import read_term, variables_of
@@ -177,3 +178,29 @@ def test_names_tell_the_variables_they_need() -> None:
     assert variables_of("y^2*<n_i*n_n>*y") == ["y", "<n_i*n_n>"]
     assert variables_of(" 1 ") == []
     assert read_term("y*x*y", ["x", "y"]).name == "x*y^2"
+
+
+@pytest.mark.parametrize(
+    "unit",
+    [
+        *sorted(units.PLAIN),
+        "m^-3",
+        "m^3/s",
+        "m^-3 s^-1",
+        "1/s",
+        "m^2/s^2",
+        "A m^-2",
+        "m/s/s",
+        "s m^-1 V",
+    ],
+)
+def test_what_needs_no_registry_reads_as_the_registry_does(unit: str) -> None:
+    plain = units._plain_powers(unit)
+    registry = units.registry()
+    parsed = registry.parse_units(unit)._units
+    assert plain == {registry.get_symbol(name): power for name, power in parsed.items()}
+
+
+@pytest.mark.parametrize("unit", ["m/s V", "mm", "eV m^-3 sr", "m^0.5", "2 m", "furlong", "m^ 2"])
+def test_other_units_are_left_to_the_registry(unit: str) -> None:
+    assert units._plain_powers(unit) is None

@@ -11,6 +11,7 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.stability import (
     LimitCycle,
     Stability,
+    _halton,
     _starts,
     limit_cycle,
     share_reaching,
@@ -299,3 +300,11 @@ def test_a_cycle_of_another_model_is_refused() -> None:
     _, cycle = found(HOPF, [1.0, 0.0], 6.0)
     with pytest.raises(ValueError, match="it has 2 states"):
         share_reaching(model_of({**HOPF, "z": {"z": -1.0}}), cycle)
+
+
+@pytest.mark.parametrize("n_dimensions", [1, 2, 3, 8])
+def test_starts_are_spread_as_by_haltons_sequence(n_dimensions: int) -> None:
+    from scipy.stats import qmc
+
+    scipys = qmc.Halton(n_dimensions, scramble=False).fast_forward(1).random(64)
+    np.testing.assert_array_equal(_halton(64, n_dimensions), scipys)

@@ -1,7 +1,8 @@
 """The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
 `ep2sindy compare RUN RUN` sets run folders side by side instead.
-`ep2sindy inspect PATH` looks into files instead.
+`ep2sindy inspect PATH` looks into files instead, and `ep2sindy warm` compiles what is compiled
+once after installation.
 
 Only Hydra is imported here: `--help` must not wait for the numerics.
 """
@@ -48,6 +49,11 @@ def main() -> None:
             from ep2sindy.app.inspection import main as inspect_files
 
             inspect_files(sys.argv[2:], conf)
+            return
+        if sys.argv[1:2] == ["warm"]:
+            from ep2sindy.app.warm import main as compile_kernels
+
+            compile_kernels(sys.argv[2:])
             return
         prepare_arguments(conf)
 
@@ -116,10 +122,11 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
                     f"choose an experiment with +exp=NAME; there are {known(conf)}. A config of "
                     "your own begins with the line '# @package _global_'"
                 )
-            from ep2sindy.app.runner import run_config
-
             typed = HydraConfig.get().overrides.task
             check_places(resolved(config), typed)
+            print(first_word(config), flush=True)  # what follows takes seconds to load
+            from ep2sindy.app.runner import run_config
+
             finished = run_config(config, overrides=typed)
         except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
             ended_early(error)
@@ -127,6 +134,12 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
         done(finished.folder, finished.headline)
     print(finished.folder)
     return []
+
+
+def first_word(config: DictConfig) -> str:
+    """What a run is, and where it will write."""
+    folder = Path(str(config.get("output")), str(config.experiment))
+    return f"{config.experiment}: loading study={config.get('study')}; writes below {folder}/"
 
 
 def known(conf: Path) -> str:

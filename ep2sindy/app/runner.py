@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 import ep2sindy.studies
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
+from ep2sindy.app.warm import warm
 from ep2sindy.machine.own import own_module
 from ep2sindy.report.about import ASIDE, About, asked_of, by_place
 from ep2sindy.report.folder import FORMATS, RunFolder
@@ -48,6 +49,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     kind = study_class(config.get("study"))
     check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
     study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
+    warm()
     with started_run(config) as run:
         outcome = study.compute(run)
         headline = write(run, outcome, study, formats_of(config))

@@ -8,7 +8,6 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import lsq_linear
 
 from ep2sindy.constraints.relations import ROUNDING, Constraint, place_of
 from ep2sindy.data.scales import column_norms
@@ -208,6 +207,8 @@ def _least_squares(
     names: Sequence[tuple[str, str]],
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"], float]:
     """Coefficients, a root of their covariance for rows of variance 1, that variance."""
+    from scipy.optimize import lsq_linear  # half a second that most searches do not need
+
     n = theta.shape[1]
     norms, size = column_norms(theta), np.linalg.norm(target) or 1.0
     columns = np.column_stack([theta / norms, target / size])

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.interpolate import make_interp_spline
 
 from ep2sindy.constraints.relations import Relation, constraint
 from ep2sindy.data.scales import zero_to_one
@@ -44,6 +43,8 @@ class Record:
 
     @cached_property
     def _curve(self) -> Callable[[np.ndarray], np.ndarray]:
+        from scipy.interpolate import make_interp_spline  # for those alone who have inputs
+
         # What is switched is held for most steps, and cubics would overshoot.
         switched = (np.diff(self.inputs, axis=0) == 0.0).mean(axis=0) > 0.5
         degree = 1 if switched.any() else min(3, len(self.inputs) - 1)

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     import pint
 
 
-# Symbols that are their own base symbol: what they mean needs no registry.
-PLAIN = frozenset({"s", "m", "A", "V", "eV"})
+# Symbols that are their own base symbol: products of their powers need no registry.
+PLAIN = frozenset({"s", "m", "A", "V", "eV", "K", "T", "kg", "Hz", "W", "N", "J", "C", "Pa"})
+_PLAIN_FACTOR = re.compile(rf"({'|'.join(PLAIN)}|1)(?:\^(-?\d{{1,2}}))?")
 
 
 # How a unit may be written. What it says is reckoned out, so it must not be a sum to work on:
@@ -65,14 +66,28 @@ def _powers(unit: str) -> dict[str, float]:
     """Base symbol -> exponent of one unit string; an unknown unit stays a symbol of its own."""
     if unit in ("", "1"):
         return {}
-    if unit in PLAIN:
-        return {unit: 1.0}
+    if (plain := _plain_powers(unit)) is not None:
+        return plain
     try:
         check_unit(unit)
         parsed = registry().parse_units(unit)
     except unit_errors():
         return {unit: 1.0}
     return {registry().get_symbol(name): float(p) for name, p in parsed._units.items()}  # type: ignore[arg-type]
+
+
+def _plain_powers(unit: str) -> dict[str, float] | None:
+    """Powers of symbols that stand alone, `m^-3 s^-1` or `m^3/s`; None for all else."""
+    found: dict[str, float] = {}
+    for k, divided in enumerate(unit.split("/")):
+        for text in divided.split(" "):
+            factor = _PLAIN_FACTOR.fullmatch(text)
+            if factor is None or (k and " " in divided):  # who reads m/s V, may mean either
+                return None
+            symbol, power = factor.groups()
+            if symbol != "1":
+                found[symbol] = found.get(symbol, 0.0) + (-1.0 if k else 1.0) * float(power or 1)
+    return found
 
 
 @cache

@@ -12,6 +12,9 @@ from typing import Any
 import numba
 from numba.core import event
 
+PACKAGE = Path(__file__).resolve().parents[1]
+ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."
+
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """`numba.njit` with its cache on; as `@compiled` or `@compiled(inline="always")`.
@@ -22,7 +25,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     """
     if function is None:
         return lambda each: compiled(each, **options)
-    _announce()
+    _listen()
     kernel = numba.njit(cache=True, nogil=True, **options)(function)
     kept: Any = getattr(kernel._cache, "_cache_file", None)
     if hasattr(kept, "_source_stamp"):  # numba has no public way
@@ -30,6 +33,29 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     if hasattr(kernel._cache, "save_overload"):
         kernel._cache.save_overload = partial(_kept_if_room, kernel._cache.save_overload)
     return kernel
+
+
+def sources() -> list[Path]:
+    """Files that define kernels, and this one, which says how they are compiled."""
+    kernels = (path for path in PACKAGE.rglob("*.py") if path.stem.endswith(("kernels", "_fits")))
+    return [*sorted(kernels), Path(__file__)]
+
+
+def kept_in() -> Path:
+    """The folder where compiled kernels are kept: beside this file, or where numba chose to."""
+
+    @numba.njit(cache=True)
+    def probe() -> None:
+        """Never called."""
+
+    return Path(str(probe.stats.cache_path))
+
+
+def tell_each_kernel(tell: Callable[[str], None]) -> None:
+    """Let `tell` hear the name of each kernel of the package once it is compiled, in place of
+    the announcement."""
+    _listen()
+    _TOLD.append(tell)
 
 
 def _kept_if_room(save: Callable, *compiled: Any) -> None:
@@ -46,27 +72,27 @@ def _stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
     return tuple((name, stat.st_mtime, stat.st_size) for name, stat in stats)
 
 
-class _Announcer(event.Listener):
+class _Listener(event.Listener):
     """Says once per process that something is compiled; what the cache holds is not."""
 
     def on_start(self, event: event.Event) -> None:
-        if not _ANNOUNCED:
-            _ANNOUNCED.append(True)
-            print(
-                "ep2sindy: compiling its kernels, once after installation (half a minute) ...",
-                file=sys.stderr,
-                flush=True,
-            )
+        if not _TOLD:
+            _TOLD.append(lambda name: None)  # numba tells of every function; people need it once
+            print(ANNOUNCEMENT, file=sys.stderr, flush=True)
 
     def on_end(self, event: event.Event) -> None:
-        pass
+        kernel: Any = event.data.get("dispatcher")
+        module = str(getattr(kernel, "__module__", ""))
+        if module.startswith("ep2sindy."):
+            for tell in _TOLD:
+                tell(f"{module}.{kernel.__name__}")
 
 
-_ANNOUNCED: list[bool] = []  # numba tells listeners of every function; people need it once
-_LISTENERS: list[_Announcer] = []
+_TOLD: list[Callable[[str], None]] = []  # whoever hears of kernels; none as long as all is cached
+_LISTENERS: list[_Listener] = []
 
 
-def _announce() -> None:
+def _listen() -> None:
     if not _LISTENERS:
-        _LISTENERS.append(_Announcer())
+        _LISTENERS.append(_Listener())
         event.register("numba:compile", _LISTENERS[0])

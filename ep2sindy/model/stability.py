@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from itertools import count
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.interpolate import CubicSpline
-from scipy.spatial import KDTree
-from scipy.stats import qmc
 
 from ep2sindy.data.trajectory import read_only
 from ep2sindy.model.closed_orbit import (
@@ -182,6 +180,8 @@ def _on_cycle(
     scaled: ScaledModel, y: np.ndarray, curve: np.ndarray, n_periods: float, n_steps: int
 ) -> int:
     """How many of the starts (n_states, starts) follow the curve for the last periods."""
+    from scipy.spatial import KDTree
+
     nearest = KDTree(_interpolated(curve))
     centre = curve.mean(axis=0)[:, None]
     bound = BLOW_UP * np.abs(y - centre).max()
@@ -212,6 +212,8 @@ def _steps(scaled: ScaledModel, y: np.ndarray) -> np.ndarray:
 
 def _interpolated(curve: np.ndarray) -> np.ndarray:
     """The closed curve through the samples, at sixteen points to each."""
+    from scipy.interpolate import CubicSpline  # a quarter of a second that most do not need
+
     n = len(curve)
     spline = CubicSpline(np.arange(n + 1), np.append(curve, curve[:1], axis=0), bc_type="periodic")
     return spline(np.arange(16 * n) / 16.0)
@@ -219,13 +221,30 @@ def _interpolated(curve: np.ndarray) -> np.ndarray:
 
 def _starts(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:
     """(starts, n_states), see `share_reaching`."""
-    share = qmc.Halton(states.shape[1], scramble=False).fast_forward(1).random(n_starts)
+    share = _halton(n_starts, states.shape[1])
     mean = states.mean(axis=0)
     reach = spread[1] * 0.5 * np.ptp(states, axis=0)
     low, high = np.log(spread)
     one_sign = (states > 0.0).all(axis=0) | (states < 0.0).all(axis=0)
     around = mean * np.exp(low + (high - low) * share)
     return np.where(one_sign, around, mean + reach * (2.0 * share - 1.0))
+
+
+def _halton(n: int, n_dimensions: int) -> np.ndarray:
+    """(n, n_dimensions): the first points of Halton's sequence but the one at zero.
+
+    To the last digit those of `scipy.stats.qmc`, which takes half a second to import.
+    Source: Halton 1960, doi:10.1007/BF01386213.
+    """
+    points = np.zeros((n, n_dimensions))
+    bases = (k for k in count(2) if all(k % j for j in range(2, k)))
+    for column, base in zip(points.T, bases, strict=False):
+        digits, place = np.arange(1, n + 1), 1.0
+        while digits.any():
+            place /= base
+            digits, digit = np.divmod(digits, base)
+            column += place * digit
+    return points
 
 
 def _check_search(

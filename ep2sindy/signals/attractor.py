@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import read_only
@@ -152,6 +151,8 @@ def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
     slow = (x - x.mean()) * np.exp(-1j * straight)
     even = t
     if not is_uniform(t):
+        from scipy.interpolate import make_interp_spline
+
         even = np.linspace(t[0], t[-1], len(t))
         slow = make_interp_spline(t, slow, k=1)(even)
     per_period = len(t) * 2.0 * np.pi / (straight[-1] - straight[0])

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import check_time, read_only
@@ -110,6 +109,8 @@ def most_likely_ratio(
     The likelihood may be flat or have several maxima: a grid of whole decades finds the
     highest, a bounded search between its neighbours refines it.
     """
+
+    from scipy.optimize import minimize_scalar  # for those alone who estimate it
 
     def misfit(log10_ratio: float) -> float:
         return -likelihood(steps, values, 10.0**log10_ratio)[0][0]

@@ -1,0 +1,108 @@
+"""`ep2sindy warm`: every kernel compiled once, so that no run waits for one.
+
+Runs of the command line begin with it; where it has been done, it takes no time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from hashlib import sha256
+
+import ep2sindy as ep
+from ep2sindy.machine.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
+
+ABOUT = """Compiles all kernels of the package, once after installation: half a minute on two cores.
+Runs of the command line do so by themselves; in Python, a call compiles what it uses."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Compile, and say where the kernels are kept."""
+    argparse.ArgumentParser("ep2sindy warm", description=ABOUT).parse_args(arguments)
+    warm()
+    print(f"all kernels are compiled; they are kept in {kept_in()}")
+
+
+def warm() -> None:
+    """Compile all kernels, saying so, unless these sources have been compiled by this machine."""
+    stamp, state = kept_in() / "warm", _state()
+    if stamp.is_file() and stamp.read_text("utf-8") == state:
+        return
+    print(ANNOUNCEMENT, file=sys.stderr, flush=True)
+    _compile_side_by_side()
+    with suppress(OSError):  # a disk that takes no more costs the next run this half minute again
+        stamp.parent.mkdir(parents=True, exist_ok=True)
+        stamp.write_text(state, "utf-8")
+
+
+def _state() -> str:
+    """What compiled kernels depend on: their sources, numba, Python and the processor."""
+    import numba
+    from llvmlite.binding import get_host_cpu_name
+
+    files = [(path.name, path.stat().st_mtime, path.stat().st_size) for path in sources()]
+    versions = numba.__version__, sys.version, get_host_cpu_name()
+    return sha256(repr((files, versions)).encode()).hexdigest()
+
+
+def _compile_side_by_side() -> None:
+    """Each part in a process of its own; what fails there fails again in a run, and says why."""
+    from tqdm import tqdm
+
+    n_kernels = sum(path.read_text("utf-8").count("\n@compiled") for path in sources())
+    reader, writer = os.pipe()
+    command = [sys.executable, "-m", "ep2sindy.app.warm"]
+    parts = [subprocess.Popen([*command, part], stdout=writer) for part in PARTS]
+    os.close(writer)
+    with (
+        open(reader, encoding="utf-8") as lines,
+        tqdm(total=n_kernels, unit="kernel", disable=None, leave=False) as bar,
+    ):
+        names: set[str] = set()  # parts share some
+        for name in lines:
+            bar.update(name not in names)
+            names.add(name)
+    for part in parts:
+        part.wait()
+
+
+def _search() -> None:
+    """Smoothers, rows, searches, estimates and free runs."""
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    found = ep.discover(run)
+    for method in (ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset()):
+        ep.discover(run, recipe=ep.Recipe(ep.Differential(), method, ep.Bootstraps(n=2), ep.Knee()))
+    found.model.simulate(run.t, run.states[0])
+
+
+def _refinement() -> None:
+    """Refinement, trial runs, and the simulator along the axis."""
+    point, step_s = ep.OperatingPoint(300.0, 5.0), 1e-6
+    brief = partial(ep.simulate, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
+    brief(ep.Thruster(), point, n_cells=20, progress=False)
+    system = ep.lotka_volterra()
+    ep.refine(system.model, [system.trajectory()], window=20, n_windows=2, rng=0)
+
+
+def _plane() -> None:
+    """The (z, r) simulator."""
+    step_s = 1e-6
+    brief = partial(ep.simulate_2d, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
+    brief(n_z=12, n_r=12, progress=False)
+
+
+PARTS: Mapping[str, Callable[[], None]] = {
+    "search": _search,
+    "refinement": _refinement,
+    "plane": _plane,
+}
+
+
+if __name__ == "__main__":
+    tell_each_kernel(lambda name: print(name, flush=True))
+    PARTS[sys.argv[1]]()
