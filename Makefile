@@ -1,7 +1,12 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: attack breathing test test-slow lint docs benchmark clean
+# Tests that call all rooms, for `make types`; TYPED=tests takes all there are.
+TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalman \
+	propellants axial plane thruster model simulation weak constraints search systems given \
+	control_law tied_refinement operating_plots map_plots report compare experiment_frontier)
+
+.PHONY: attack breathing test test-fast test-slow lint types docs benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -18,7 +23,13 @@ lint: .venv/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint
+# Shapes and types of every call are checked by jaxtyping's hook, here and nowhere else.
+types: .venv/installed
+	$(BIN)/python -m pytest -q -m "not slow" -p tests.checked $(TYPED)
+
+test: lint test-fast
+
+test-fast: .venv/installed
 	$(BIN)/python -m pytest -q -m "not slow" -n auto --dist worksteal
 
 # EP2SINDY_DATA=folder adds the checks against files that are not shipped.

@@ -8,10 +8,8 @@ import pytest
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from tests import type_checks
 from tests.warm import compile_kernels
 
-type_checks.install()
 # Workers share the cores: threads of their own would only get in each other's way.
 threadpool_limits(1)
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of PyTorch, which is imported later
@@ -57,7 +55,7 @@ def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
         coords={"time": time, "z": np.linspace(0.012, 0.028, 5)},
         attrs={"channel_m": 0.025},
     )
-    from ep2sindy.data.open import write_field  # after the hook
+    from ep2sindy.data.open import write_field
 
     path = tmp_path_factory.mktemp("data") / "predator_prey.nc"
     write_field(field, path)
