@@ -1,12 +1,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
+# Kept, whatever the environment says: each process of a run would compile all sources again.
+unexport PYTHONDONTWRITEBYTECODE
 
-# Tests that call all rooms, for `make types`; TYPED=tests takes all there are.
+# Tests that call all rooms, for `make types`; another set: make types TYPED=tests/test_weak.py
 TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalman \
 	propellants axial plane thruster model simulation weak constraints search systems given \
 	control_law tied_refinement operating_plots map_plots report compare experiment_frontier)
 
-.PHONY: attack breathing test test-fast test-slow lint types docs benchmark clean
+.PHONY: attack breathing test test-fast test-slow test-docs lint types docs benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -35,6 +37,10 @@ test-fast: .venv/installed
 # EP2SINDY_DATA=folder adds the checks against files that are not shipped.
 test-slow: lint
 	$(BIN)/python -m pytest -q
+
+# What guards figures and commands of README and docs: every page's Python, the site, the wheel.
+test-docs: .venv/installed
+	$(BIN)/python -m pytest -q tests/test_docs.py tests/test_site.py tests/test_wheel.py
 
 # The site, into ./site; a warning is an error. Its notebook is run on the way.
 docs: .venv/installed

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from tests.warm import compile_kernels
@@ -24,6 +23,8 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(scope="session")
 def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""
+    import xarray as xr  # here, for each process of a run imports this file
+
     a, b, c = 1.64e5, 4.66e-14, 4.39e4
     dt_s, n_samples = 1.5e-6, 1200
     states = np.empty((n_samples, 2))
