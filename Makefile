@@ -1,7 +1,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
+# Kept, whatever the environment says: each process of a run would compile all sources again.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: attack breathing test test-slow lint docs benchmark clean
+# Tests that call all rooms, for `make types`; another set: make types TYPED=tests/test_weak.py
+TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalman \
+	propellants axial plane thruster model simulation weak constraints search systems given \
+	control_law tied_refinement operating_plots map_plots report compare experiment_frontier)
+
+.PHONY: attack breathing test test-fast test-slow test-docs lint types docs benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -18,12 +25,22 @@ lint: .venv/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint
+# Shapes and types of every call are checked by jaxtyping's hook, here and nowhere else.
+types: .venv/installed
+	$(BIN)/python -m pytest -q -m "not slow" -p tests.checked $(TYPED)
+
+test: lint test-fast
+
+test-fast: .venv/installed
 	$(BIN)/python -m pytest -q -m "not slow" -n auto --dist worksteal
 
 # EP2SINDY_DATA=folder adds the checks against files that are not shipped.
 test-slow: lint
 	$(BIN)/python -m pytest -q
+
+# What guards figures and commands of README and docs: every page's Python, the site, the wheel.
+test-docs: .venv/installed
+	$(BIN)/python -m pytest -q tests/test_docs.py tests/test_site.py tests/test_wheel.py
 
 # The site, into ./site; a warning is an error. Its notebook is run on the way.
 docs: .venv/installed

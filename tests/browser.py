@@ -75,22 +75,29 @@ def seen(
         )  # fmt: skip
         try:
             url = page if isinstance(page, str) else page.resolve().as_uri()
-            return asyncio.run(_seen(Path(profile), url, width_px, questions or {}, picture))
+            return asyncio.run(
+                _seen(process, Path(profile), url, width_px, questions or {}, picture)
+            )
         finally:
             process.kill()
             process.wait()
 
 
 async def _seen(
-    profile: Path, url: str, width_px: int, questions: dict[str, str], picture: Path | None
+    process: subprocess.Popen,
+    profile: Path,
+    url: str,
+    width_px: int,
+    questions: dict[str, str],
+    picture: Path | None,
 ) -> Seen:
+    """It waits for what the browser says, however long that takes, until the browser ends."""
     from tornado.httpclient import AsyncHTTPClient
     from tornado.websocket import websocket_connect
 
     port_file = profile / "DevToolsActivePort"
-    for _ in range(300):
-        if port_file.is_file() and "\n" in port_file.read_text():
-            break
+    while not (port_file.is_file() and "\n" in port_file.read_text()):
+        assert process.poll() is None, "the browser ended before it listened"
         await asyncio.sleep(0.1)
     port = port_file.read_text().splitlines()[0]
     listed = await AsyncHTTPClient().fetch(f"http://127.0.0.1:{port}/json/list")
@@ -110,7 +117,9 @@ async def _seen(
         count += 1
         await socket.write_message(json.dumps({"id": count, "method": method, "params": arguments}))
         while True:
-            message = json.loads(await asyncio.wait_for(socket.read_message(), 60.0))  # type: ignore[arg-type]
+            answer = await socket.read_message()
+            assert answer is not None, "the browser ended"
+            message = json.loads(answer)
             if message.get("id") == count:
                 assert "error" not in message, message
                 return message["result"]
@@ -128,9 +137,7 @@ async def _seen(
         width=width_px, height=900, deviceScaleFactor=1, mobile=width_px < 700,
     )  # fmt: skip
     await call("Page.navigate", url=url)
-    for _ in range(300):
-        if await value("location.href != 'about:blank' && document.readyState == 'complete'"):
-            break
+    while not await value("location.href != 'about:blank' && document.readyState == 'complete'"):
         await asyncio.sleep(0.1)
     found.scroll_px = await value("document.documentElement.scrollWidth")
     found.figures = await value("document.querySelectorAll('figure img, figure svg').length")

@@ -5,13 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from tests import type_checks
 from ep2sindy.app.warm import warm
 
-type_checks.install()
 # Workers share the cores: threads of their own would only get in each other's way.
 threadpool_limits(1)
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of PyTorch, which is imported later
@@ -26,6 +23,8 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(scope="session")
 def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A field on (time, z) whose average follows the thesis's Eq. 23, in SI units."""
+    import xarray as xr  # here, for each process of a run imports this file
+
     a, b, c = 1.64e5, 4.66e-14, 4.39e4
     dt_s, n_samples = 1.5e-6, 1200
     states = np.empty((n_samples, 2))
@@ -57,7 +56,7 @@ def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
         coords={"time": time, "z": np.linspace(0.012, 0.028, 5)},
         attrs={"channel_m": 0.025},
     )
-    from ep2sindy.data.open import write_field  # after the hook
+    from ep2sindy.data.open import write_field
 
     path = tmp_path_factory.mktemp("data") / "predator_prey.nc"
     write_field(field, path)

@@ -87,7 +87,7 @@ def test_epoch_seconds_are_even_but_for_their_rounding() -> None:
 
 
 def test_a_trajectory_refuses_them_without_type_checks_too() -> None:
-    """As users have it: in tests jaxtyping refuses them first."""
+    """As users have it: under `make types` jaxtyping would refuse them first."""
     lines = [
         "import numpy as np",
         "from ep2sindy import Trajectory",

@@ -30,7 +30,7 @@ class Choice:
     the model leaves more than noise.
     """
 
-    scores: Sequence[Float[np.ndarray, " candidates"]]
+    scores: Sequence[Float[np.ndarray, " _candidates"]]
     chosen: Sequence[Candidate]
     model: SparseModel
     note: str = ""
@@ -81,7 +81,7 @@ def choose(
 
 def _least_sum(
     fronts: Sequence[ParetoFront],
-    scores: Sequence[Float[np.ndarray, " candidates"]],
+    scores: Sequence[Float[np.ndarray, " _candidates"]],
     relations: Sequence[Relation],
 ) -> Int[np.ndarray, " fronts"]:
     """The combination of candidates of least summed score that has the relations' terms."""

@@ -53,7 +53,7 @@ class Discovery:
     """
 
     fronts: Mapping[str, ParetoFront] = field(repr=False)
-    scores: Mapping[str, Float[np.ndarray, " candidates"]] = field(repr=False)
+    scores: Mapping[str, Float[np.ndarray, " _candidates"]] = field(repr=False)
     chosen: Mapping[str, Candidate]
     model: SparseModel = field(repr=False)
     ambiguities: Sequence[Ambiguity]

@@ -27,7 +27,7 @@ TERMS_A_LINE = 4  # of a title
 
 def front_figure(
     fronts: Mapping[str, ParetoFront],
-    scores: Mapping[str, Float[np.ndarray, " candidates"]],
+    scores: Mapping[str, Float[np.ndarray, " _candidates"]],
     *,
     label: str,
 ) -> Figure:

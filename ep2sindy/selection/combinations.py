@@ -34,7 +34,7 @@ def joint_scores(
     *,
     limit: float,
     winner: int | None = None,
-) -> list[Float[np.ndarray, " candidates"]]:
+) -> list[Float[np.ndarray, " _candidates"]]:
     """Scores of candidates from the errors of their combinations.
 
     limit: errors up to there cannot be told from the least; of these the combination of fewest

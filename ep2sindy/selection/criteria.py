@@ -32,7 +32,7 @@ class AICc:
 
     label: ClassVar[str] = "AICc"
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         return [_criterion(front, self._penalty) for front in fronts]
 
     def _penalty(self, candidate: Candidate, n_rows: float) -> float:
@@ -51,7 +51,7 @@ class BIC:
 
     label: ClassVar[str] = "BIC"
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         return [_criterion(front, self._penalty) for front in fronts]
 
     def _penalty(self, candidate: Candidate, n_rows: float) -> float:
@@ -89,7 +89,7 @@ class EBIC:
         """The rule at one of n points that share a support: together they pay its count once."""
         return replace(self, gamma=self.gamma / n_points)
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         found = []
         for front in fronts:
             library = front.problem.library

@@ -21,7 +21,7 @@ class Evidence:
 
     label: ClassVar[str] = "deviance"
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         for front in fronts:
             if any(candidate.deviance is None for candidate in front.candidates):
                 raise ValueError(

@@ -102,7 +102,7 @@ class FreeRunScore:
         if not 0.0 < self.margin <= 1.0:
             raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         """Those of `decide`."""
         return list(self.decide(fronts).scores)
 

@@ -50,7 +50,7 @@ class IntegralScore:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1: {getattr(self, name)} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         """Raises ValueError for rows without trajectories, a state without a front, or more than
         max_combinations.
         """

@@ -30,7 +30,7 @@ class Knee:
         if self.n_norm not in ("library", "max_terms"):
             raise ValueError(f"n_norm must be 'library' or 'max_terms': {self.n_norm!r} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         return [np.hypot(f.errors, f.sizes / _norm_of_sizes(f, self.n_norm)) for f in fronts]
 
 
@@ -49,7 +49,7 @@ class LogKnee:
     def __post_init__(self) -> None:
         Knee(self.n_norm)
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         found = []
         for front in fronts:
             height = np.log(np.maximum(front.errors, FLOOR))

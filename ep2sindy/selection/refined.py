@@ -72,7 +72,7 @@ class RefinedScore:
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}: {getattr(self, name)} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         """Raises ValueError for rows without trajectories, a state without a front, more than
         max_combinations, or records too short for two windows.
         """

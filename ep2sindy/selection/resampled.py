@@ -35,7 +35,7 @@ class Stability:
         if not 0.5 < self.threshold <= 1.0:
             raise ValueError(f"threshold must lie in (0.5, 1]: {self.threshold} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         """Raises ValueError for fronts without bootstraps."""
         _check_bootstraps([c for front in fronts for c in front.candidates])
         return [np.array([self._score(c) for c in front.candidates]) for front in fronts]
@@ -73,7 +73,7 @@ class CrossValidation:
         if self.n_folds < 2:
             raise ValueError(f"n_folds must be at least 2: {self.n_folds} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]:
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         """Raises ValueError for fewer groups than folds, or too few rows outside of a block."""
         found = []
         for front in fronts:

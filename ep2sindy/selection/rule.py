@@ -27,7 +27,7 @@ class Selection(Protocol):
 
     label: ClassVar[str]
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " candidates"]]: ...
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]: ...
 
 
 def selected(front: ParetoFront, scores: Float[np.ndarray, " candidates"]) -> Candidate:
@@ -43,7 +43,7 @@ class Decision:
     the covariance of its coefficients. note: how it was decided, in words.
     """
 
-    scores: Sequence[Float[np.ndarray, " candidates"]]
+    scores: Sequence[Float[np.ndarray, " _candidates"]]
     model: SparseModel
     note: str
 
