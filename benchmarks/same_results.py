@@ -246,7 +246,7 @@ def differing(before: Any, now: Any, place: str) -> Iterator[str]:
     """Where what was there is another, or missing; what is new does not count."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key, value in before.items():
-            if key not in TIMES:
+            if key.split("/")[-1] not in TIMES:
                 yield from differing(value, now.get(key), f"{place}: {key}")
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         for k, (one, other) in enumerate(zip(before, now, strict=True)):
