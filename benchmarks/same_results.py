@@ -26,7 +26,7 @@ import pandas as pd
 import xarray as xr
 
 HERE = Path(__file__).resolve().parents[1]
-TIMES = {"cpu_s", "wall_s", "points_per_s", "cpu_s_per_search"}
+TIMES = {"cpu_s", "cpu_ms", "wall_s", "points_per_s", "cpu_s_per_search"}
 ON_FILE = ["data=file", "data.variables.R_ion.name=R_ion", "data.variables.u_iz.name=u_iz"]
 LINE, GRID = "data.path={line}", "data.path={grid}"
 ZONE = "trajectory.zone.z=[0.015,0.025]"

@@ -244,8 +244,7 @@ def test_a_terminal_sees_label_count_and_unit_and_then_nothing(
     with Bars().stage(3, "system", "refined") as advance:
         first = terminal.getvalue()
         assert "refined:   0%" in first
-        assert "0/3 [" in first
-        assert "? system/s" in first
+        assert "0/3 system [" in first
         advance(3)
     assert terminal.getvalue().endswith("\r")
     assert not terminal.getvalue().split("\r")[-2].strip()

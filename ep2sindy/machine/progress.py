@@ -61,13 +61,22 @@ class Bars:
         with tqdm(
             total=total,
             desc=label or None,
-            unit=f" {unit}",
-            bar_format=None if unit else "{desc} ... ",
+            unit=unit,
+            bar_format=_layout(total, unit, label),
             leave=False,
             disable=False,
             miniters=1,  # slow pieces after fast ones are shown as they come
         ) as bar:
             yield lambda n_more: bar.update(n_more) and None
+
+
+def _layout(total: int | None, unit: str, label: str) -> str:
+    """What tqdm writes on a line."""
+    if not unit:
+        return "{desc} ... "
+    if total is None:
+        return ("{desc}: " if label else "") + "{n_fmt} {unit} [{elapsed}]"
+    return "{l_bar}{bar}| {n_fmt}/{total_fmt} {unit} [{elapsed}<{remaining}]"
 
 
 @dataclass(frozen=True)
