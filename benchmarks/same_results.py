@@ -2,8 +2,10 @@
 
     python -m benchmarks.same_results OTHER_CHECKOUT
 
-Compares summaries, models and tables, but for times. What only this checkout writes is named and
-allowed; anything that differs, or that it lacks, ends the program with status 1.
+What no experiment computes is a small program instead, run in both checkouts: the (z, r)
+simulator and a neural correction. Compares summaries, models and tables, but for times. What only
+this checkout writes is named and allowed; anything that differs, or that it lacks, ends the
+program with status 1.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import subprocess
 import sys
 import tempfile
@@ -23,7 +26,7 @@ import pandas as pd
 import xarray as xr
 
 HERE = Path(__file__).resolve().parents[1]
-TIMES = {"cpu_s", "wall_s", "points_per_s", "cpu_s_per_search"}
+TIMES = {"cpu_s", "cpu_ms", "wall_s", "points_per_s", "cpu_s_per_search"}
 ON_FILE = ["data=file", "data.variables.R_ion.name=R_ion", "data.variables.u_iz.name=u_iz"]
 LINE, GRID = "data.path={line}", "data.path={grid}"
 ZONE = "trajectory.zone.z=[0.015,0.025]"
@@ -70,13 +73,62 @@ TOYS: dict[str, list[str]] = {
         "+exp=pointwise", *ON_FILE, GRID, "data.r.name=r", "data.variables.u_ir.name=u_ir",
         "keep={cache}/kept", "parallel=serial", "bootstraps.n=6", "block_points=5", "max_regimes=3",
     ],
+    "trace": [
+        "+exp=trace", "data=file", "data.path={signal}", "signal=I", "unit=A", "search.n_best=2",
+        "search.max_terms=4", "depth=2", "selection.n_starts=2", "selection.n_windows=6",
+    ],
+    "simulate": [
+        "+exp=simulate", "data.cache={cache}", "data.duration_s=6.0e-4", "data.warm_up_s=1.0e-4",
+        "data.n_cells=24", "data.progress=false", "parallel=serial",
+        "scan={{operating_point.voltage:[250.0,300.0]}}",
+    ],
 }  # fmt: skip
+# Programs that write tables into the folder they are given.
+PROGRAMS: dict[str, str] = {
+    "simulate_2d": """
+import json, sys
+from pathlib import Path
+import ep2sindy as ep
+field = ep.simulate_2d(duration_s=3e-5, warm_up_s=5e-6, n_z=24, n_r=10, progress=False)
+values = {str(name): field[name].values.ravel().tolist() for name in field.data_vars}
+Path(sys.argv[1], "field.json").write_text(json.dumps(values | {"status": field.attrs["status"]}))
+""",
+    "correction": """
+import json, sys
+from pathlib import Path
+import torch
+import ep2sindy as ep
+prey = ep.lotka_volterra()
+library = ep.named_terms(["x", "y"], ["x", "y"])
+rates = [{name: prey.model.terms(name)[name]} for name in ("x", "y")]
+known = ep.SparseModel(library, ["x", "y"], ep.coef_matrix(library, rates))
+torch.manual_seed(0)
+last = torch.nn.Linear(4, 2)
+torch.nn.init.zeros_(last.weight)
+torch.nn.init.zeros_(last.bias)
+network = torch.nn.Sequential(torch.nn.Linear(2, 4), torch.nn.Tanh(), last)
+run = prey.trajectory(noise=0.01, rng=0)
+fit = ep.refine_with_correction(
+    known, [run], network, window=15, n_windows=4, rng=0, method=ep.GradientDescent(max_iter=4)
+)
+states = run.states[::50]
+values = {
+    "coef": fit.model.coef.tolist(),
+    "losses": [fit.loss_before, fit.loss, *fit.window_loss.tolist()],
+    "status": fit.status,
+    "history": [step.loss for step in fit.history],
+    "learned": fit.learned(states).tolist(),
+}
+Path(sys.argv[1], "correction.json").write_text(json.dumps(values))
+""",
+}
 
 
 def main() -> None:
+    names = [*TOYS, *PROGRAMS]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("other", type=Path, help="the checkout to compare with")
-    parser.add_argument("--only", nargs="*", choices=TOYS, default=list(TOYS))
+    parser.add_argument("--only", nargs="*", choices=names, default=names)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         paths = write_data(Path(folder))
@@ -85,7 +137,7 @@ def main() -> None:
 
 
 def write_data(folder: Path) -> dict[str, Path]:
-    """A line that follows the thesis's Eq. 23, and a grid whose regions follow laws apart."""
+    """A line by the thesis's Eq. 23, a grid whose regions follow laws apart, and one signal."""
     t = 1.5e-6 * np.arange(1200)
     profile = np.linspace(0.9, 1.1, 5)
     line = _field(_predator_prey(t)[:, :, None] * profile, t, {"z": np.linspace(0.012, 0.028, 5)})
@@ -94,7 +146,10 @@ def write_data(folder: Path) -> dict[str, Path]:
     grid = _field(waves * np.linspace(0.95, 1.05, 5), t[:300], axes)
     line.to_netcdf(folder / "line.nc")
     grid.to_netcdf(folder / "grid.nc")
-    return {name: folder / f"{name}.nc" for name in ("line", "grid")} | {"folder": folder}
+    signal = pd.DataFrame({"time": t, "I": _predator_prey(t)[:, 0] / 1e17})
+    signal.to_csv(folder / "signal.csv", index=False)
+    paths = {name: folder / f"{name}.nc" for name in ("line", "grid")}
+    return paths | {"signal": folder / "signal.csv", "folder": folder}
 
 
 def _predator_prey(t: np.ndarray) -> np.ndarray:
@@ -141,15 +196,11 @@ def is_same(name: str, other: Path, paths: dict[str, Path]) -> bool:
     for number, checkout in enumerate((other.resolve(), HERE)):
         output = paths["folder"] / f"{name}_{number}"
         places = {**paths, "cache": paths["folder"] / f"cache_{number}"}
-        command = [text.format(**places) for text in TOYS[name]]
-        run = subprocess.run(
-            [sys.executable, "-m", "experiments.run", *command, f"output={output}"],
-            cwd=checkout, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        run = outcome(name, checkout, output, places)
         if run.returncode:
             print(f"{name}: failed in {checkout}:\n{run.stderr[-2000:]}")
             return False
-        found.append(contents(Path(run.stdout.splitlines()[-1])))
+        found.append(contents(output if name in PROGRAMS else Path(run.stdout.splitlines()[-1])))
     before, now = found
     differences = [text for path in before for text in differing(before[path], now.get(path), path)]
     new = sorted(set(now) - set(before))
@@ -161,6 +212,22 @@ def is_same(name: str, other: Path, paths: dict[str, Path]) -> bool:
     for text in differences[:10]:
         print(f"  {text}")
     return not differences
+
+
+def outcome(
+    name: str, checkout: Path, output: Path, places: dict[str, Path]
+) -> subprocess.CompletedProcess[str]:
+    """A toy or a program, run by the code of a checkout."""
+    if name in PROGRAMS:
+        output.mkdir()
+        command = ["-c", PROGRAMS[name], str(output)]
+    else:
+        overrides = [text.format(**places) for text in TOYS[name]]
+        command = ["-m", "experiments.run", *overrides, f"output={output}"]
+    return subprocess.run(
+        [sys.executable, *command], cwd=checkout, env={**os.environ, "PYTHONPATH": str(checkout)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
 
 
 def contents(folder: Path) -> dict[str, Any]:
@@ -179,7 +246,7 @@ def differing(before: Any, now: Any, place: str) -> Iterator[str]:
     """Where what was there is another, or missing; what is new does not count."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key, value in before.items():
-            if key not in TIMES:
+            if key.split("/")[-1] not in TIMES:
                 yield from differing(value, now.get(key), f"{place}: {key}")
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         for k, (one, other) in enumerate(zip(before, now, strict=True)):

@@ -78,6 +78,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.machine.parallel import Dask as Dask
     from ep2sindy.machine.parallel import Loky as Loky
     from ep2sindy.machine.parallel import Serial as Serial
+    from ep2sindy.machine.progress import Progress as Progress
     from ep2sindy.model.free_run import FreeRun as FreeRun
     from ep2sindy.model.free_run import free_run as free_run
     from ep2sindy.model.likeness import Bounds as Bounds
@@ -245,6 +246,7 @@ _FACE = {
     "library.library": "Library polynomial named_terms",
     "machine.own": "for_configs",
     "machine.parallel": "Serial Loky Dask",
+    "machine.progress": "Progress",
     "library.units": "Clock",
     "model.free_run": "FreeRun free_run",
     "model.likeness": "Bounds Verdict",

@@ -21,6 +21,7 @@ from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
 from ep2sindy.machine.own import own_module
+from ep2sindy.machine.progress import counted
 from ep2sindy.report.about import ASIDE, About, asked_of, by_place
 from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
@@ -162,7 +163,7 @@ def write(
     sections, headline = outcome.sections(), dict(outcome.headline())
     run.screen.show(sections)
     figures = {}
-    for name, captioned in outcome.figures().items():
+    for name, captioned in counted(run.watch, outcome.figures().items(), "figure"):
         figure = captioned.draw()
         png = folder.write_figure(name, figure, formats)
         run.board.image(name, png)

@@ -13,6 +13,7 @@ from ep2sindy.constraints.relations import Relation, constraint
 from ep2sindy.constraints.support import binding
 from ep2sindy.discovery.last_fit import assemble_model, last_fit
 from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, support_of
@@ -44,6 +45,7 @@ def choose(
     units: Mapping[str, str],
     provenance: Mapping[str, str],
     estimate: Estimate | None = None,
+    progress: Progress = SILENT,
 ) -> Choice:
     """Score the candidates, select, and fit: refined, constrained, weighted or as they are.
 
@@ -54,12 +56,13 @@ def choose(
     """
     library = fronts[0].problem.library
     if isinstance(rule, SystemSelection):
-        decision = rule.decide(fronts, relations)
+        decision = rule.decide(fronts, relations, progress=progress)
         best = [selected(*pair) for pair in zip(fronts, decision.scores, strict=True)]
         model = replace(decision.model, units=units, provenance=provenance)
         chosen = [_as_in(model, candidate) for candidate in best]
         return Choice(decision.scores, chosen, model, decision.note)
-    scores = rule.scores(fronts)
+    with progress.stage(None, "", f"candidates by {rule.label}"):
+        scores = rule.scores(fronts)
     if estimate is not None:
         best = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
         chosen = [_as_in(estimate.model, candidate) for candidate in best]

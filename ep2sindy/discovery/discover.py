@@ -20,6 +20,7 @@ from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.machine.screen import N_LINES, one_screen
 from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
@@ -96,6 +97,7 @@ def discover(
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
     seed: int | np.random.Generator = 0,
+    progress: Progress | bool = False,
 ) -> Discovery:
     """Find sparse equations for every state of the runs.
 
@@ -108,7 +110,7 @@ def discover(
     recipe: None means Recipe(), the route for noisy data that we know to be best.
     relations: between coefficients, such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in
     the search, in the selection and in the model. terms: by state, all the terms of an equation
-    that is known but for its coefficients.
+    that is known but for its coefficients. progress: True shows bars; see `Progress`.
     Raises ValueError for a relation or a term that the library or the states do not have.
     """
     trajectories = trajectories_of(runs)
@@ -118,15 +120,13 @@ def discover(
     check_kind("recipe", recipe, Recipe, "ep.Recipe(selection=ep.EBIC())")
     asked = Asked(relations_of(relations), terms or {})
     check_asked(asked, library, trajectories[0].state_names)
-    estimate, fronts = _searched(trajectories, library, recipe, asked, seed)
+    watch = as_progress(progress)
+    estimate, fronts = _searched(trajectories, library, recipe, asked, seed, watch)
     choice = choose(
-        list(fronts.values()),
-        recipe.selection,
-        asked.relations,
-        units=trajectories[0].units,
+        list(fronts.values()), recipe.selection, asked.relations, units=trajectories[0].units,
         provenance=recipe.provenance | {"trajectories": ", ".join(r.label for r in trajectories)},
-        estimate=estimate,
-    )
+        estimate=estimate, progress=watch,
+    )  # fmt: skip
     choice = _judged(choice, trajectories, library, recipe)
     findings = _findings([front.problem for front in fronts.values()], recipe, asked)
     return Discovery(
@@ -169,10 +169,11 @@ def _searched(
     recipe: Recipe,
     asked: Asked,
     seed: int | np.random.Generator,
+    progress: Progress,
 ) -> tuple[Estimate | None, dict[str, ParetoFront]]:
     """Fronts by state, and the estimate that they come from, if any."""
     rng = np.random.default_rng(seed)
     if isinstance(recipe.search, Joint):
-        return estimated(runs, library, recipe, asked, rng=rng)
-    equations = recipe.searched(runs, library, asked, rng=rng)
+        return estimated(runs, library, recipe, asked, rng=rng, progress=progress)
+    equations = recipe.searched(runs, library, asked, rng=rng, progress=progress)
     return None, {equation.front.equation: equation.front for equation in equations}

@@ -12,6 +12,7 @@ from ep2sindy.discovery.recipe import Asked, Recipe
 from ep2sindy.estimation.estimate import Estimate, Weighed, estimate
 from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.rows import Regression
 from ep2sindy.search.front import Candidate, ParetoFront, fit_supports
 
@@ -23,6 +24,7 @@ def estimated(
     asked: Asked,
     *,
     rng: np.random.Generator,
+    progress: Progress = SILENT,
 ) -> tuple[Estimate, dict[str, ParetoFront]]:
     """The estimate, and by state its front: R2 of its candidates is that of the recipe's rows."""
     assert isinstance(recipe.search, Joint)
@@ -34,8 +36,10 @@ def estimated(
         terms=asked.terms,
         units=runs[0].units,
         provenance=recipe.provenance | {"trajectories": ", ".join(run.label for run in runs)},
+        progress=progress,
     )
-    problems = recipe.formulation.assemble(runs, library, rng=rng)
+    with progress.stage(None, "", "rows of the regression"):
+        problems = recipe.formulation.assemble(runs, library, rng=rng)
     fronts = {
         state: _front(problem, state, found.weighed[state], recipe.depth)
         for problem in problems

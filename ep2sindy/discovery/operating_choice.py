@@ -22,6 +22,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Serial, Workers
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.searches import BestSubset
 
@@ -50,7 +51,11 @@ class Tried:
 
 
 def candidate_structures(
-    records: Sequence[OperatingRecord], library: Library, *, max_terms: int
+    records: Sequence[OperatingRecord],
+    library: Library,
+    *,
+    max_terms: int,
+    progress: Progress = SILENT,
 ) -> list[Structure]:
     """The best support of every size from two on for each equation, in all combinations.
 
@@ -58,7 +63,7 @@ def candidate_structures(
     """
     recipe = Recipe(formulation=Differential(), search=BestSubset(max_terms=max_terms))
     runs = {point_text(record.parameters): [record.run] for record in records}
-    found = discover_jointly(runs, library, recipe)
+    found = discover_jointly(runs, library, recipe, progress=progress)
     sizes = {
         state: [support for support in front.supports if len(support) >= 2]
         for state, front in found.fronts.items()
@@ -75,6 +80,7 @@ def tried(
     windows: Windows,
     seed: int = 0,
     workers: Workers | None = None,
+    progress: Progress = SILENT,
 ) -> list[Tried]:
     """Every structure with every degree that leaves a point over.
 
@@ -83,7 +89,11 @@ def tried(
     one = partial(
         _tried, records=records, library=library, degrees=degrees, windows=windows, seed=seed
     )
-    done = dict((workers or Serial()).run(one, structures))
+    done = {}
+    with progress.stage(len(structures), "structure", "laws at points left out") as advance:
+        for number, trials in (workers or Serial()).run(one, structures):
+            done[number] = trials
+            advance(1)
     found = [each for k in range(len(structures)) for each in done[k]]
     if not found:
         n = len(records)

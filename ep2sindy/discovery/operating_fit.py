@@ -20,6 +20,7 @@ from ep2sindy.discovery.operating_points import (
 )
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Serial, Workers
+from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds, deviation
 from ep2sindy.model.model import SparseModel
@@ -113,7 +114,11 @@ class OperatingFit:
         return self._law(functions, law, None, "weighted")
 
     def tied(
-        self, functions: Library, *, start: OperatingLaw | None = None
+        self,
+        functions: Library,
+        *,
+        start: OperatingLaw | None = None,
+        progress: Progress | bool = False,
     ) -> tuple[OperatingLaw, TiedRefinement]:
         """The law refined over all records at once, with intervals.
 
@@ -133,6 +138,7 @@ class OperatingFit:
             start=near.coef,
             method=method,
             rng=self.seed,
+            progress=progress,
         )
         return self._law(functions, found.law, found.covariance, "tied"), found
 
@@ -164,6 +170,7 @@ def operating_fit(
     *,
     windows: Windows | None = None,
     seed: int = 0,
+    progress: Progress | bool = False,
 ) -> OperatingFit:
     """Refine every record on its own with the same terms, from least squares of the derivative.
 
@@ -188,6 +195,7 @@ def operating_fit(
         n_windows=windows.n_windows,
         n_reweights=0,  # states count by their standard deviation, as they are judged
         rng=seed,
+        progress=progress,
     )
     whole = {state: list(structure[state]) for state in states}
     return OperatingFit(records, whole, fits, windows, seed)
@@ -221,6 +229,7 @@ def left_out(
     *,
     start: OperatingLaw | None = None,
     workers: Workers | None = None,
+    progress: Progress | bool = False,
 ) -> list[LeftOut]:
     """Every point in turn by the law of the others: weighted, or tied, beginning at `start`.
 
@@ -234,7 +243,11 @@ def left_out(
                 f"{point_text(record.parameters)} cannot be left out: {error}"
             ) from error
     one = partial(_left_out, fit=fit, functions=functions, start=start)
-    done = dict((workers or Serial()).run(one, range(len(fit.records))))
+    done, n_points = {}, len(fit.records)
+    with as_progress(progress).stage(n_points, "point", "law without a point") as advance:
+        for number, result in (workers or Serial()).run(one, range(n_points)):
+            done[number] = result
+            advance(1)
     return [done[k] for k in range(len(fit.records))]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -19,6 +19,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
 from ep2sindy.machine.parallel import Workers
+from ep2sindy.machine.progress import Advance, Progress, as_progress
 
 NO_FIT = "no_fit"
 
@@ -63,7 +64,7 @@ def pointwise(
     workers: Workers,
     kept: Kept | None = None,
     block_points: int = 128,
-    progress: Callable[[int], None] = lambda n_points: None,
+    progress: Progress | Advance | bool = False,
 ) -> xr.Dataset:
     """Search at every point of a (time, z, r), (time, z) or (time, r) field, block by block.
 
@@ -76,7 +77,8 @@ def pointwise(
     no_fit holds a reason why a fit failed, if one did.
     Only the block at work is in memory where the field is open lazily.
     kept: where finished blocks are found again by a run that takes up a broken one.
-    progress: told of the points of every finished block.
+    progress: True shows a bar; a function is told of the points of every finished block; see
+    `Progress`.
     Raises ValueError for a field without space, a variable it lacks, or where no point could be
     fitted, with the first reason.
     """
@@ -84,23 +86,36 @@ def pointwise(
     part = field[list(search.variables)]
     blocks = blocks_of(part, block_points)
     result = _empty(part, search)
+    n_points = sum(block.n_points for block in blocks)
+    with as_progress(progress).stage(n_points, "point") as advance:
+        for block, done in _done(part, search, blocks, workers, kept):
+            _place(result, block, done)
+            advance(block.n_points)
+    if not (result["status"] == 0).any():
+        raise ValueError(f"no point could be fitted: {_why_none(result)}")
+    return result
+
+
+def _done(
+    part: xr.Dataset,
+    search: PointSearch,
+    blocks: Sequence[Block],
+    workers: Workers,
+    kept: Kept | None,
+) -> Iterator[tuple[Block, Mapping[str, np.ndarray]]]:
+    """Every block with its results: first what is kept, then what is searched now, and kept."""
     waiting: list[Block] = []
     for block in blocks:
         done = kept.read(block) if kept else None
         if done is None:
             waiting.append(block)
         else:
-            _place(result, block, done)
-            progress(block.n_points)
+            yield block, done
     pieces = (part.isel(block.slices) for block in waiting)
     for number, done in workers.run(partial(_searched, search), pieces):
         if kept:
             kept.write(waiting[number], done)
-        _place(result, waiting[number], done)
-        progress(waiting[number].n_points)
-    if not (result["status"] == 0).any():
-        raise ValueError(f"no point could be fitted: {_why_none(result)}")
-    return result
+        yield waiting[number], done
 
 
 def _why_none(result: xr.Dataset) -> str:

@@ -14,6 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.estimate import Estimate, estimate
 from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, resamples
@@ -162,6 +163,7 @@ class Recipe:
         asked: Asked | None = None,
         *,
         rng: np.random.Generator | int,
+        progress: Progress = SILENT,
     ) -> list[SearchedEquation]:
         """Assemble the rows, search every bootstrap of them, and fit what is found.
 
@@ -174,10 +176,15 @@ class Recipe:
             )
         rng, asked = np.random.default_rng(rng), asked or Asked()
         equations = []
-        for problem in self.formulation.assemble(runs, library, rng=rng):
-            draws = resamples(problem, self.bootstraps, rng=rng)
-            for k in range(len(problem.equations)):
-                found = asked.of(problem.equations[k], library, draws.searched(self.search, k))
+        with progress.stage(None, "", "rows of the regression"):
+            problems = self.formulation.assemble(runs, library, rng=rng)
+        for problem in problems:
+            with progress.stage(None, "", "draws of rows"):
+                draws = resamples(problem, self.bootstraps, rng=rng)
+            for k, equation in enumerate(problem.equations):
+                with progress.stage(len(draws.xx), "draw", f"search for {equation}'") as advance:
+                    proposed = draws.searched(self.search, k, advance)
+                found = asked.of(equation, library, proposed)
                 supports = pooled(draws, k, found)
                 front = pareto_front(problem, supports, depth=self.depth)
                 equations.append(SearchedEquation(draws, k, found, supports, front))

@@ -12,6 +12,7 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.discovery.last_fit import assemble_model, last_fit
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import Progress, as_progress, counted
 from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
@@ -61,6 +62,7 @@ def discover_jointly(
     recipe: Recipe | None = None,
     *,
     seed: int | np.random.Generator = 0,
+    progress: Progress | bool = False,
 ) -> JointDiscovery:
     """Find equations whose terms are the same at every operating point, coefficients free.
 
@@ -79,14 +81,12 @@ def discover_jointly(
     search = _joint_search(recipe)
     _check_points(points, library)
     rng = np.random.default_rng(seed)
-    problems = {p: recipe.formulation.assemble(points[p], library, rng=rng) for p in sorted(points)}
-    fronts = {
-        equation: _joint_front(
-            {p: parts[k] for p, parts in problems.items()}, equation, search, recipe.depth
-        )
-        for k, problem in enumerate(next(iter(problems.values())))
-        for equation in problem.equations
+    watch = as_progress(progress)
+    problems = {
+        p: recipe.formulation.assemble(points[p], library, rng=rng)
+        for p in counted(watch, sorted(points), "point", "rows of the regression")
     }
+    fronts = _joint_fronts(problems, search, recipe.depth, watch)
     scores = _summed_scores(list(fronts.values()), recipe.selection)
     best = {state: int(np.argmin(each)) for state, each in zip(fronts, scores, strict=True)}
     provenance = recipe.provenance | {"joint": ", ".join(points)}
@@ -101,6 +101,26 @@ def discover_jointly(
             for point in points
         },
     )
+
+
+def _joint_fronts(
+    problems: Mapping[str, Sequence[Regression]],
+    search: BestSubset,
+    depth: int,
+    progress: Progress,
+) -> dict[str, JointFront]:
+    """By equation, the search over all points. problems: by point, of one structure."""
+    equations = [
+        (k, equation)
+        for k, problem in enumerate(next(iter(problems.values())))
+        for equation in problem.equations
+    ]
+    return {
+        equation: _joint_front(
+            {p: parts[k] for p, parts in problems.items()}, equation, search, depth
+        )
+        for k, equation in counted(progress, equations, "equation", "search of all points")
+    }
 
 
 def _joint_search(recipe: Recipe) -> BestSubset:

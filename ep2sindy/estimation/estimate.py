@@ -17,6 +17,7 @@ from ep2sindy.estimation.problem import Problem, scaled_problem
 from ep2sindy.estimation.size import check_size
 from ep2sindy.estimation.supports import priced, supports_by_size
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import Progress, as_progress, counted
 from ep2sindy.model.model import SparseModel
 
 MOST_RIVALS = 5
@@ -90,24 +91,28 @@ def estimate(
     terms: Mapping[str, Sequence[str]] | None = None,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
+    progress: Progress | bool = False,
 ) -> Estimate:
     """Estimate states at every sample and sparse coefficients together, by their likelihood.
 
     runs: share the coefficients; samples may come at unequal times. Inputs are taken as exact.
     relations: between coefficients, held in fit and search. terms: by state, all the terms of an
-    equation that is known but for its coefficients. Raises ValueError for a library that needs
+    equation that is known but for its coefficients. progress: True shows bars; see `Progress`.
+    Raises ValueError for a library that needs
     more samples than there are, or a variable that no run has.
     """
     search = search or Joint()
     check_runs(runs, library)
     check_size(runs, library, terms or {})
-    problem = scaled_problem(runs, library, relations, terms)
-    found = solve(problem, max_terms=search.terms_for(problem))
+    watch = as_progress(progress)
+    with watch.stage(None, "step", "states and coefficients") as advance:
+        problem = scaled_problem(runs, library, relations, terms, advance=advance)
+        found = solve(problem, max_terms=search.terms_for(problem))
     fit, level = found.annealed.fit, found.annealed.level
     pair = gram(problem, fit, level)
     weighed = {
         state: _weighed(problem, pair, found, block, search)
-        for block, state in enumerate(problem.states)
+        for block, state in counted(watch, list(enumerate(problem.states)), "equation", "rivals")
     }
     misfit = _misfit(problem, found) or _at_limit(problem, found, search)
     model = _model(problem, library, found, units or runs[0].units, provenance or {})

@@ -103,6 +103,7 @@ def fitted(problem: Problem, fit: Fit, level: Level) -> Fit:
     if not np.isfinite(fit.total):
         return fit  # there is no slope to follow
     for _ in range(MOST_STEPS):
+        problem.advance(1)
         change, moves = _step(problem, fit, level)
         if not np.isfinite(change).all():
             return fit  # derivatives overflow where the flow itself does not yet

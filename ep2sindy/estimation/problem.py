@@ -14,6 +14,7 @@ from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.kernels import sensitivity_stage, term_values
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import Advance, nothing
 
 # Where each Runge-Kutta stage stands in its step, and the share of its slope in the sum.
 STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
@@ -70,7 +71,7 @@ class Problem:
     column: (coefficients,), where each stands. C: (coefficients, free), fixed: (coefficients,),
     both scaled; without relations C is the identity. required: (free,), those that are never left
     out. to_SI: (coefficients,), what takes each from scaled to SI. scale: (d,), RMS of the states
-    in SI; step_s: the unit of time.
+    in SI; step_s: the unit of time. advance: told of every step of a fit.
     """
 
     library: Library
@@ -85,6 +86,7 @@ class Problem:
     to_SI: Float[np.ndarray, " coefficients"]
     scale: Float[np.ndarray, " d"]
     step_s: float
+    advance: Advance = nothing
 
     @property
     def n_samples(self) -> int:
@@ -203,6 +205,8 @@ def scaled_problem(
     library: Library,
     relations: Sequence[Relation] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
+    *,
+    advance: Advance = nothing,
 ) -> Problem:
     """Scale records and library, and gather the coefficients that may be in the model.
 
@@ -234,6 +238,7 @@ def scaled_problem(
         to_SI=to_SI,
         scale=size[: len(states)],
         step_s=step_s,
+        advance=advance,
     )
 
 

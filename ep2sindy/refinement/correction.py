@@ -13,6 +13,7 @@ from torch import nn
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import FLAT
@@ -92,6 +93,7 @@ def refine_with_correction(
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
+    progress: Progress | bool = False,
 ) -> Corrected:
     """Train x' = model + correction(states, inputs) to follow windows of the trajectories.
 
@@ -117,10 +119,11 @@ def refine_with_correction(
         rng=rng,
     )
     known, ode = _known_and_whole(model, correction, batch, constraint, device)
-    history, observe = recorder(callback)
-    problem = Problem((ode,), (batch,), free_start, n_reweights, observe)
     method = GradientDescent(max_iter=60, tolerance=1e-3, patience=5) if method is None else method
-    fit = method.fit(problem)
+    with as_progress(progress).stage(None, "iteration", "refinement") as advance:
+        history, observe = recorder(callback, advance)
+        problem = Problem((ode,), (batch,), free_start, n_reweights, observe)
+        fit = method.fit(problem)
     relations = unconstrained(model) if constraint is None else constraint
     return _result(
         model, correction, known, problem, fit, relations, history, n_substeps=method.n_substeps

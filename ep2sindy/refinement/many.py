@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.constraints.relations import Constraint
+from ep2sindy.machine.progress import Advance, nothing
 from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import closed
@@ -41,11 +42,12 @@ def refine_together(
     constraints: Sequence[Constraint] | None = None,
     n_reweights: int = 1,
     points_per_batch: int = 8,
+    advance: Advance = nothing,
 ) -> Together:
     """Refine models of the same states on the same windows, with free starts, and judge none.
 
     constraints: one per model; None leaves all coefficients free. points_per_batch: as for
-    `refine_many`; models may differ in their terms as there.
+    `refine_many`; models may differ in their terms as there. advance: told of finished models.
     Raises ValueError for a model without terms.
     """
     found: list[SparseModel] = []
@@ -68,6 +70,7 @@ def refine_together(
         with np.errstate(over="ignore", invalid="ignore"):
             loss = np.square(fit.nodes - problem.data).mean(axis=(1, 2, 3))
         losses.append(np.where(fit.finite, loss, np.inf))
+        advance(len(chunk))
     return Together(found, np.concatenate(finished), np.concatenate(losses))
 
 
@@ -77,11 +80,12 @@ def follow_together(
     *,
     method: Method,
     points_per_batch: int = 8,
+    advance: Advance = nothing,
 ) -> Float[np.ndarray, "models windows samples n_states"]:
     """Trajectories that follow the windows best: starts fitted, coefficients held.
 
     In units of the batch's scale; NaN in windows where a model blows up. points_per_batch: as
-    for `refine_many`; models may differ in their terms as there.
+    for `refine_many`; models may differ in their terms as there. advance: told of those followed.
     Raises ValueError for a model without terms.
     """
     # Every window is a point of its own: one that blows up stops no other.
@@ -104,6 +108,7 @@ def follow_together(
             [ode for ode in odes for _ in windows], windows * len(chunk), n_reweights=0
         )
         found.append(closed(problem, method.fit(problem)))
+        advance(len(chunk))
     return np.concatenate(found).reshape(len(models), *batch.data.shape)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ep2sindy.machine.progress import Advance, nothing
 from ep2sindy.refinement.ode import ODE, Drive
 from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
 from ep2sindy.refinement.tangents import Augmented, augmented
@@ -35,13 +36,14 @@ class Iteration:
 
 
 def recorder(
-    callback: Callable[[Iteration], None] | None,
+    callback: Callable[[Iteration], None] | None, advance: Advance = nothing
 ) -> tuple[list[Iteration], Callable[[Iteration], None]]:
-    """A list that fills as a fit goes, and who fills it; `callback` sees the same."""
+    """A list that fills as a fit goes, and who fills it; `callback` and `advance` are told."""
     history: list[Iteration] = []
 
     def observe(iteration: Iteration) -> None:
         history.append(iteration)
+        advance(1)
         if callback is not None:
             callback(iteration)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.machine.progress import Advance, Progress, as_progress, counted
 from ep2sindy.machine.screen import N_LINES, one_screen
 from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
@@ -75,13 +77,15 @@ def refine(
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
+    progress: Progress | bool = False,
 ) -> Refinement:
     """Fit the free coefficients to windows spread over trajectories, by least squares.
 
     window: samples in each; None takes one and a half periods of the dominant frequency.
     method: None means MultipleShooting(). free_start: fit each window's initial state as well,
     without which noise in it biases the coefficients; False starts at the data, as the thesis.
-    n_reweights: passes with each state weighted by 1/std of its residuals.
+    n_reweights: passes with each state weighted by 1/std of its residuals. progress: True shows
+    a bar; see `Progress`.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
     terms or a constraint that leaves out one of them. A failed fit is a result: see `status`.
 
@@ -103,6 +107,7 @@ def refine(
         rng=rng,
         callback=callback,
         device=device,
+        progress=progress,
     )
     return found
 
@@ -122,6 +127,7 @@ def refine_many(
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
+    progress: Progress | bool = False,
 ) -> list[Refinement]:
     """Refine models of the same states, each on trajectories of its own; as `refine` for the rest.
 
@@ -131,30 +137,26 @@ def refine_many(
     Raises ValueError if the models differ in their variables or the windows in their number.
     """
     rng = np.random.default_rng(rng)
+    cut = partial(cut_windows, n_windows=n_windows, window=window, rng=rng)
     found: list[Refinement] = []
-    for first in range(0, len(models), points_per_batch):
-        chunk = models[first : first + points_per_batch]
-        batches = [
-            cut_windows(
-                data,
-                states=model.states,
-                inputs=model.inputs,
-                n_windows=n_windows,
-                window=window,
-                rng=rng,
+    with as_progress(progress).stage(None, "iteration", "refinement") as advance:
+        for first in range(0, len(models), points_per_batch):
+            chunk = models[first : first + points_per_batch]
+            batches = [
+                cut(data, states=model.states, inputs=model.inputs)
+                for model, data in zip(chunk, trajectories[first:], strict=False)
+            ]
+            found += _refined(
+                chunk,
+                batches,
+                method=MultipleShooting() if method is None else method,
+                constraint=constraint,
+                free_start=free_start,
+                n_reweights=n_reweights,
+                callback=callback,
+                device=device,
+                advance=advance,
             )
-            for model, data in zip(chunk, trajectories[first:], strict=False)
-        ]
-        found += _refined(
-            chunk,
-            batches,
-            method=MultipleShooting() if method is None else method,
-            constraint=constraint,
-            free_start=free_start,
-            n_reweights=n_reweights,
-            callback=callback,
-            device=device,
-        )
     return found
 
 
@@ -169,9 +171,10 @@ def loss_against_window(
     free_start: bool = True,
     n_reweights: int = 1,
     rng: np.random.Generator | int,
+    progress: Progress | bool = False,
 ) -> dict[int, Refinement]:
     """Refine once per window length; the loss of each says where the model ceases to follow."""
-    rng = np.random.default_rng(rng)
+    rng, watch = np.random.default_rng(rng), as_progress(progress)
     return {
         window: refine(
             model,
@@ -183,8 +186,9 @@ def loss_against_window(
             free_start=free_start,
             n_reweights=n_reweights,
             rng=rng,
+            progress=watch,
         )
-        for window in windows
+        for window in counted(watch, windows, "window length")
     }
 
 
@@ -198,13 +202,14 @@ def _refined(
     n_reweights: int,
     callback: Callable[[Iteration], None] | None,
     device: str,
+    advance: Advance,
 ) -> list[Refinement]:
     """One batch of points, from windows to results."""
     odes = [
         ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=constraint).to(device)
         for model, batch in zip(models, batches, strict=True)
     ]
-    history, observe = recorder(callback)
+    history, observe = recorder(callback, advance)
     problem = Problem(
         odes=tuple(odes),
         batches=tuple(batches),

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import (
@@ -70,6 +71,7 @@ def refine_tied(
     n_reweights: int = 0,
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
+    progress: Progress | bool = False,
 ) -> TiedRefinement:
     """Fit one law to windows of all points, by least squares: coef_p = law @ basis[p].
 
@@ -89,12 +91,14 @@ def refine_tied(
         ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=relations)
         for model, batch in zip(models, batches, strict=True)
     ]
-    history, observe = recorder(callback)
-    problem = Problem(tuple(odes), tuple(batches), free_start, n_reweights, observe)
     free0 = np.stack([ode.free0.numpy() for ode in odes])
     tie = Tie.of(free0, known)
     begin = tie.theta(weighted_law(free0, None, basis) if start is None else start)
-    state, verdict = _fitted(problem, tie, begin, MultipleShooting() if method is None else method)
+    method = MultipleShooting() if method is None else method
+    with as_progress(progress).stage(None, "iteration", "refinement of a law") as advance:
+        history, observe = recorder(callback, advance)
+        problem = Problem(tuple(odes), tuple(batches), free_start, n_reweights, observe)
+        state, verdict = _fitted(problem, tie, begin, method)
     return _result(models, relations, tie, state, verdict, known, tuple(history))
 
 

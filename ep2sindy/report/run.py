@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ep2sindy.machine.files import replacing
+from ep2sindy.machine.progress import Advance, Bars, Progress
 from ep2sindy.report.document import Text
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.screen import Screen, renderables
@@ -20,7 +21,8 @@ class Run:
     """One run of a study: its name and seed, where it writes and what it says on the way.
 
     settings: the whole config as plain values. said: what the page repeats; warnings: that is
-    amiss, the summary too. provenance: which code this is, and the command.
+    amiss, the summary too. provenance: which code this is, and the command. watch: who is told how
+    far the run has come.
     """
 
     title: str
@@ -32,6 +34,7 @@ class Run:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    watch: Progress = field(default_factory=Bars)
 
     def say(self, text: str, *, warning: bool = False) -> None:
         """A line for those who watch, at once: on the screen and in run.log, later on the page."""
@@ -49,10 +52,8 @@ class Run:
         with replacing(self.folder.file(name)) as temporary:
             writer(temporary)
 
-    @contextmanager
-    def progress(self, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-        """A progress bar; what comes takes the number of pieces done since it was last called."""
-        from tqdm import tqdm
-
-        with tqdm(total=total, unit=unit, disable=None) as bar:
-            yield lambda n_more: bar.update(n_more) and None
+    def progress(
+        self, total: int | None, unit: str, label: str = ""
+    ) -> AbstractContextManager[Advance]:
+        """A stage of the run, shown as a bar; see `Progress`."""
+        return self.watch.stage(total, unit, label)

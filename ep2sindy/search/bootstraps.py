@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.machine.progress import Advance, nothing
 from ep2sindy.regression.ambiguity import largest_support, usable_terms
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.regression.resampling import moving_block_counts
@@ -111,10 +112,15 @@ class Resamples:
     counted: bool
     largest: int
 
-    def searched(self, search: Search, equation: int) -> list[Bool[np.ndarray, "_ terms"]]:
+    def searched(
+        self, search: Search, equation: int, advance: Advance = nothing
+    ) -> list[Bool[np.ndarray, "_ terms"]]:
         """What a search proposes in every draw, as far as the rows can bear it."""
         draws = zip(self.xx, self.xy[:, equation], self.yy[:, equation].tolist(), strict=True)
-        found = [search.supports(*draw) for draw in draws]
+        found = []
+        for draw in draws:
+            found.append(search.supports(*draw))
+            advance(1)
         return [masks[masks.sum(axis=1) <= self.largest] for masks in found]
 
     def fits(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
+from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.likeness import Bounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import Ensemble
@@ -106,20 +107,27 @@ class FreeRunScore:
         """Those of `decide`."""
         return list(self.decide(fronts).scores)
 
-    def decide(self, fronts: Sequence[ParetoFront], relations: Sequence[Relation] = ()) -> Decision:
+    def decide(
+        self,
+        fronts: Sequence[ParetoFront],
+        relations: Sequence[Relation] = (),
+        *,
+        progress: Progress = SILENT,
+    ) -> Decision:
         """Raises ValueError for rows without trajectories, a state without a front, more than
         max_combinations, or relations that no combination has the terms for.
         """
         records = records_of(fronts)
         cycles = cycles_of(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
-            found = RefinedScore(max_combinations=self.max_combinations).decide(fronts, relations)
+            rule = RefinedScore(max_combinations=self.max_combinations)
+            found = rule.decide(fronts, relations, progress=progress)
             return replace(found, note=f"{cycles}: chosen by windows held out instead")
         places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
         systems = [system_of(fronts, choice, relations) for choice in places]
-        trials = self._trials(records, cycles, systems)
+        trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
-        winner, model, note = self._winner(records, cycles, trials)
+        winner, model, note = self._winner(records, cycles, trials, progress)
         limit = max(1.0, float(errors[winner]))
         scores = joint_scores(fronts, places, errors, limit=limit, winner=winner)
         return Decision(scores, model, note)
@@ -133,7 +141,11 @@ class FreeRunScore:
         return round(float(np.median(samples))) + 1
 
     def _trials(
-        self, records: Records, cycles: Sequence[Cycle], systems: Sequence[System]
+        self,
+        records: Records,
+        cycles: Sequence[Cycle],
+        systems: Sequence[System],
+        progress: Progress,
     ) -> list[Trial]:
         """Every system refined and run, fold by fold; one that lacks an equation cannot live."""
         whole = [k for k, system in enumerate(systems) if system.model.coef.any(axis=0).all()]
@@ -142,15 +154,19 @@ class FreeRunScore:
         if not whole:
             return trials
         some = [systems[k] for k in whole]
-        tried = [
-            self._tried(records, cycles, some, f) for f in folds_of(records.runs, self.n_folds)
-        ]
+        folds = folds_of(records.runs, self.n_folds)
+        tried = [self._tried(records, cycles, some, f, progress) for f in folds]
         for k, worst in zip(whole, np.max(tried, axis=0), strict=True):
             trials[k] = Trial(systems[k], *worst.tolist())
         return trials
 
     def _tried(
-        self, records: Records, cycles: Sequence[Cycle], systems: Sequence[System], fold: Fold
+        self,
+        records: Records,
+        cycles: Sequence[Cycle],
+        systems: Sequence[System],
+        fold: Fold,
+        progress: Progress,
     ) -> Float[np.ndarray, "systems 3"]:
         """Error, waveform and loss of every system in one fold."""
         first = systems[0].model
@@ -163,20 +179,23 @@ class FreeRunScore:
             rng=np.random.default_rng(self.seed),
         )
         method, together = budget(batch)
-        refined = refine_together(
-            [system.model for system in systems],
-            batch,
-            method=method,
-            constraints=[system.constraint for system in systems],
-            n_reweights=0,  # states count by their standard deviation, as they are judged
-            points_per_batch=together,
-        )
+        with progress.stage(len(systems), "system", "refined without a fold") as advance:
+            refined = refine_together(
+                [system.model for system in systems],
+                batch,
+                method=method,
+                constraints=[system.constraint for system in systems],
+                n_reweights=0,  # states count by their standard deviation, as they are judged
+                points_per_batch=together,
+                advance=advance,
+            )
         coef = np.stack([model.coef for model in refined.models], axis=2)
         ensemble = Ensemble(first.library, first.states, coef)
-        judged = [
-            self._judged(t, paths, cycle, first.states)
-            for t, paths, cycle in paths_over(ensemble, fold.held, records, cycles, self.n_starts)
-        ]
+        judged = []
+        with progress.stage(None, "run", "free runs over the fold") as advance:
+            for t, paths, cycle in paths_over(ensemble, fold.held, records, cycles, self.n_starts):
+                judged.append(self._judged(t, paths, cycle, first.states))
+                advance(len(paths))
         return np.column_stack([np.max(judged, axis=0), refined.loss])
 
     def _judged(
@@ -199,7 +218,11 @@ class FreeRunScore:
         return found
 
     def _winner(
-        self, records: Records, cycles: Sequence[Cycle], trials: Sequence[Trial]
+        self,
+        records: Records,
+        cycles: Sequence[Cycle],
+        trials: Sequence[Trial],
+        progress: Progress,
     ) -> tuple[int, SparseModel, str]:
         """Which system, refined on all data, and how it came to win."""
         exact = min(trial.loss for trial in trials) < FLOOR
@@ -210,7 +233,8 @@ class FreeRunScore:
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
         found, resting = [], None
-        for place, k in enumerate((living or by_error)[: self.n_confirmed]):
+        best = (living or by_error)[: self.n_confirmed]
+        for place, k in enumerate(counted(progress, best, "system", "refined on all data")):
             model = trials[k].system.refined_on_all(
                 records.runs,
                 window=window,

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.constraints.relations import Constraint, Relation
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.machine.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.model.many import MAX_ERROR, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.many import follow_together, refine_together
@@ -77,19 +78,27 @@ class RefinedScore:
         max_combinations, or records too short for two windows.
         """
         places = combinations(fronts, self.max_combinations)
-        errors, limit = self._judged(fronts, places, ())
+        errors, limit = self._judged(fronts, places, (), SILENT)
         return joint_scores(fronts, places, errors, limit=limit)
 
-    def decide(self, fronts: Sequence[ParetoFront], relations: Sequence[Relation] = ()) -> Decision:
+    def decide(
+        self,
+        fronts: Sequence[ParetoFront],
+        relations: Sequence[Relation] = (),
+        *,
+        progress: Progress = SILENT,
+    ) -> Decision:
         """As `scores`, and the winner refined on windows of all the data.
 
         Raises ValueError for relations that no combination has the terms for, too.
         """
         places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
-        errors, limit = self._judged(fronts, places, relations)
+        errors, limit = self._judged(fronts, places, relations, progress)
         winner = smallest(fronts, places, errors, limit=limit)
         scores = joint_scores(fronts, places, errors, limit=limit, winner=winner)
-        found = system_of(fronts, places[winner], relations).refined_on_all(records_of(fronts).runs)
+        system = system_of(fronts, places[winner], relations)
+        with progress.stage(None, "", "the best system refined on all data"):
+            found = system.refined_on_all(records_of(fronts).runs)
         return Decision(scores, found, self.label)
 
     def _judged(
@@ -97,6 +106,7 @@ class RefinedScore:
         fronts: Sequence[ParetoFront],
         places: Int[np.ndarray, "combinations fronts"],
         relations: Sequence[Relation],
+        progress: Progress,
     ) -> tuple[Float[np.ndarray, " combinations"], float]:
         """Error of every combination on windows it was not refined on, and the limit."""
         records = records_of(fronts)
@@ -105,15 +115,15 @@ class RefinedScore:
         ensemble = replace(ensemble_of(fronts, places), coef=coef)
         constraints = [system.constraint for system in systems]
         spread = np.concatenate(records.smoothed).std(axis=0)
-        residuals = np.concatenate(
-            [
-                _residuals(_refined(ensemble, fitted, constraints), held)
-                * (held.scale[: len(spread)] / spread)
-                for fitted, held in self._folds(records.runs, ensemble)
-            ],
-            axis=1,
-        )
-        return _errors_and_limit(residuals)
+        folds = self._folds(records.runs, ensemble)
+        parts = []
+        n_fits = 2 * len(folds) * len(_by_size(ensemble))
+        with progress.stage(n_fits, "fit", "systems and window starts") as advance:
+            for fitted, held in folds:
+                refined = _refined(ensemble, fitted, constraints, advance)
+                scale = held.scale[: len(spread)] / spread
+                parts.append(_residuals(refined, held, advance) * scale)
+        return _errors_and_limit(np.concatenate(parts, axis=1))
 
     def _folds(
         self, runs: Sequence[Trajectory], ensemble: Ensemble
@@ -184,7 +194,12 @@ def _by_size(ensemble: Ensemble) -> Int[np.ndarray, " models"]:
     return order[n_terms[order] > 0]
 
 
-def _refined(ensemble: Ensemble, batch: WindowBatch, constraints: Sequence[Constraint]) -> Ensemble:
+def _refined(
+    ensemble: Ensemble,
+    batch: WindowBatch,
+    constraints: Sequence[Constraint],
+    advance: Advance,
+) -> Ensemble:
     """Every model refined on the same windows; one without terms has nothing to refine."""
     order = _by_size(ensemble)
     if not order.size:
@@ -196,6 +211,7 @@ def _refined(ensemble: Ensemble, batch: WindowBatch, constraints: Sequence[Const
         method=method,
         constraints=[constraints[k] for k in order],
         points_per_batch=together,
+        advance=advance,
     )
     coef = ensemble.coef.copy()
     coef[:, :, order] = np.stack([model.coef for model in found.models], axis=2)
@@ -211,7 +227,7 @@ def _refined(ensemble: Ensemble, batch: WindowBatch, constraints: Sequence[Const
 
 
 def _residuals(
-    ensemble: Ensemble, batch: WindowBatch
+    ensemble: Ensemble, batch: WindowBatch, advance: Advance = nothing
 ) -> Float[np.ndarray, "models windows samples n_states"]:
     """Distances of the best trajectories to the samples, in the batch's scale; NaN if none."""
     # Without terms a state stays where it is, and best at the mean.
@@ -221,7 +237,11 @@ def _residuals(
     if order.size:
         method, together = budget(batch)
         paths = follow_together(
-            _models(ensemble, order), batch, method=method, points_per_batch=together
+            _models(ensemble, order),
+            batch,
+            method=method,
+            points_per_batch=together,
+            advance=advance,
         )
         found[order] = paths - batch.data
     return found

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel
 from ep2sindy.search.front import Candidate, ParetoFront
 
@@ -52,9 +53,14 @@ class Decision:
 class SystemSelection(Selection, Protocol):
     """A rule that judges combinations of candidates, one per equation, and refines the winner.
 
-    relations: between coefficients; they hold in every system that is judged.
+    relations: between coefficients; they hold in every system that is judged. progress: told of
+    the systems that are tried.
     """
 
     def decide(
-        self, fronts: Sequence[ParetoFront], relations: Sequence[Relation] = ()
+        self,
+        fronts: Sequence[ParetoFront],
+        relations: Sequence[Relation] = (),
+        *,
+        progress: Progress = SILENT,
     ) -> Decision: ...

@@ -48,7 +48,12 @@ class Study:
         with run.progress(n_pieces, "realization") as progress:
             outcomes = self.outcomes(variants, seed=run.seed, progress=progress)
         first = first_realizations(
-            variants, self.systems, self.noises, n_trajectories=self.n_trajectories, seed=run.seed
+            variants,
+            self.systems,
+            self.noises,
+            n_trajectories=self.n_trajectories,
+            seed=run.seed,
+            progress=run.watch,
         )
         return Outcome(variants, outcomes, cells(outcomes), published, first)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ep2sindy.constraints.relations import Constraint, constraint
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import counted
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.run import Run
 from ep2sindy.studies.held_out import first_and_last, fit_and_judge
@@ -57,11 +58,16 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         models = {n: case.constraints(n, self.source.states) for n, case in self.models.items()}
         libraries = [library for library, _ in models.values()]
-        data = self.source.sampled(self.source.field(), libraries, run)
+        with run.progress(None, "", "data"):
+            field = self.source.field()
+        data = self.source.sampled(field, libraries, run)
         train, held = first_and_last(data, self.held_out)
         judged, labels, findings = {}, {}, {}
         streams = np.random.default_rng(run.seed).spawn(len(models))
-        for (name, (library, constraints)), stream in zip(models.items(), streams, strict=True):
+        pairs = list(zip(models.items(), streams, strict=True))
+        for (name, (library, constraints)), stream in counted(
+            run.watch, pairs, "model", "fits and free runs"
+        ):
             # Both draw the same: what differs between them is then the constraint alone.
             seed = int(stream.integers(2**63))
             for kind, each in zip(KINDS, constraints, strict=True):

@@ -11,6 +11,7 @@ import numpy as np
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.attractors import Identified
+from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.studies.variants import Variant
 from ep2sindy.synthetic.draws import realization
 
@@ -30,6 +31,7 @@ def first_realizations(
     *,
     n_trajectories: int,
     seed: int,
+    progress: Progress = SILENT,
 ) -> FirstRealizations | None:
     """By the last variant that makes models, searched as the benchmark does; None without one.
 
@@ -40,13 +42,14 @@ def first_realizations(
         return None
     name, recipe = recipes[-1]
     found = []
-    for label, noise in product(systems, sorted(noises)):
+    pairs = list(product(systems, sorted(noises)))
+    for label, noise in counted(progress, pairs, "model", "first realizations"):
         (system, runs), (_, (truth, *_)) = (
             realization(label, level, 0, n_trajectories=n_trajectories, seed=seed)
             for level in (noise, 0.0)
         )
         rng = np.random.default_rng([seed, 0, *name.encode()])
-        model = discover(runs, system.model.library, recipe, seed=rng).model
+        model = discover(runs, system.model.library, recipe, seed=rng, progress=progress).model
         right = np.array_equal(model.coef != 0.0, system.model.coef != 0.0)
         found.append(Identified(label, noise, runs[0], truth, model.rollout(truth), right))
     return FirstRealizations(name, found)

@@ -17,6 +17,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.windows import loss_against_window_figure
 from ep2sindy.library.library import polynomial
+from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
@@ -79,7 +80,9 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         library, terms = terms_of(self.model, states=self.source.states)
         free, tied = constraint(library, terms), constraint(library, terms, self.relations)
-        data = self.source.sampled(self.source.field(), [library], run)
+        with run.progress(None, "", "data"):
+            field = self.source.field()
+        data = self.source.sampled(field, [library], run)
         train, held = first_and_last(data, self.held_out)
         self._check_windows(train)
         window = two_periods(train) if self.window is None else self.window
@@ -92,9 +95,9 @@ class Study:
         )
         judged = {
             name: fit_and_judge(train, held, library, each, form, rng=next(streams))
-            for name, each, form in fits
+            for name, each, form in counted(run.watch, fits, "fit")
         }
-        lives = self._living(train, rng=next(streams))
+        lives = self._living(train, rng=next(streams), progress=run.watch)
         own = constraint(lives.library, {state: list(lives.terms(state)) for state in lives.states})
         starts = {
             "ils": (judged["base"].model, free),
@@ -102,30 +105,35 @@ class Study:
             "living": (lives, own),
         }
         again = {
-            name: partial(self._refined, model, each, train, held)
+            name: partial(self._refined, model, each, train, held, progress=run.watch)
             for name, (model, each) in starts.items()
         }
-        for name, (_, each) in starts.items():
+        for name, (_, each) in counted(run.watch, starts.items(), "refinement"):
             watch = watcher(run.board.scalars, name, each)
             judged[name] = again[name](window, rng=next(streams), watch=watch)
         by_window = {
-            name: {length: again[name](length, rng=stream) for length in self.windows}
+            name: {
+                length: again[name](length, rng=stream)
+                for length in counted(run.watch, self.windows, "window length", name)
+            }
             for name, stream in zip(("ils", "ils_constrained"), sweep_rng.spawn(2), strict=True)
         }
         draws = {
             name: [
                 free_run(self._refinement(*starts[name], train, window, rng=each).model, held)
-                for each in stream.spawn(self.n_draws)
+                for each in counted(run.watch, stream.spawn(self.n_draws), "draw", name)
             ]
             for name, stream in zip(starts, draws_rng.spawn(3), strict=True)
         }
         return self._outcome(train, held, judged, by_window, draws)
 
-    def _living(self, train: Trajectory, *, rng: np.random.Generator) -> SparseModel:
+    def _living(
+        self, train: Trajectory, *, rng: np.random.Generator, progress: Progress
+    ) -> SparseModel:
         """The model that lives on its own, in the library of degree 2."""
         recipe = Recipe(self.formulation, bootstraps=Bootstraps(n=0))
         library = polynomial(train.state_names, degree=2)
-        return self.living.found(train, library, recipe, rng=rng).model
+        return self.living.found(train, library, recipe, rng=rng, progress=progress).model
 
     def _check_windows(self, train: Trajectory) -> None:
         """Raise ValueError for windows that the fitted part of the data cannot hold."""
@@ -148,9 +156,12 @@ class Study:
         *,
         rng: np.random.Generator,
         watch: Callable[[Iteration], None] | None = None,
+        progress: Progress = SILENT,
     ) -> Judged:
         begun = process_time()
-        found = self._refinement(start, constraint, train, window, rng=rng, watch=watch)
+        found = self._refinement(
+            start, constraint, train, window, rng=rng, watch=watch, progress=progress
+        )
         cpu_s = process_time() - begun
         return judge(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
 
@@ -163,6 +174,7 @@ class Study:
         *,
         rng: np.random.Generator,
         watch: Callable[[Iteration], None] | None = None,
+        progress: Progress = SILENT,
     ) -> Refinement:
         from ep2sindy.refinement.refine import refine  # PyTorch takes seconds to load
 
@@ -174,6 +186,7 @@ class Study:
             constraint=constraint,
             rng=rng,
             callback=watch,
+            progress=progress,
         )
 
     def _outcome(

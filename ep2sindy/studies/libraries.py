@@ -12,6 +12,7 @@ import xarray as xr
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.machine.progress import counted
 from ep2sindy.report.run import Run
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.studies.functions import registered
@@ -84,7 +85,8 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
-        opened = self.source.fields()
+        with run.progress(None, "", "data"):
+            opened = self.source.fields()
         libraries = {name: case.library(opened[0]) for name, case in self.libraries.items()}
         runs = [self.source.sampled(field, libraries.values(), run) for field in opened]
         data = runs[0]
@@ -94,6 +96,7 @@ class Study:
             run.warn(hint)
         # Each case draws from its own stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
+        pairs = list(zip(libraries.items(), streams, strict=True))
         results = {
             name: result_of(
                 runs,
@@ -106,8 +109,9 @@ class Study:
                 self.compared,
                 zone_length_m(self.source, opened[0]),
                 rng=rng,
+                progress=run.watch,
             )
-            for (name, library), rng in zip(libraries.items(), streams, strict=True)
+            for (name, library), rng in counted(run.watch, pairs, "library")
         }
         for name, result in results.items():
             if result.discovery.misfit:

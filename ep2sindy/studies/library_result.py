@@ -13,6 +13,7 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.last_fit import assemble_model
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.search.front import Candidate, fit_support
@@ -53,6 +54,7 @@ def result_of(
     length_m: float | None = None,
     *,
     rng: np.random.Generator,
+    progress: Progress = SILENT,
 ) -> LibraryResult:
     """What one library finds in all records, and how its model and the published one run.
 
@@ -63,27 +65,31 @@ def result_of(
         (run, run.n_samples if rollout_s is None else samples_in(run, rollout_s)) for run in runs
     ]
     data, n_samples = first
-    found = discover(list(runs), library, recipe, seed=rng)
+    found = discover(list(runs), library, recipe, seed=rng, progress=progress)
     refitted = _refitted(found, published)
     lives = roles = None
     if living is not None and not found.model.inputs:
         parts = first_and_last(data, held_out)
-        lives = living_model(*parts, library, recipe, living, found.model, rng=rng)
+        lives = living_model(
+            *parts, library, recipe, living, found.model, rng=rng, progress=progress
+        )
         if compared is not None:
             roles = term_roles(
-                lives.discovery, data, *parts, compared, living.bounds, length_m=length_m
-            )
-    return LibraryResult(
-        recipe=recipe,
-        discovery=found,
-        selected=free_run(found.model, data, n_samples=n_samples),
-        given=published,
-        refitted=refitted,
-        published=_run_refitted(found, refitted, data, n_samples),
-        living=lives,
-        roles=roles,
-        elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
-    )
+                lives.discovery, data, *parts, compared, living.bounds,
+                length_m=length_m, progress=progress,
+            )  # fmt: skip
+    with progress.stage(None, "", "free runs"):
+        return LibraryResult(
+            recipe=recipe,
+            discovery=found,
+            selected=free_run(found.model, data, n_samples=n_samples),
+            given=published,
+            refitted=refitted,
+            published=_run_refitted(found, refitted, data, n_samples),
+            living=lives,
+            roles=roles,
+            elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
+        )
 
 
 def _refitted(

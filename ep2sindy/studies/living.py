@@ -10,6 +10,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds, Verdict
 from ep2sindy.model.model import SparseModel
@@ -33,11 +34,17 @@ class LivingSearch:
     selection: SystemSelection
 
     def found(
-        self, train: Trajectory, library: Library, recipe: Recipe, *, rng: np.random.Generator
+        self,
+        train: Trajectory,
+        library: Library,
+        recipe: Recipe,
+        *,
+        rng: np.random.Generator,
+        progress: Progress = SILENT,
     ) -> Discovery:
         """What it finds in a record, with the recipe's formulation and bootstraps."""
         own = replace(recipe, search=self.search, depth=self.depth, selection=self.selection)
-        return discover(train, library, own, seed=rng)
+        return discover(train, library, own, seed=rng, progress=progress)
 
     @property
     def bounds(self) -> Bounds:
@@ -83,16 +90,19 @@ def living_model(
     selected: SparseModel,
     *,
     rng: np.random.Generator,
+    progress: Progress = SILENT,
 ) -> Living:
     """Find it in one part of a record, and run it over the other.
 
     selected: the model that was selected by derivatives, to be refined for comparison.
     """
-    found = settings.found(train, library, recipe, rng=rng)
-    run = free_run(found.model, held, initial=start_of(held, found.model), bounds=settings.bounds)
-    cycle = cycle_of(run)
-    share = None if cycle is None else share_reaching(found.model, cycle)
-    return Living(found, held, run, cycle, share, _refined(selected, train, held))
+    found = settings.found(train, library, recipe, rng=rng, progress=progress)
+    with progress.stage(None, "", "free run and limit cycle"):
+        start = start_of(held, found.model)
+        run = free_run(found.model, held, initial=start, bounds=settings.bounds)
+        cycle = cycle_of(run)
+        share = None if cycle is None else share_reaching(found.model, cycle)
+    return Living(found, held, run, cycle, share, _refined(selected, train, held, progress))
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
@@ -120,9 +130,11 @@ def two_periods(run: Trajectory) -> int | None:
     return round(2.0 / (cycle.frequency_Hz * run.dt_s)) + 1
 
 
-def _refined(model: SparseModel, train: Trajectory, held: Trajectory) -> Refined:
+def _refined(
+    model: SparseModel, train: Trajectory, held: Trajectory, progress: Progress
+) -> Refined:
     """On windows of two periods, where there are periods."""
     from ep2sindy.refinement.refine import refine  # torch, for those alone who refine
 
-    found = refine(model, [train], window=two_periods(train), rng=0)
+    found = refine(model, [train], window=two_periods(train), rng=0, progress=progress)
     return Refined(found.status, free_run(found.model, held, initial=start_of(held, model)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -24,6 +24,7 @@ from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
 from ep2sindy.machine.files import fingerprint
 from ep2sindy.machine.parallel import Workers
+from ep2sindy.machine.progress import Advance
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import A_LIST, Count, Names
 from ep2sindy.studies.pointwise_view import Outcome
@@ -70,7 +71,8 @@ class Study:
         return PointSearch(self.states, library, self.recipe, self.least_variation, seed)
 
     def compute(self, run: Run) -> Outcome:
-        field = self.source.field()
+        with run.progress(None, "", "data"):
+            field = self.source.field()
         say_simulation(run, field.attrs)
         say_field(run, field)
         lacking = [name for name in self.variables_if_present if name not in field]
@@ -83,7 +85,8 @@ class Study:
         result, n_before = self._searched(field, search, kept, run)
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(run.seed)
-        found = regimes(result, rng=rng, max_regimes=self.max_regimes)
+        with run.progress(None, "", "regimes"):
+            found = regimes(result, rng=rng, max_regimes=self.max_regimes)
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
         write_netcdf(result, run.folder.path / "pointwise.nc", encoding=packed)
@@ -100,15 +103,14 @@ class Study:
         if n_before:
             run.say(f"going on with {n_before} of {n_points} points that a broken run had done")
         try:
-            with progress_of(run, n_points, n_before) as progress:
-                result = pointwise(
-                    field,
-                    search,
-                    workers=self.parallel,
-                    kept=kept,
-                    block_points=self.block_points,
-                    progress=progress,
-                )
+            result = pointwise(
+                field,
+                search,
+                workers=self.parallel,
+                kept=kept,
+                block_points=self.block_points,
+                progress=Rates(run, n_before),
+            )
         except KeyboardInterrupt:
             run.say(
                 f"finished blocks are kept in {kept.folder}: the same command goes on with them"
@@ -117,24 +119,30 @@ class Study:
         return result, n_before
 
 
-@contextmanager
-def progress_of(run: Run, n_points: int, n_before: int) -> Iterator[Callable[[int], None]]:
-    """A bar with points per second, and the same in TensorBoard while the run goes on.
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """The run's own progress, and points per second in TensorBoard while the run goes on.
 
     n_before: points that were done already, and come first.
     """
-    begin = time.perf_counter()
-    done = 0
-    with run.progress(n_points, "point") as count:
 
-        def progress(n_more: int) -> None:
-            nonlocal done
-            done += n_more
-            count(n_more)
-            per_s = max(done - n_before, 0) / max(time.perf_counter() - begin, 1e-9)
-            run.board.scalars({"points/done": float(done), "points/per_s": per_s}, step=done)
+    run: Run
+    n_before: int
 
-        yield progress
+    @contextmanager
+    def stage(self, total: int | None, unit: str, label: str = "") -> Iterator[Advance]:
+        begin, done = time.perf_counter(), 0
+        with self.run.progress(total, unit, label) as advance:
+
+            def count(n_more: int) -> None:
+                nonlocal done
+                done += n_more
+                advance(n_more)
+                per_s = max(done - self.n_before, 0) / max(time.perf_counter() - begin, 1e-9)
+                rates = {"points/done": float(done), "points/per_s": per_s}
+                self.run.board.scalars(rates, step=done)
+
+            yield count
 
 
 def blocks_key(settings: Mapping[str, Any]) -> str:

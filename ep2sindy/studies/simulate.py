@@ -76,7 +76,8 @@ class Study:
 
     def _scanned(self, run: Run) -> ScanOutcome:
         points = scan_points(self.data, self.scan or {})
-        compile_kernels([point.data for point in points])
+        with run.progress(None, "", "kernels, compiled once"):
+            compile_kernels([point.data for point in points])
         found: dict[int, Simulated] = {}
         with run.progress(len(points), "simulation") as came:
             for number, result in self.parallel.run(simulated, points):

@@ -13,6 +13,7 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Constraint, Relation, constraint, parse_relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery
+from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds
 from ep2sindy.model.model import SparseModel
@@ -91,6 +92,7 @@ def term_roles(
     bounds: Bounds,
     *,
     length_m: float | None,
+    progress: Progress = SILENT,
 ) -> Roles:
     """Each term left out in turn, and ionization shared, refined on `train` and run over `held`.
 
@@ -99,15 +101,15 @@ def term_roles(
     model, expected = found.model, compared.expected(data, length_m)
     support = {state: list(model.terms(state)) for state in model.states}
     roles = []
-    for state in model.states:
-        for term, coef in model.terms(state).items():
-            less = support | {state: [name for name in support[state] if name != term]}
-            run = _run(found, less, (), train, held, bounds) if less[state] else None
-            roles.append(Role(state, term, coef, expected.get((state, term)), run))
+    terms = [(s, term, coef) for s in model.states for term, coef in model.terms(s).items()]
+    for state, term, coef in counted(progress, terms, "term", "models without a term"):
+        less = support | {state: [name for name in support[state] if name != term]}
+        run = _run(found, less, (), train, held, bounds, progress) if less[state] else None
+        roles.append(Role(state, term, coef, expected.get((state, term)), run))
     product = f"{compared.ions}*{compared.neutrals}"
     relation = parse_relation(f"{compared.ions}: {product} == -1 * {compared.neutrals}: {product}")
     both = {state: list(dict.fromkeys([*terms, product])) for state, terms in support.items()}
-    return Roles(roles, _run(found, both, (relation,), train, held, bounds))
+    return Roles(roles, _run(found, both, (relation,), train, held, bounds, progress))
 
 
 def _run(
@@ -117,23 +119,32 @@ def _run(
     train: Trajectory,
     held: Trajectory,
     bounds: Bounds,
+    progress: Progress,
 ) -> FreeRun | None:
     """These terms fitted, refined on windows of two periods, and run; None if they cannot be."""
     held_to = constraint(found.model.library, support, relations)
     problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
     start = constrained_fit(problems, held_to, units=train.units)
-    refined = _refined(start, held_to, train)
+    refined = _refined(start, held_to, train, progress)
     if refined.status == "non_finite":
         return None
     initial = start_of(held, refined.model)
     return free_run(refined.model, held, initial=initial, bounds=bounds)
 
 
-def _refined(start: SparseModel, held_to: Constraint, train: Trajectory) -> Refinement:
+def _refined(
+    start: SparseModel, held_to: Constraint, train: Trajectory, progress: Progress
+) -> Refinement:
     from ep2sindy.refinement.refine import refine  # torch, for those alone who refine
 
     return refine(
-        start, [train], window=two_periods(train), constraint=held_to, n_reweights=0, rng=0
+        start,
+        [train],
+        window=two_periods(train),
+        constraint=held_to,
+        n_reweights=0,
+        rng=0,
+        progress=progress,
     )
 
 

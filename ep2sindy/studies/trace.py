@@ -67,21 +67,25 @@ class Study:
             run.say(f"{signal.name}: {text}")
         for text in signal.advice:
             run.warn(text)
-        chosen = self._embedded(signal)
+        with run.progress(None, "", "states of the signal"):
+            chosen = self._embedded(signal)
         if type(chosen.embedding) is not LogRate and (hint := lost_mean(signal)):
             run.warn(hint)
         states = chosen.embedded.run
         n_fitted = fitted_samples(signal, states, self.held_out)
         found = self._found(chosen, states.window(0, n_fitted), run)
         held = states if n_fitted == states.n_samples else states.window(n_fitted, states.n_samples)
-        return living(signal, chosen, found, states, held, label=self.recipe.selection.label)
+        with run.progress(None, "", "free run and limit cycle"):
+            return living(signal, chosen, found, states, held, label=self.recipe.selection.label)
 
     def _sampled(self, run: Run) -> Trajectory:
         zone = getattr(self.source.trajectory, "zone", None)
         space = [axis for axis in ("z", "r") if getattr(zone, axis, None) is None]
         data = only(self.source.data, self.signal, self.unit, without=space)
         source = replace(self.source, data=data)
-        sampled = source.sampled(source.field(), [], run)
+        with run.progress(None, "", "data"):
+            field = source.field()
+        sampled = source.sampled(field, [], run)
         return replace(sampled, states=sampled.states + self.offset)
 
     def _embedded(self, signal: Trace) -> Chosen:
@@ -108,6 +112,7 @@ class Study:
             relations=chosen.embedded.relations,
             terms=chosen.embedded.terms,
             seed=run.seed,
+            progress=run.watch,
         )
 
 

@@ -67,7 +67,9 @@ class Study:
             n_points=self.n_points,
         )
         library, terms = terms_of(self.model, states=self.source.states)
-        data = self.source.sampled(self.source.field(), [library], run)
+        with run.progress(None, "", "data"):
+            record = self.source.field()
+        data = self.source.sampled(record, [library], run)
         f_data_Hz = dominant_frequency(data.t, data.states[:, 0])
         fitted = fit_settings(
             data,
@@ -77,6 +79,7 @@ class Study:
             f_data_Hz=f_data_Hz,
             rollout_s=self.rollout_s,
             rng=np.random.default_rng(run.seed),
+            progress=run.watch,
         )
         return Outcome(self, data, f_data_Hz, fitted)
 

@@ -10,6 +10,7 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.last_fit import assemble_model, reweighted
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.rows import Formulation, Regression
@@ -146,6 +147,7 @@ def fit_settings(
     f_data_Hz: float,
     rollout_s: float | None,
     rng: np.random.Generator,
+    progress: Progress = SILENT,
 ) -> dict[str, Fitted]:
     """Fit the same terms in every setting and integrate each model from the first sample.
 
@@ -158,7 +160,8 @@ def fit_settings(
     widths = {name: _half_widths(run, setting.windows, rng) for name, setting in settings.items()}
     n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
     results = {}
-    for (name, setting), stream in zip(settings.items(), rng.spawn(len(settings)), strict=True):
+    pairs = list(zip(settings.items(), rng.spawn(len(settings)), strict=True))
+    for (name, setting), stream in counted(progress, pairs, "setting", "fits and free runs"):
         found = fitted_terms([run], library, terms, setting, rng=stream)
         model = assemble_model(
             library,

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.machine.files import fingerprint, sweep, writing
+from ep2sindy.machine.progress import Progress
 from ep2sindy.thruster.axial.model import CFL
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.simulate import as_start, simulate_as
@@ -35,7 +36,7 @@ def simulate_cached(
     cfl: float = CFL,
     coldest_T_e_eV: float = 0.0,
     initial: Start | xr.Dataset | str | Path | None = None,
-    progress: bool = True,
+    progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Read this simulation from the folder `cache`, or run it once and keep it there.
 

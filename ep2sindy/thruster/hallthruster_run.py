@@ -6,6 +6,7 @@ from pathlib import Path
 
 import xarray as xr
 
+from ep2sindy.machine.progress import Progress
 from ep2sindy.thruster.cache import simulate_cached
 from ep2sindy.thruster.hallthruster_input import read_hallthruster_input
 
@@ -18,7 +19,7 @@ def simulate_hallthruster_input(
     warm_up_s: float = 0.0,
     sample_s: float | None = None,
     n_cells: int | None = None,
-    progress: bool = True,
+    progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Run the thruster of an input file by this package's own simulator, or read the kept run.
 

@@ -10,6 +10,7 @@ import numpy as np
 from ep2sindy.discovery.coefficient_law import TiedFit, tied_fit
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
@@ -38,6 +39,7 @@ def searched_jointly(
     law: Library,
     *,
     rng: np.random.Generator,
+    progress: Progress = SILENT,
 ) -> JointResult | None:
     """Search all points that oscillate at once; None for fewer than two of them.
 
@@ -56,10 +58,13 @@ def searched_jointly(
         study.searched,
         replace(study.recipe, bootstraps=Bootstraps(n=0)),
         seed=rng,
+        progress=progress,
     )
     tied, reason = None, ""
     try:
-        tied = tied_fit(found, law, parameters={k: p.parameters for k, p in used.items()})
+        parameters = {label: point.parameters for label, point in used.items()}
+        with progress.stage(None, "", "coefficients tied by a law"):
+            tied = tied_fit(found, law, parameters=parameters)
     except ValueError as error:
         reason = str(error)
     labels = [point_label(point.parameters) for point in points]

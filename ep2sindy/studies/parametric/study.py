@@ -142,7 +142,7 @@ class Study:
             study=how,
             results=results,
             laws=laws(results, law, max_terms=self.law.max_terms),
-            joint=searched_jointly(points, results, how, tying, rng=together),
+            joint=searched_jointly(points, results, how, tying, rng=together, progress=run.watch),
             along=[(each.along, each.at) for each in self.trends],
             published=published,
             shown=self.figures,

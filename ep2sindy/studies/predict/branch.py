@@ -22,6 +22,7 @@ from ep2sindy.discovery.operating_points import (
 )
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Workers
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.refinement.tied import TiedRefinement
 
 MOST_PARAMETERS = 2  # of a map that can be drawn
@@ -95,13 +96,17 @@ def branch_of(
     points: Sequence[Mapping[str, float]],
     how: How,
     workers: Workers,
+    *,
+    progress: Progress = SILENT,
 ) -> Branch:
     """Find the law of one cycle's records, and follow it over points and a map.
 
     Raises ValueError where the records do not suffice for a law.
     """
     check_records(records)
-    structures = [how.structure] if how.structure is not None else _structures(records, how)
+    structures = (
+        [how.structure] if how.structure is not None else _structures(records, how, progress)
+    )
     trials = tried(
         records,
         how.library,
@@ -110,10 +115,11 @@ def branch_of(
         windows=how.windows,
         seed=how.seed,
         workers=workers,
+        progress=progress,
     )
     choice = chosen(trials)
     functions = choice.fit.functions(choice.degree)
-    law, found = choice.fit.tied(functions)
+    law, found = choice.fit.tied(functions, progress=progress)
     grid = map_points(points, how.n_map)
     return Branch(
         name=name,
@@ -121,10 +127,10 @@ def branch_of(
         choice=choice,
         law=law,
         tied=found,
-        left_out=left_out(choice.fit, functions, start=law, workers=workers),
+        left_out=left_out(choice.fit, functions, start=law, workers=workers, progress=progress),
         smooth=measured_left_out(records, choice.fit.basis(functions)),
-        at_points=_followed(law, records, points, workers),
-        map=_followed(law, records, grid, workers),
+        at_points=_followed(law, records, points, workers, progress),
+        map=_followed(law, records, grid, workers, progress),
     )
 
 
@@ -142,8 +148,12 @@ def _ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return values.min(axis=0), values.max(axis=0)
 
 
-def _structures(records: Sequence[OperatingRecord], how: How) -> list[Structure]:
-    return candidate_structures(records, how.library, max_terms=how.searched.max_terms)
+def _structures(
+    records: Sequence[OperatingRecord], how: How, progress: Progress
+) -> list[Structure]:
+    return candidate_structures(
+        records, how.library, max_terms=how.searched.max_terms, progress=progress
+    )
 
 
 def _followed(
@@ -151,10 +161,15 @@ def _followed(
     records: Sequence[OperatingRecord],
     points: Sequence[Mapping[str, float]],
     workers: Workers,
+    progress: Progress,
 ) -> list[MapPoint]:
     """In pieces: the records travel with each."""
     pieces = list(_pieces(points, 24))
-    done = dict(workers.run(partial(law_map, law, records), pieces))
+    done = {}
+    with progress.stage(len(points), "point", "map of the law") as advance:
+        for number, piece in workers.run(partial(law_map, law, records), pieces):
+            done[number] = piece
+            advance(len(piece))
     return [point for k in range(len(pieces)) for point in done[k]]
 
 

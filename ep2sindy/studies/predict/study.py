@@ -79,7 +79,8 @@ class Study:
         how = self._how(run.seed)
         given = expanded(self.points, list(self.parameters))
         sources = point_sources(self.source, self.parameters, given)
-        compile_kernels([source.source.data for source in sources])
+        with run.progress(None, "", "kernels, compiled once"):
+            compile_kernels([source.source.data for source in sources])
         opened = self._opened(sources, run)
         records, statuses = _records(opened, run)
         if not records:
@@ -92,7 +93,9 @@ class Study:
             cycle = "" if len(groups) == 1 else f" on the {name} cycle"
             run.say(f"fitting a law to {n_points(len(members))}{cycle} ...")
             try:
-                found[name] = branch_of(name, members, everywhere, how, self.parallel)
+                found[name] = branch_of(
+                    name, members, everywhere, how, self.parallel, progress=run.watch
+                )
             except ValueError as error:
                 reasons[name] = str(error)
                 if len(groups) > 1:

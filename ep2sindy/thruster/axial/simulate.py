@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
-from tqdm import tqdm
 
+from ep2sindy.machine.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial import kernels
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
 from ep2sindy.thruster.axial.grid import cell_faces
@@ -42,7 +42,7 @@ from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import uncovered
 from ep2sindy.thruster.verdict import diagnose, performance
 
-CHUNK_ROWS = 50  # samples between two updates of the progress bar
+CHUNK_ROWS = 50  # samples between two words on the progress
 
 
 def simulate(
@@ -59,7 +59,7 @@ def simulate(
     cfl: float = CFL,
     coldest_T_e_eV: float = 0.0,
     initial: Start | xr.Dataset | str | Path | None = None,
-    progress: bool = True,
+    progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point and record it at equal steps after a warm-up.
 
@@ -93,7 +93,12 @@ def simulate(
 
 
 def simulate_as(
-    settings: Settings, thruster: Thruster, point: OperatingPoint, start: Start, *, progress: bool
+    settings: Settings,
+    thruster: Thruster,
+    point: OperatingPoint,
+    start: Start,
+    *,
+    progress: Progress | bool,
 ) -> xr.Dataset:
     """`simulate`, with its settings as one value."""
     parameters = to_json({"thruster": thruster, "operating_point": point, "settings": settings})
@@ -103,8 +108,9 @@ def simulate_as(
         coldest_eV=settings.coldest_T_e_eV,
     )  # fmt: skip
     beginning = start.begin(model, lengths_and_centres(faces)[1], parameters)
-    with tqdm(desc=point.label, unit="sample", disable=not progress) as bar:
-        record = run(model, beginning, settings, bar)
+    n_samples = sum(sample_counts(beginning, settings))
+    with as_progress(progress).stage(n_samples, "sample", point.label) as advance:
+        record = run(model, beginning, settings, advance)
     field = _dataset(record, model, settings, point, faces)
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
@@ -135,24 +141,30 @@ class Record:
     diverged: bool
 
 
-def run(model: Model, beginning: Beginning, settings: Settings, bar: tqdm) -> Record:
+def sample_counts(beginning: Beginning, settings: Settings) -> tuple[int, int, int]:
+    """Samples that a run is held for, warms up for and records."""
+    step = settings.sample_s
+    seconds = (beginning.hold_s, settings.warm_up_s, settings.duration_s)
+    n_hold, n_warm_up, n_recorded = (round(each / step) for each in seconds)
+    return n_hold, n_warm_up, n_recorded + 1
+
+
+def run(model: Model, beginning: Beginning, settings: Settings, advance: Advance) -> Record:
     """Hold, warm up and record; a run that breaks ends with its last whole sample."""
-    state, step = beginning.state, settings.sample_s
+    state = beginning.state
     charges, size = state.n_i.shape
     n_fields = len(CELL_SUMS) + PER_CHARGE * (charges - 1)
     quiet = model
     if beginning.resistance is not None:
         quiet = model._replace(resistance=beginning.resistance)
-    n_hold, n_warm_up = round(beginning.hold_s / step), round(settings.warm_up_s / step)
-    n_samples = round(settings.duration_s / step) + 1
-    bar.total = n_hold + n_warm_up + n_samples
+    n_hold, n_warm_up, n_samples = sample_counts(beginning, settings)
     whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
-        whole = whole and _pass(each, state, settings, n_rows, n_fields, bar)
+        whole = whole and _pass(each, state, settings, n_rows, n_fields, advance)
     before, state.hottest_eV[0] = stored_energy(state, model), 0.0
     fields = np.empty((n_fields, n_samples if whole else 0, size - 2), np.float32)
     series = np.empty((fields.shape[1], len(SERIES_SUMS)))
-    filled = _fill(model, state, settings, fields, series, bar)
+    filled = _fill(model, state, settings, fields, series, advance)
     return Record(
         fields[:, :filled],
         series[:filled],
@@ -170,14 +182,14 @@ def first_fields(state: State, model: Model) -> bool:
 
 
 def _pass(
-    model: Model, state: State, settings: Settings, n_rows: int, n_fields: int, bar: tqdm
+    model: Model, state: State, settings: Settings, n_rows: int, n_fields: int, advance: Advance
 ) -> bool:
     """Advance by n_rows samples without keeping them; False where the run breaks."""
     fields = np.empty((n_fields, CHUNK_ROWS, state.n_n.size - 2), np.float32)
     series = np.empty((CHUNK_ROWS, len(SERIES_SUMS)))
     while n_rows > 0:
         n = min(n_rows, CHUNK_ROWS)
-        if _fill(model, state, settings, fields[:, :n], series[:n], bar) < n:
+        if _fill(model, state, settings, fields[:, :n], series[:n], advance) < n:
             return False
         n_rows -= n
     return True
@@ -189,7 +201,7 @@ def _fill(
     settings: Settings,
     fields: Float[np.ndarray, "sums samples cells"],
     series: Float[np.ndarray, "samples series"],
-    bar: tqdm,
+    advance: Advance,
 ) -> int:
     """Advance and record until the arrays are full or the run breaks; how many samples it took."""
     filled = 0
@@ -199,7 +211,7 @@ def _fill(
             state, model, settings.sample_s, settings.averaged, fields[:, part], series[part]
         )
         filled += done
-        bar.update(done)
+        advance(done)
         if done < len(series[part]):
             break
     return filled

@@ -8,6 +8,7 @@ from typing import Any
 
 import xarray as xr
 
+from ep2sindy.machine.progress import Progress
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.cache import kept
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
@@ -25,7 +26,7 @@ def simulate_2d_cached(
     n_z: int = 41,
     n_r: int = 49,
     averaged: bool = True,
-    progress: bool = True,
+    progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Read this simulation from the folder `cache`, or run it once and keep it there.
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
-from tqdm import tqdm
 
+from ep2sindy.machine.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plane.balance import diagnose
@@ -19,7 +19,7 @@ from ep2sindy.thruster.plane.state_kernels import Model, State
 from ep2sindy.thruster.propellants import XenonFits
 from ep2sindy.thruster.transport import AnomalousTransport
 
-CHUNK_ROWS = 50  # samples between two updates of the progress bar
+CHUNK_ROWS = 50  # samples between two words on the progress
 
 PLANES = {  # variable -> unit, long name, in the order the compiled loop fills them
     "n_i": ("m^-3", "ion density"),
@@ -60,7 +60,7 @@ def simulate_2d(
     n_z: int = 41,
     n_r: int = 49,
     averaged: bool = True,
-    progress: bool = True,
+    progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point in (z, r) and sample it at equal steps after a warm-up.
 
@@ -77,11 +77,10 @@ def simulate_2d(
     check_thruster(thruster)
     grid = MaskedGrid(thruster, n_z, n_r)
     model = build_model(thruster, operating_point, grid)
-    n_samples = round(duration_s / sample_s) + 1
-    rows = warmed_up_run(
-        grid, model, round(warm_up_s / sample_s), n_samples, sample_s, averaged,
-        tqdm(desc=operating_point.label, unit="sample", disable=not progress),
-    )  # fmt: skip
+    n_warm_up, n_samples = round(warm_up_s / sample_s), round(duration_s / sample_s) + 1
+    watch = as_progress(progress)
+    with watch.stage(n_warm_up + n_samples, "sample", operating_point.label) as told:
+        rows = warmed_up_run(grid, model, n_warm_up, n_samples, sample_s, averaged, told)
     field = as_dataset(rows, sample_s, grid)
     drop = thruster.series_resistance * field["I_d"].values
     field["V_d"] = ("time", operating_point.voltage - drop, attributes(SERIES["V_d"]))
@@ -120,19 +119,17 @@ def warmed_up_run(
     n_samples: int,
     sample_s: float,
     averaged: bool,
-    bar: tqdm,
+    told: Advance,
 ) -> Rows:
     """The samples after the warm-up; of a warm-up that diverges, its last finite ones."""
     state = initial_state(grid, model)
-    bar.total = n_warm_up + n_samples
-    with bar:
-        while n_warm_up:
-            n_rows = min(n_warm_up, CHUNK_ROWS)
-            rows = march(state, model, grid, n_rows, sample_s, averaged, bar)
-            if len(rows.series) < n_rows:
-                return rows
-            n_warm_up -= n_rows
-        return march(state, model, grid, n_samples, sample_s, averaged, bar)
+    while n_warm_up:
+        n_rows = min(n_warm_up, CHUNK_ROWS)
+        rows = march(state, model, grid, n_rows, sample_s, averaged, told)
+        if len(rows.series) < n_rows:
+            return rows
+        n_warm_up -= n_rows
+    return march(state, model, grid, n_samples, sample_s, averaged, told)
 
 
 def march(
@@ -142,7 +139,7 @@ def march(
     n_rows: int,
     sample_s: float,
     averaged: bool,
-    bar: tqdm,
+    told: Advance,
 ) -> Rows:
     """Advance `state` by n_rows samples; fewer rows come back where it diverges."""
     rows = Rows(
@@ -158,7 +155,7 @@ def march(
             state, model, sample_s, averaged, *planes, rows.profiles[chunk], rows.series[chunk]
         )
         filled += done
-        bar.update(done)
+        told(done)
         if filled < chunk.stop:
             break
     return rows.until(filled)
