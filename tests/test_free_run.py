@@ -91,7 +91,7 @@ def test_units_change_nothing() -> None:
 
 
 def test_chaos_is_judged_by_its_distribution() -> None:
-    system = replace(lorenz(), duration_s=60.0)
+    system = replace(lorenz(), duration_s=60.0, rate_Hz=100.0)
     run = system.trajectory()
     truth = free_run(system.model, run)
     assert truth.verdict is Verdict.LIVES

@@ -510,16 +510,24 @@ def test_a_pendulum_swings_on_closed_orbits() -> None:
     assert cycle.stability.value == "neutral"
 
 
-def test_a_function_of_ones_own_is_refined(tanh: str) -> None:
+@pytest.mark.parametrize(
+    "way",
+    [
+        {},
+        pytest.param(  # torch.optim imports torch's compiler: five seconds
+            {"method": ep.GradientDescent(), "free_start": False}, marks=pytest.mark.slow
+        ),
+    ],
+    ids=["shooting", "descent"],
+)
+def test_a_function_of_ones_own_is_refined(way: dict, tanh: str) -> None:
     truth = model_of({"x": {"y": 1.0}, "y": {"tanh(3*x)": -4.0, "y": -0.05}})
     t = np.linspace(0.0, 6.0, 301)
     run = truth.simulate(t, [1.5, 0.0]).trajectory()
     off = model_of({"x": {"y": 1.02}, "y": {"tanh(3*x)": -4.1, "y": -0.06}})
-    ways: list[dict] = [{}, {"method": ep.GradientDescent(), "free_start": False}]
-    for way in ways:
-        found = refine(off, [run], n_windows=4, window=60, rng=np.random.default_rng(0), **way)
-        # Steps of 0.02 s are exact to 1e-6 where tanh(3 x) turns.
-        assert found.model.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, abs=1e-4)
+    found = refine(off, [run], n_windows=4, window=60, rng=np.random.default_rng(0), **way)
+    # Steps of 0.02 s are exact to 1e-6 where tanh(3 x) turns.
+    assert found.model.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, abs=1e-4)
 
 
 def test_refinement_survives_windows_that_leave_a_domain() -> None:
