@@ -162,8 +162,9 @@ def test_intervals_under_relations_are_withheld_where_a_term_is_missing() -> Non
 
 
 def test_a_rule_that_judges_free_runs_says_nothing_of_the_noise_of_rows() -> None:
-    run = lotka_volterra().trajectory(noise=0.05, rng=0)
-    recipe = Recipe(WeightedWeak(), BestSubset(max_terms=2), Bootstraps(n=0), FreeRunScore())
+    run = replace(lotka_volterra(), rate_Hz=5.0).trajectory(noise=0.05, rng=0)
+    rule = FreeRunScore(n_windows=4, n_folds=2)
+    recipe = Recipe(WeightedWeak(), BestSubset(max_terms=2), Bootstraps(n=0), rule)
     found = discover(run, named_terms(["x", "y"], ["x", "y", "x*y"]), recipe)
     assert [chosen.chi_squared for chosen in found.chosen.values()] == [None, None]
     assert found.misfit == ""

@@ -91,7 +91,7 @@ def test_units_change_nothing() -> None:
 
 
 def test_chaos_is_judged_by_its_distribution() -> None:
-    system = replace(lorenz(), duration_s=60.0)
+    system = replace(lorenz(), duration_s=60.0, rate_Hz=100.0)
     run = system.trajectory()
     truth = free_run(system.model, run)
     assert truth.verdict is Verdict.LIVES
@@ -120,7 +120,10 @@ def test_samples_of_a_duration() -> None:
         samples_in(run, 1e-9)
 
 
-@pytest.mark.parametrize("number", [0, 1, 3])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=SLOW), pytest.param(3, marks=SLOW)])
 def test_the_true_model_of_a_chaotic_record_lives_and_a_wrong_one_does_not(number: int) -> None:
     """Rossler's frequency and waveform wander: no run lies closer than the data's own parts."""
     system, run = noisy("rossler", 0.05, number)

@@ -286,7 +286,7 @@ def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Me
     wider = [terms[0] | {"x^2": 0.01}, terms[1] | {"1": 0.01, "y^2": -0.01}]
     models = [SparseModel(library, ["x", "y"], coef_matrix(library, t)) for t in (wider, terms)]
     data = [[noisy(PREY, 0.05, rng)]] * 2
-    settings = {"window": 60, "n_windows": 8, "method": method}
+    settings = {"window": 40, "n_windows": 6, "method": method}
     together = refine_many(models, data, rng=np.random.default_rng(1), **settings)
     alone = refine_many(models, data, points_per_batch=1, rng=np.random.default_rng(1), **settings)
     for one, other in zip(together, alone, strict=True):

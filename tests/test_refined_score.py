@@ -135,7 +135,7 @@ def test_inputs_drive_the_refinement() -> None:
 
 
 def test_units_do_not_matter_to_the_refined_score() -> None:
-    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1))
+    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1)).window(0, 500)
     library, choices = PREY.model.library, next_to_truth(PREY, WRONG["Lotka-Volterra"])
     degree = dict(zip(library.names, library.exponents.sum(axis=1), strict=True))
     dense = Trajectory(run.t * 1e-6, run.states * 1e18, run.state_names)

@@ -18,6 +18,22 @@ def kept(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.fixture
+def small_runs(monkeypatch):
+    """Simulations of two variables, each its own of its point; a list of those that ran."""
+    done = []
+
+    def simulate_as(_settings, _thruster, point, start, *, progress):
+        done.append((point, start))
+        n_i = point.neutral_speed * np.arange(12, dtype=np.float32).reshape(4, 3)
+        variables = {"n_i": (("time", "z"), n_i), "n_n": ("time", np.linspace(0.0, 1.0, 4))}
+        attributes = {"parameters": "{}", "status": "steady"}
+        return xr.Dataset(variables, {"time": np.arange(4.0)}, attributes)
+
+    monkeypatch.setattr(cache, "simulate_as", simulate_as)
+    return done
+
+
 def test_second_call_reads_identical_values(tmp_path, monkeypatch):
     first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated twice"))
@@ -29,12 +45,13 @@ def test_second_call_reads_identical_values(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("size", [0, 1000])
-def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, size):
+def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, small_runs, size):
     first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:size])
     again = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     xr.testing.assert_identical(first.drop_attrs(), again.drop_attrs())
+    assert len(small_runs) == 2
     printed = capsys.readouterr()
     assert "cannot be read" in printed.out + printed.err
     xr.testing.assert_identical(again.drop_attrs(), cache.read(path).drop_attrs())
@@ -50,10 +67,10 @@ def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, size):
         (Thruster(), POINT, {"n_cells": 41}),
     ],
 )
-def test_other_parameters_have_another_file(tmp_path, thruster, point, change):
+def test_other_parameters_have_another_file(tmp_path, small_runs, thruster, point, change):
     simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     simulate_cached(thruster, point, cache=tmp_path, **(BRIEF | change))
-    assert len(kept(tmp_path)) == 2
+    assert len(kept(tmp_path)) == len(small_runs) == 2
 
 
 @pytest.mark.parametrize(
@@ -63,12 +80,14 @@ def test_other_parameters_have_another_file(tmp_path, thruster, point, change):
         (SoftStart(hold_s=1e-5), SoftStart(hold_s=2e-5)),
     ],
 )
-def test_other_starts_have_another_file(tmp_path, one, other):
+def test_other_starts_have_another_file(tmp_path, small_runs, one, other):
     for initial in (one, other, one):
         simulate_cached(Thruster(), POINT, cache=tmp_path, initial=initial, **BRIEF)
     assert len(kept(tmp_path)) == 2
+    assert small_runs == [(POINT, one), (POINT, other)]
 
 
+@pytest.mark.usefixtures("small_runs")
 def test_changed_source_has_another_file(tmp_path, monkeypatch):
     simulate_cached(Thruster(), POINT, cache=tmp_path / "kept", **BRIEF)
     (tmp_path / "closures.py").write_text("changed = True\n")
@@ -77,6 +96,7 @@ def test_changed_source_has_another_file(tmp_path, monkeypatch):
     assert len(kept(tmp_path / "kept")) == 2
 
 
+@pytest.mark.usefixtures("small_runs")
 def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -95,7 +115,7 @@ def test_a_cache_that_cannot_be_written_costs_no_simulation(tmp_path, monkeypatc
 
 
 def changed_value(field: xr.Dataset) -> xr.Dataset:
-    field["n_i"][0, 0] *= 1.0 + 1e-6
+    field["n_i"][0, 1] *= 1.0 + 1e-6
     return field
 
 
@@ -108,17 +128,20 @@ def changed_value(field: xr.Dataset) -> xr.Dataset:
         (lambda field: field.assign_attrs(kept_for="{}"), "it is of other parameters"),
     ],
 )
-def test_a_kept_run_that_is_another_is_simulated_again(tmp_path, capsys, change, reason):
+def test_a_kept_run_that_is_another_is_simulated_again(
+    tmp_path, capsys, small_runs, change, reason
+):
     first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     (path,) = tmp_path.iterdir()
     cache.write(change(cache.read(path)), path)
     again = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     xr.testing.assert_identical(first.drop_attrs(), again.drop_attrs())
+    assert len(small_runs) == 2
     printed = capsys.readouterr()
     assert reason in " ".join((printed.out + printed.err).split())
 
 
-def test_a_run_under_the_name_of_another_is_not_taken_for_it(tmp_path):
+def test_a_run_under_the_name_of_another_is_not_taken_for_it(tmp_path, small_runs):
     hot = OperatingPoint(300.0, 5.0, neutral_speed=281.0)
     simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
     (path,) = tmp_path.iterdir()
@@ -126,6 +149,7 @@ def test_a_run_under_the_name_of_another_is_not_taken_for_it(tmp_path):
     (other,) = (tmp_path / "other").iterdir()
     other.write_bytes(path.read_bytes())
     found = simulate_cached(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
+    assert [point for point, _ in small_runs] == [POINT, hot, hot]
     xr.testing.assert_identical(found.drop_attrs(), expected.drop_attrs())
 
 
