@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from test_face import targets
 
 import ep2sindy as ep
+from ep2sindy.app import yaml_files
 from ep2sindy.app.build import call_of
 from ep2sindy.app.defaults import defaults_of, plain
 from ep2sindy.app.runner import run_config, study_class
@@ -216,8 +217,9 @@ def test_references_that_double_are_refused_before_they_are_written_out(
         loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
 
 
-def test_a_long_list_is_no_reference() -> None:
-    check_references({"a": [1.5] * 1_000_000, "b": "${a}", "c": {"d": "${b}", "e": "${.d}"}})
+def test_a_long_list_is_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(yaml_files, "MOST_CHARACTERS", 1000)
+    check_references({"a": [1.5] * 10_000, "b": "${a}", "c": {"d": "${b}", "e": "${.d}"}})
 
 
 def test_text_that_becomes_a_group_is_looked_at_as_one(tmp_path: Path, monkeypatch: Any) -> None:
