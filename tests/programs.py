@@ -1,16 +1,19 @@
 """Experiments run inside a test, without the command line; and, where asked, without figures."""
 
+import sys
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
+from ep2sindy.app.main import main
 from ep2sindy.app.runner import started_run, study_class
 from ep2sindy.app.schema import study_of
 from ep2sindy.report.page import page_html
@@ -59,3 +62,13 @@ def computed(config: DictConfig) -> Computed:
         page = page_html(config.experiment, sections, {})
         log = (run.folder.path / "run.log").read_text()
     return Computed(outcome, log, page, run.folder.path)
+
+
+def ended(*arguments: str) -> str:
+    """How the command line `ep2sindy ARGUMENTS` ends in this process: its error, or nothing."""
+    with patch.object(sys, "argv", ["ep2sindy", *arguments]):
+        try:
+            main()
+        except SystemExit as error:
+            return str(error)
+    return ""
