@@ -148,13 +148,11 @@ def test_points_that_are_quiet_have_no_law(tmp_path: Path) -> None:
 
 
 def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) -> None:
-    folder = run_config(composed(*own_records(tmp_path, 0.6, 0.9, 1.2))).folder
-    law = OperatingLaw.load(folder / "law_all.json")
+    found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2)))
+    law = OperatingLaw.load(found.folder / "law_all.json")
     np.testing.assert_allclose(law.model_at({"a": 1.0}).terms("n_i")["n_i"], 1.0, atol=1e-3)
-    assert {p.stem for p in (folder / "figures").glob("*.png")} == {
-        "laws_all", "left_out", "map_all",
-    }  # fmt: skip
-    log = " ".join((folder / "run.log").read_text().split())
+    found.check_figures("laws_all", "left_out", "map_all")
+    log = " ".join(found.log.split())
     assert "3 of 3 live, diverging: 0." in log
     assert "f (mHz)" in log
     assert "also: other cycles" not in log

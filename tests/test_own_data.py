@@ -121,13 +121,10 @@ def test_several_files_are_several_records(folder: Path) -> None:
         "+exp=discover", "data=recognised", "trajectory.states=[x,y,z]", f"output={folder}",
         "search=best_subset", "selection=ebic",
     ]  # fmt: skip
-    run = run_config(composed(*overrides, "data.path=run*.csv")).folder
-    summary = json.loads((run / "summary.json").read_text())
-    log = (run / "run.log").read_text()
-    assert all(f"data: run{k}.csv; 1000 samples" in log for k in range(3))
-    rows = (run / "tables" / "records.csv").read_text().splitlines()
-    assert len(rows) == 4
-    assert summary["models"]["model"]["equations"]["x"]["terms"] == pytest.approx(
+    found = computed(composed(*overrides, "data.path=run*.csv"))
+    assert all(f"data: run{k}.csv; 1000 samples" in found.log for k in range(3))
+    assert len(found.outcome.tables()["records"]) == 3
+    assert found.summary["models"]["model"]["equations"]["x"]["terms"] == pytest.approx(
         {"x": -10.0, "y": 10.0}, rel=0.01
     )
     one = computed(composed(*overrides, "data.path=[run0.csv]"))
