@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+LOOKS, LOOK_S = 3000, 0.1  # until it has started, and a page is there: seconds on most machines
 # Every image that is not loaded or of one colour, every drawing without a line in it.
 EMPTY = """
 [...document.images].filter(image => {
@@ -88,10 +89,10 @@ async def _seen(
     from tornado.websocket import websocket_connect
 
     port_file = profile / "DevToolsActivePort"
-    for _ in range(300):
+    for _ in range(LOOKS):
         if port_file.is_file() and "\n" in port_file.read_text():
             break
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(LOOK_S)
     port = port_file.read_text().splitlines()[0]
     listed = await AsyncHTTPClient().fetch(f"http://127.0.0.1:{port}/json/list")
     (target, *_) = [each for each in json.loads(listed.body) if each["type"] == "page"]
@@ -110,7 +111,7 @@ async def _seen(
         count += 1
         await socket.write_message(json.dumps({"id": count, "method": method, "params": arguments}))
         while True:
-            message = json.loads(await asyncio.wait_for(socket.read_message(), 60.0))  # type: ignore[arg-type]
+            message = json.loads(await asyncio.wait_for(socket.read_message(), LOOKS * LOOK_S))  # type: ignore[arg-type]
             if message.get("id") == count:
                 assert "error" not in message, message
                 return message["result"]
@@ -128,10 +129,10 @@ async def _seen(
         width=width_px, height=900, deviceScaleFactor=1, mobile=width_px < 700,
     )  # fmt: skip
     await call("Page.navigate", url=url)
-    for _ in range(300):
+    for _ in range(LOOKS):
         if await value("location.href != 'about:blank' && document.readyState == 'complete'"):
             break
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(LOOK_S)
     found.scroll_px = await value("document.documentElement.scrollWidth")
     found.figures = await value("document.querySelectorAll('figure img, figure svg').length")
     found.empty = await value(EMPTY)

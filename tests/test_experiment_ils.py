@@ -33,6 +33,7 @@ def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
         "windows=[60]",
         "living.search.max_terms=2",  # as many as the truth has
         "+living.selection.n_windows=6",
+        "+living.selection.n_folds=2",
         "n_draws=2",
         "weak.test_functions.n_windows=500",
         "weak.test_functions.n_points=50",

@@ -30,6 +30,7 @@ def breathing(path: Path, output: Path) -> list[str]:
         "bootstraps.n=4",
         "living.search.max_terms=2",  # as many as the truth has
         "+living.selection.n_windows=6",
+        "+living.selection.n_folds=2",
         "rollout_s=1.0e-3",
     ]
 

@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 import xarray as xr
 from omegaconf import DictConfig, OmegaConf
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ep2sindy.app.runner import run_config, started_run
 from ep2sindy.app.schema import study_of
@@ -96,6 +95,8 @@ def test_the_file_holds_every_map(toy_run: Path) -> None:
 
 
 def test_tables_figures_and_page_are_there(toy_run: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
     terms = pd.read_csv(toy_run / "tables" / "terms.csv")
     assert len(terms) == 2 * len(TERMS)
     assert terms["selected"].between(0, 1).all()

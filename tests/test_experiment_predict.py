@@ -151,23 +151,23 @@ def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) 
     found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2)))
     law = OperatingLaw.load(found.folder / "law_all.json")
     np.testing.assert_allclose(law.model_at({"a": 1.0}).terms("n_i")["n_i"], 1.0, atol=1e-3)
-    found.check_figures("laws_all", "left_out", "map_all")
+    assert set(found.outcome.figures()) == {"laws_all", "left_out", "map_all"}
+    found.check_figures(*found.outcome.figures())
     log = " ".join(found.log.split())
     assert "3 of 3 live, diverging: 0." in log
     assert "f (mHz)" in log
     assert "also: other cycles" not in log
 
 
-def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(
-    folder: Path, tmp_path: Path
-) -> None:
-    kept = f"data.cache={folder.parents[1] / 'cache'}"
-    settings = ["model=null", "structures.max_terms=3", "map_points=1", kept]
-    found = programs.computed(composed(*toy(tmp_path), POINTS, *settings))
+def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(tmp_path: Path) -> None:
+    settings = ["model=null", "structures.degree=3", "structures.max_terms=3", "map_points=1"]
+    records = own_records(tmp_path, 0.6, 0.9, 1.2)
+    found = programs.computed(composed(*records, *settings))
     (branch,) = found.outcome.branches.values()
     assert len(branch.trials) == 4
     assert {each.fit.n_coefs for each in branch.trials} == {4, 5, 6}
     table = found.outcome.tables()["structures"]
     assert table["chosen"].sum() == 1
+    assert found.summary["branches"]["all"]["structure"]["n_i"] == ["n_i", "n_n", "n_i^3"]
     assert "Structure and order" in found.log
     assert found.log.count("<- chosen") == 1

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from distributed import LocalCluster
 from threadpoolctl import threadpool_info
 
 from ep2sindy.machine.parallel import Dask, Loky, Serial, Workers, rows_in_order
@@ -64,6 +63,8 @@ def dies_once(marker: str) -> str:
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """A scheduler with two workers, on loopback, in processes of their own."""
+    from distributed import LocalCluster
+
     with LocalCluster(
         n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
     ) as cluster:
@@ -140,6 +141,8 @@ def test_a_silent_scheduler_is_named() -> None:
 
 
 def test_a_scheduler_without_workers_is_named() -> None:
+    from distributed import LocalCluster
+
     with (
         LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address=":0") as empty,
         pytest.raises(OSError, match="a dask scheduler with a worker must answer"),
@@ -194,8 +197,9 @@ def test_a_piece_that_fails_is_told_in_our_words_alone(tmp_path: Path) -> None:
     script.write_text(FAILING)
     os.mkfifo(tmp_path / "both")
     done = subprocess.run(
-        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True,
+        timeout=PATIENCE_S,
+    )  # fmt: skip
     assert (done.stdout, done.stderr) == ("in our words\n", "")
 
 
