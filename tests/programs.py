@@ -1,17 +1,21 @@
 """Experiments run inside a test, without the command line; and, where asked, without figures."""
 
+import sys
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from ep2sindy.app.runner import started_run, study_class
+from ep2sindy.app.main import main
+from ep2sindy.app.runner import about, started_run, study_class
 from ep2sindy.app.schema import study_of
 from ep2sindy.report.page import page_html
 
@@ -45,17 +49,35 @@ class Computed:
     log: str
     page: str
     folder: Path
+    warnings: Sequence[str]
 
     @property
     def summary(self) -> dict[str, Any]:
         return self.outcome.summary()
 
+    def check_figures(self, *names: str) -> None:
+        """Each of these can be drawn; that it can be printed, the full run of a study shows."""
+        figures = self.outcome.figures()
+        for name in names:
+            assert figures[name].draw().axes, name
+
 
 def computed(config: DictConfig) -> Computed:
     with started_run(config) as run:
-        outcome = study_of(study_class(config.study), config).compute(run)
+        study = study_of(study_class(config.study), config)
+        outcome = study.compute(run)
         sections = outcome.sections()
         run.screen.show(sections)
-        page = page_html(config.experiment, sections, {})
+        page = page_html(config.experiment, sections, {}, about(run, study))
         log = (run.folder.path / "run.log").read_text()
-    return Computed(outcome, log, page, run.folder.path)
+    return Computed(outcome, log, page, run.folder.path, run.warnings)
+
+
+def ended(*arguments: str) -> str:
+    """How the command line `ep2sindy ARGUMENTS` ends in this process: its error, or nothing."""
+    with patch.object(sys, "argv", ["ep2sindy", *arguments]):
+        try:
+            main()
+        except SystemExit as error:
+            return str(error)
+    return ""

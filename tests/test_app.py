@@ -1,7 +1,6 @@
 """From a command line to a study: configs, their errors, sweeps and their index."""
 
 import json
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.machine.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.kinds import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
+from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -321,34 +321,26 @@ def test_an_index_knows_a_job_that_ended_while_it_was_written(
     assert pd.read_csv(tmp_path / "index.csv")["job"].tolist() == [0, 1]
 
 
-def run_program(*overrides: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "ep2sindy.app.main", *overrides],
-        cwd=cwd,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
-def test_a_sweep_goes_on_after_a_failed_job_and_says_so(tmp_path: Path) -> None:
+def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
     """Three jobs that end early, each for its own reason: no job ends another."""
     (tmp_path / "conf" / "exp").mkdir(parents=True)
     own = "# @package _global_\ndefaults: [discover]\nexperiment: mine\n"
     (tmp_path / "conf" / "exp" / "mine.yaml").write_text(own)
-    result = run_program(
-        "-m", "+exp=mine", "data=file", "data.path=none.nc", "trajectory.states=[x,y]",
-        "seed=-1,2", cwd=tmp_path,
-    )  # fmt: skip
-    assert result.returncode == 1
+    monkeypatch.chdir(tmp_path)
+    error = ended(
+        "-m", "+exp=mine", "data=file", "data.path=none.nc", "trajectory.states=[x,y]", "seed=-1,2"
+    )
+    assert error == "error: 2 jobs failed"
+    said = capsys.readouterr()
     for text in ("job 0: ", "job 1: ", "sweep of 2 jobs", "seed must be a whole number"):
-        assert text in result.stdout
+        assert text in said.out
     (path,) = tmp_path.glob("outputs/multirun/*/index.csv")
     errors = pd.read_csv(path)["error"].tolist()
     assert errors[0] == "seed must be a whole number, zero or more: -1 came"
     assert errors[1].startswith("no such file: ")
-    assert "Traceback" not in result.stderr
+    assert "Traceback" not in said.err
 
 
 @pytest.mark.parametrize(
@@ -368,9 +360,7 @@ def test_mistakes_end_in_one_clear_message(
     capsys: pytest.CaptureFixture,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["ep2sindy", *overrides])
-    with pytest.raises(SystemExit) as ended:
-        program.main()
-    assert message in str(ended.value)
-    assert str(ended.value).startswith("error: ")
+    error = ended(*overrides)
+    assert message in error
+    assert error.startswith("error: ")
     assert not list(tmp_path.glob("outputs/*/*"))  # no run folder of a run that never began

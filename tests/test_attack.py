@@ -110,8 +110,9 @@ def test_the_layer_fails_one_write_of_the_run(
 
 def test_processes_of_a_run_are_found_whoever_their_parent_is(tmp_path: Path) -> None:
     mark = {"EP2SINDY_ATTACK": json.dumps({"folder": str(tmp_path)})}
-    wait = "import time; time.sleep(60)"
-    with subprocess.Popen([sys.executable, "-c", wait], env={**os.environ, **mark}) as run:
+    with subprocess.Popen(
+        [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, env={**os.environ, **mark}
+    ) as run:
         (found,) = left.living(tmp_path, timeout_s=0.0)
         assert f"alive: {run.pid}" in found
     assert run.returncode == -9
@@ -135,12 +136,21 @@ SONGS = {
 }
 
 
-@pytest.mark.parametrize(("code", "noted"), SONGS.values(), ids=SONGS)
-def test_a_config_that_runs_something_is_betrayed(code: str, noted: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def betrayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """What is made of a run of a module that does all of this, and what was noted of it."""
+    folder = tmp_path_factory.mktemp("sung")
+    (folder / "elsewhere").mkdir()
+    (folder / "elsewhere" / "there").write_text("")
+    song = "\n".join(code for code, _ in SONGS.values())
+    case = Case(("+exp=weak", "study=own.song"), {"own/song.py": song}, names="own")
+    kind, _ = crafted.judged(case, folder)
+    return kind, (folder / "notes").read_text("utf-8")
+
+
+@pytest.mark.parametrize("noted", [noted for _, noted in SONGS.values()], ids=SONGS)
+def test_a_config_that_runs_something_is_betrayed(noted: str, betrayed: tuple[str, str]) -> None:
     """A module of one's own may be run, and stands here for what must not be."""
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "there").write_text("")
-    case = Case(("+exp=weak", "study=own.song"), {"own/song.py": code}, names="own")
-    kind, words = crafted.judged(case, tmp_path)
-    assert kind == "ran or wrote", words
-    assert noted in words
+    kind, notes = betrayed
+    assert kind == "ran or wrote", notes
+    assert noted in notes

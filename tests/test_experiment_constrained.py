@@ -1,8 +1,6 @@
-import json
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from omegaconf import DictConfig
 
@@ -30,31 +28,30 @@ def constrained(path: Path, output: Path, *overrides: str) -> DictConfig:
 
 
 def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_path: Path) -> None:
-    folder = run_config(constrained(predator_prey, tmp_path, "~models.ionization")).folder
-    summary = json.loads((folder / "summary.json").read_text())
-    assert list(summary) == ["experiment", "seed", "data", "models", "headline"]
+    found = programs.computed(constrained(predator_prey, tmp_path, "~models.ionization"))
+    summary = found.summary
+    assert list(summary) == ["data", "models"]
     assert (summary["data"]["n_samples"], summary["data"]["n_held_out"]) == (1200, 300)
     models = summary["models"]
     assert list(models) == ["predator_prey", "velocity"]
     for name, model in models.items():
         shared = "n_i*n_n" if name == "predator_prey" else "n_i*n_n*R_ion"
-        pairs = {kind: found["equations"] for kind, found in model.items()}
+        pairs = {kind: fit["equations"] for kind, fit in model.items()}
         assert set(pairs) == {"base", "constrained"}
         assert pairs["constrained"]["n_i"][shared] == -pairs["constrained"]["n_n"][shared]
         assert pairs["base"]["n_i"][shared] != -pairs["base"]["n_n"][shared]
-        assert all(set(found) >= JUDGED for found in model.values())
+        assert all(set(fit) >= JUDGED for fit in model.values())
     exact = models["predator_prey"]["constrained"]["equations"]
     # Second-order differences at 1.5 us on a 14 kHz wave: (omega dt)^2 / 6 = 0.3 %, and the
     # smoothing window flattens peaks by about 1 %.
     assert exact["n_i"] == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=0.02)
     assert exact["n_n"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
-    assert len(pd.read_csv(folder / "tables" / "methods.csv")) == 8
-    page, log = (folder / "report.html").read_text(), (folder / "run.log").read_text()
-    assert 'id="figure-trajectories"' in page
+    assert len(found.outcome.tables()["methods"]) == 8
+    found.check_figures("trajectories")
     for words in ("relation: n_i: n_i*n_n == -1 * n_n: n_i*n_n", "predator prey, constrained"):
-        assert words in page
-        assert words in log
-    assert "status" not in page  # least squares has none
+        assert words in found.page
+        assert words in found.log
+    assert "status" not in found.page  # least squares has none
 
 
 def test_held_out_times_count_from_the_start_of_the_held_out_part(

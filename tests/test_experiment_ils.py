@@ -29,8 +29,11 @@ def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
         "data=file",
         f"data.path={path}",
         f"output={output}",
-        "n_windows=8",
+        "n_windows=6",
         "windows=[60]",
+        "living.search.max_terms=2",  # as many as the truth has
+        "+living.selection.n_windows=6",
+        "+living.selection.n_folds=2",
         "n_draws=2",
         "weak.test_functions.n_windows=500",
         "weak.test_functions.n_points=50",

@@ -1,5 +1,6 @@
 import json
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from tests.programs import composed, computed
 CYCLE = {"1": 7.93e9, "I": -2.44e9, "I*g": 1.07e4, "g^3": -1.47e-6}
 
 
-def signal(n_periods: float = 40.0) -> tuple[np.ndarray, np.ndarray]:
+@cache
+def signal(n_periods: float) -> tuple[np.ndarray, np.ndarray]:
     library = ep.polynomial(["I", "g"], degree=3)
     coef = ep.coef_matrix(library, [{"I*g": 1.0}, CYCLE])
     model = ep.SparseModel(library, ["I", "g"], coef)
@@ -29,18 +31,26 @@ def scope(path: Path, t: np.ndarray, x: np.ndarray) -> Path:
 def toy(path: Path, output: Path, *more: str) -> list[str]:
     return [
         "+exp=trace", "data=file", f"data.path={path}", "signal=I", "unit=A", f"output={output}",
-        "search.n_best=2", "search.max_terms=4", "depth=2", "selection.n_starts=2",
-        "selection.n_windows=6", *more,
+        "search.n_best=2", "search.max_terms=4", "depth=2", "selection.n_starts=1",
+        "selection.n_windows=6", "selection.n_folds=2", *more,
     ]  # fmt: skip
+
+
+def glance(path: Path, output: Path, *more: str) -> list[str]:
+    """What is said of a signal; the model, of one term, is chosen without a free run."""
+    few = ("depth=1", "search.n_best=1", "search.max_terms=1", "selection=ebic")
+    own = ("~selection.bounds", "~selection.n_windows", "~selection.n_starts")  # of free runs
+    given = [o for o in toy(path, output, *few) if not o.startswith("selection.")]
+    return [*given, *own, *more]
 
 
 @pytest.fixture(scope="module")
 def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal())
+    return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal(24.0))
 
 
 def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
-    folder = run_config(composed(*toy(record, tmp_path))).folder
+    folder = run_config(composed(*toy(record, tmp_path, "selection.n_starts=2"))).folder
     summary = json.loads((folder / "summary.json").read_text())
     living = summary["living"]
     assert living["verdict"] == "lives"
@@ -64,12 +74,12 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
 
 @pytest.mark.parametrize("embedding", ["rate", "delays"])
 def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) -> None:
-    t = 0.12 * np.arange(1500)  # 28 periods
+    t = 0.12 * np.arange(850)  # 16 periods
     run = ep.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    more = ("search.max_terms=3", "degree=3" if embedding == "rate" else "degree=1")
-    config = composed(*toy(path, tmp_path, f"embedding={embedding}", *more))
-    found = computed(config)
+    settings = {"rate": toy(path, tmp_path, "search.max_terms=3", "degree=3")}
+    settings |= {"delays": glance(path, tmp_path, "degree=1")}
+    found = computed(composed(*settings[embedding], f"embedding={embedding}"))
     assert found.summary["signal"]["reason"] == "set"
     if embedding == "rate":
         assert found.summary["model"]["equations"]["I"] == {"v": 1.0}
@@ -84,17 +94,16 @@ def test_advice_is_given_and_taken(tmp_path: Path) -> None:
     t, x = signal(12.0)
     fine = np.linspace(t[0], t[-1], 4 * len(t))
     path = scope(tmp_path / "scope.csv", fine, np.interp(fine, t, x))
-    few = ("search.n_best=1", "depth=1", "search.max_terms=1", "selection.n_windows=2")
-    offered = computed(composed(*toy(path, tmp_path, *few, "decimate=null")))
+    offered = computed(composed(*glance(path, tmp_path, "decimate=null")))
     assert re.search(r"21\d samples to a period are more .* decimate=2", offered.log)
-    taken = computed(composed(*toy(path, tmp_path, *few, "decimate=auto")))
+    taken = computed(composed(*glance(path, tmp_path, "decimate=auto")))
     assert "means over 2 samples" in taken.log
     assert taken.summary["data"]["n_samples"] == len(fine) // 2
 
 
 def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
     path = scope(tmp_path / "scope.csv", *signal(8.0))
-    found = computed(composed(*toy(path, tmp_path)))
+    found = computed(composed(*glance(path, tmp_path)))
     assert found.summary["living"]["held_out"] is False
     assert "too short to hold out" in " ".join(found.log.split())
 
@@ -119,11 +128,10 @@ def test_what_cannot_be_taken_is_refused(change, more, message, tmp_path: Path) 
 def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> None:
     t, x = signal(12.0)
     path = scope(tmp_path / "scope.csv", t, x - x.mean())
-    few = ("search.n_best=1", "depth=1", "search.max_terms=1", "selection.n_windows=2")
-    lost = computed(composed(*toy(path, tmp_path, *few)))
+    lost = computed(composed(*glance(path, tmp_path)))
     assert lost.summary["signal"]["embedding"] == "Rate"
     assert "offset=MEAN gives it back" in " ".join(lost.log.split())
-    given = computed(composed(*toy(path, tmp_path, *few, f"offset={x.mean()}")))
+    given = computed(composed(*glance(path, tmp_path, f"offset={x.mean()}")))
     assert given.summary["signal"]["embedding"] == "LogRate"
     assert "offset=MEAN" not in given.log
 

@@ -1,12 +1,10 @@
-import json
 import re
 from pathlib import Path
 
-import pandas as pd
 import pytest
 
 from ep2sindy.app.runner import run_config
-from tests.programs import composed
+from tests.programs import composed, computed
 
 
 def weak_on(path: Path, output: Path) -> list[str]:
@@ -22,8 +20,8 @@ def weak_on(path: Path, output: Path) -> list[str]:
 
 
 def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
-    folder = run_config(composed(*weak_on(predator_prey, tmp_path))).folder
-    summary = json.loads((folder / "summary.json").read_text())
+    found = computed(composed(*weak_on(predator_prey, tmp_path)))
+    summary = found.summary
     forms = ["differential", "n_points_10", "n_points_50", "automatic", "automatic_weighted"]
     assert list(summary["settings"]) == forms
     for name, setting in summary["settings"].items():
@@ -35,20 +33,18 @@ def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) 
         assert equations["n_n"] == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=rel)
         assert setting["f_error"] == pytest.approx(0.0, abs=0.01)
         assert {"text", "r2", "f_kHz", "nrmse", "verdict"} <= set(setting)
-        assert (folder / "models" / f"{name}.json").is_file()
+    assert list(found.outcome.models()) == forms
     automatic = summary["settings"]["automatic_weighted"]
     for state, half_width in automatic["half_width"].items():
         assert automatic["half_width_s"][state] == pytest.approx(1.5e-6 * half_width)
         low, high = automatic["intervals"][state][state]
         assert low < automatic["equations"][state][state] < high
-    assert len(pd.read_csv(folder / "tables" / "settings.csv")) == 2 * len(forms)
-    log, page = ((folder / name).read_text() for name in ("run.log", "report.html"))
+    assert len(found.outcome.tables()["settings"]) == 2 * len(forms)
+    log, page = found.log, found.page
     assert "thesis, Eq. 24: n_i' = -1.51e+05 n_i + 4.21e-14 n_i n_n" in log
     assert log.count("95 % from") == page.count("95 % from") == 1  # of the weighted fit
     assert max(map(len, log.splitlines())) <= 120
-    for name in ("trajectories", "phase", "derivatives", "spectra"):
-        assert f'id="figure-{name}"' in page
-        assert (folder / "figures" / f"{name}.png").is_file()
+    found.check_figures("trajectories", "phase", "derivatives", "spectra")
 
 
 def test_windows_longer_than_the_data_end_a_run_before_any_fit(

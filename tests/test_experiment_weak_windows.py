@@ -1,4 +1,3 @@
-import json
 import re
 from pathlib import Path
 
@@ -16,8 +15,8 @@ def composed(*overrides: str) -> DictConfig:
 def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
     overrides = ["n_windows=[100,300]", "n_points=[10,30]", "noises=[0.0,0.1]", "parallel=serial"]
     config = composed(*overrides, "n_realizations=2", f"output={tmp_path}")
-    folder = run_config(config).folder
-    found = json.loads((folder / "summary.json").read_text())["cells"]
+    errors = programs.computed(config)
+    found = errors.summary["cells"]
     assert len(found) == 2 * (4 + 3)
     assert {cell["setting"] for cell in found if cell["n_points"] is None} == {
         "differential",
@@ -27,7 +26,7 @@ def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
     for cell in found:
         assert cell["n"] == 2
         assert {"n_windows", "noise", "error_mean", "error_std"} <= set(cell)
-    assert 'id="figure-errors"' in (folder / "report.html").read_text()
+    errors.check_figures("errors")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import ep2sindy as ep
 from ep2sindy.app import main as program
 from ep2sindy.app.runner import run_config
 from ep2sindy.data.inspection import NEEDS
-from tests.programs import EXPERIMENTS, composed
+from tests.programs import EXPERIMENTS, composed, computed
 
 
 def ep2sindy(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
@@ -21,10 +21,10 @@ def ep2sindy(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
     program.main()
 
 
-def lorenz_csv(path: Path, *, seed: int = 0, lost: int = 0) -> np.ndarray:
-    """A file with semicolons, decimal commas and a preamble; returns its states."""
+def lorenz_csv(path: Path, *, seed: int = 0, lost: int = 0) -> None:
+    """A file with semicolons, decimal commas and a preamble: a thousand samples."""
     start = np.random.default_rng(seed).uniform(-8.0, 8.0, 3) + np.array([0.0, 0.0, 25.0])
-    run = ep.lorenz().trajectory(initial=start, noise=0.001, rng=seed)
+    run = ep.lorenz().trajectory(initial=start, noise=0.001, rng=seed).window(0, 1000)
     lines = ["made by;a scope", "", "Time;x;y;z", "(s);;;"]
     for k, row in enumerate(zip(run.t, *run.states.T, strict=True)):
         cells = [f"{value:.9g}".replace(".", ",") for value in row]
@@ -32,7 +32,6 @@ def lorenz_csv(path: Path, *, seed: int = 0, lost: int = 0) -> np.ndarray:
             cells[1] = ""
         lines.append(";".join(cells))
     path.write_text("\n".join(lines) + "\n")
-    return run.states
 
 
 @pytest.fixture
@@ -50,16 +49,19 @@ def test_two_commands_lead_from_a_file_to_its_equations(
     assert "between semicolons, decimal commas, rows from line 5" in said
     command = "ep2sindy +exp=discover data=scope 'trajectory.states=[x,y,z]'"
     assert command in said
-    ep2sindy(monkeypatch, "+exp=discover", "data=scope", "trajectory.states=[x,y,z]")
+    ep2sindy(
+        monkeypatch, "+exp=discover", "data=scope", "trajectory.states=[x,y,z]",
+        "search=best_subset", "selection=ebic",
+    )  # fmt: skip
     (run,) = (folder / "outputs" / "discover").iterdir()
     summary = json.loads((run / "summary.json").read_text())
     terms = summary["models"]["model"]["equations"]["x"]["terms"]
     assert terms == pytest.approx({"x": -10.0, "y": 10.0}, rel=0.05)
     page, log = (run / "report.html").read_text(), (run / "run.log").read_text()
-    for part in ("data: scope.csv", "2995 samples", "x in 1"):
+    for part in ("data: scope.csv", "995 samples", "x in 1"):
         assert part in page
         assert part in log
-    assert "5 of 3000 samples are missing (NaN)" in summary["warnings"][0]
+    assert "5 of 1000 samples are missing (NaN)" in summary["warnings"][0]
 
 
 def test_a_written_config_is_that_of_the_file(
@@ -115,18 +117,18 @@ def test_what_cannot_be_looked_into_ends_in_one_message(
 def test_several_files_are_several_records(folder: Path) -> None:
     for k in range(3):
         lorenz_csv(folder / f"run{k}.csv", seed=k)
-    overrides = ["+exp=discover", "data=recognised", "trajectory.states=[x,y,z]"]
-    run = run_config(composed(*overrides, "data.path=run*.csv", f"output={folder}")).folder
-    summary = json.loads((run / "summary.json").read_text())
-    log = (run / "run.log").read_text()
-    assert all(f"data: run{k}.csv; 3000 samples" in log for k in range(3))
-    rows = (run / "tables" / "records.csv").read_text().splitlines()
-    assert len(rows) == 4
-    assert summary["models"]["model"]["equations"]["x"]["terms"] == pytest.approx(
+    overrides = [
+        "+exp=discover", "data=recognised", "trajectory.states=[x,y,z]", f"output={folder}",
+        "search=best_subset", "selection=ebic",
+    ]  # fmt: skip
+    found = computed(composed(*overrides, "data.path=run*.csv"))
+    assert all(f"data: run{k}.csv; 1000 samples" in found.log for k in range(3))
+    assert len(found.outcome.tables()["records"]) == 3
+    assert found.summary["models"]["model"]["equations"]["x"]["terms"] == pytest.approx(
         {"x": -10.0, "y": 10.0}, rel=0.01
     )
-    one = run_config(composed(*overrides, "data.path=[run0.csv]", f"output={folder}")).folder
-    assert not (one / "tables" / "records.csv").exists()
+    one = computed(composed(*overrides, "data.path=[run0.csv]"))
+    assert "records" not in one.outcome.tables()
 
 
 def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:

@@ -9,16 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from ep2sindy.app import main as program
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.machine.threads import NUMBERS, one_thread
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.problem import Fit, Problem
-from ep2sindy.refinement.refine import refine
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.criteria import EBIC
@@ -29,6 +25,8 @@ PREY = lotka_volterra()
 
 @pytest.fixture(autouse=True)
 def two_threads() -> Iterator[None]:
+    import torch  # takes a second and more: for those alone who run these tests
+
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     with threadpool_limits(2):
@@ -38,17 +36,10 @@ def two_threads() -> Iterator[None]:
 
 def threads() -> tuple[int, int]:
     """Of NumPy's libraries, the most, and of PyTorch."""
+    import torch
+
     blas = (pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
     return max(blas), torch.get_num_threads()
-
-
-@dataclass(frozen=True)
-class WatchedFit(MultipleShooting):
-    seen: list[tuple[int, int]] = field(default_factory=list)
-
-    def fit(self, problem: Problem) -> Fit:
-        self.seen.append(threads())
-        return super().fit(problem)
 
 
 @dataclass(frozen=True)
@@ -75,6 +66,18 @@ def test_an_error_gives_the_threads_back() -> None:
 
 
 def test_a_refinement_runs_on_one_thread() -> None:
+    from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+    from ep2sindy.refinement.problem import Fit, Problem
+    from ep2sindy.refinement.refine import refine
+
+    @dataclass(frozen=True)
+    class WatchedFit(MultipleShooting):
+        seen: list[tuple[int, int]] = field(default_factory=list)
+
+        def fit(self, problem: Problem) -> Fit:
+            self.seen.append(threads())
+            return super().fit(problem)
+
     method = WatchedFit()
     rng = np.random.default_rng(0)
     refine(PREY.model, [PREY.trajectory()], window=40, n_windows=3, method=method, rng=rng)
