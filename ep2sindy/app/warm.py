@@ -16,6 +16,7 @@ from hashlib import sha256
 
 import ep2sindy as ep
 from ep2sindy.machine.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
+from ep2sindy.machine.progress import Bars
 
 ABOUT = """Compiles all kernels of the package, once after installation: half a minute on two cores.
 Runs of the command line do so by themselves; in Python, a call compiles what it uses."""
@@ -52,20 +53,15 @@ def _state() -> str:
 
 def _compile_side_by_side() -> None:
     """Each part in a process of its own; what fails there fails again in a run, and says why."""
-    from tqdm import tqdm
-
     n_kernels = sum(path.read_text("utf-8").count("\n@compiled") for path in sources())
     reader, writer = os.pipe()
     command = [sys.executable, "-m", "ep2sindy.app.warm"]
     parts = [subprocess.Popen([*command, part], stdout=writer) for part in PARTS]
     os.close(writer)
-    with (
-        open(reader, encoding="utf-8") as lines,
-        tqdm(total=n_kernels, unit="kernel", disable=None, leave=False) as bar,
-    ):
+    with open(reader, encoding="utf-8") as lines, Bars().stage(n_kernels, "kernel") as advance:
         names: set[str] = set()  # parts share some
         for name in lines:
-            bar.update(name not in names)
+            advance(int(name not in names))
             names.add(name)
     for part in parts:
         part.wait()
