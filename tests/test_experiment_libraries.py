@@ -105,7 +105,7 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
         "tables/front_velocity.csv",
         "tables/comparison.csv",
         "figures/data.png",
-        "figures/trajectories.pdf",
+        "figures/trajectories.png",
     } <= files
     assert any(name.startswith("tensorboard/events") for name in files)
     model = SparseModel.load(folder / "models" / "simple.json")

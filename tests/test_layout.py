@@ -165,8 +165,8 @@ def test_files_and_functions_stay_short() -> None:
     long: list[str] = []
     for module, path in PATHS.items():
         n_lines = len(path.read_text(encoding="utf-8").splitlines())
-        if n_lines > 300:
-            long.append(f"{module} holds {n_lines} lines, over 300")
+        if n_lines > 500:
+            long.append(f"{module} holds {n_lines} lines, over 500")
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.FunctionDef):
                 n_lines = (node.end_lineno or node.lineno) - node.lineno + 1

@@ -268,7 +268,7 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
         [run], states=("x", "y"), inputs=(), n_windows=3, window=50, rng=np.random.default_rng(0)
     )
     both = Ensemble(PREY.model.library, ["x", "y"], np.repeat(off.coef[:, :, None], 2, axis=2))
-    found = _refined(both, batch, [unconstrained(off)] * 2)
+    found = _refined(both, batch, [unconstrained(off)] * 2, lambda n_more: None)
     np.testing.assert_array_equal(found.coef[:, :, 0], PREY.model.coef)
     np.testing.assert_array_equal(found.coef[:, :, 1], off.coef)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -40,20 +41,7 @@ def main() -> None:
     failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
     try:
         conf = conf_folder()
-        if sys.argv[1:2] == ["compare"]:
-            from ep2sindy.app.compare import main as compare_runs
-
-            compare_runs(sys.argv[2:])
-            return
-        if sys.argv[1:2] == ["inspect"]:
-            from ep2sindy.app.inspection import main as inspect_files
-
-            inspect_files(sys.argv[2:], conf)
-            return
-        if sys.argv[1:2] == ["warm"]:
-            from ep2sindy.app.warm import main as compile_kernels
-
-            compile_kernels(sys.argv[2:])
+        if command(sys.argv[1:], conf):
             return
         prepare_arguments(conf)
 
@@ -81,6 +69,24 @@ def main() -> None:
             print(index_text(sweep))
     if failed:
         sys.exit(f"error: {failed[0]}" if len(failed) == 1 else f"error: {len(failed)} jobs failed")
+
+
+def command(arguments: Sequence[str], conf: Path) -> bool:
+    """Whether the first argument names a command, which has been carried out then."""
+    name, rest = "".join(arguments[:1]), arguments[1:]
+    if name == "compare":
+        from ep2sindy.app.compare import main as compare_runs
+
+        compare_runs(rest)
+    elif name == "inspect":
+        from ep2sindy.app.inspection import main as inspect_files
+
+        inspect_files(rest, conf)
+    elif name == "warm":
+        from ep2sindy.app.warm import main as compile_kernels
+
+        compile_kernels(rest)
+    return name in ("compare", "inspect", "warm")
 
 
 def conf_folder() -> Path:

@@ -152,7 +152,7 @@ def started_run(config: DictConfig) -> Iterator[Run]:
 
 
 def write(
-    run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str]
+    run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str] = ("png",)
 ) -> dict[str, float]:
     """Everything of an outcome into the run folder; what no view may lose comes first."""
     folder, models = run.folder, outcome.models()

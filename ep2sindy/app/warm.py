@@ -14,9 +14,12 @@ from contextlib import suppress
 from functools import partial
 from hashlib import sha256
 
+import numpy as np
+
 import ep2sindy as ep
 from ep2sindy.machine.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
 from ep2sindy.machine.progress import Bars
+from ep2sindy.model.many import DrivenWindows, Ensemble
 
 ABOUT = """Compiles all kernels of the package, once after installation: half a minute on two cores.
 Runs of the command line do so by themselves; in Python, a call compiles what it uses."""
@@ -82,7 +85,14 @@ def _refinement() -> None:
     brief = partial(ep.simulate, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
     brief(ep.Thruster(), point, n_cells=20, progress=False)
     system = ep.lotka_volterra()
-    ep.refine(system.model, [system.trajectory()], window=20, n_windows=2, rng=0)
+    for step in (ep.RungeKutta(), ep.HermiteSimpson()):
+        method = ep.MultipleShooting(step=step)
+        ep.refine(system.model, [system.trajectory()], window=20, n_windows=2, method=method, rng=0)
+    model = system.model
+    windows = DrivenWindows.free(np.ones((2, 1)), step_s=0.1, n_samples=3)
+    Ensemble(model.library, model.states, model.coef[..., None]).paths(
+        windows, centre=np.ones(2), spread=np.ones(2)
+    )
 
 
 def _plane() -> None:

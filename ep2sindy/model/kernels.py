@@ -23,13 +23,25 @@ EXPONENT = -1.0 / 8.0  # of the error that chooses a step; its estimate is of se
 
 
 @compiled(error_model="numpy")
+def _add_terms(table, coef, columns, slope):
+    """Slopes of all states, from zero: each term, the product of its columns, times its coef."""
+    for i in range(len(slope)):
+        slope[i] = 0.0
+    for k in range(len(table)):
+        value = columns[table[k, 0]]
+        for factor in range(1, table.shape[1]):
+            value *= columns[table[k, factor]]
+        for i in range(len(slope)):
+            slope[i] += value * coef[k, i]
+
+
+@compiled(error_model="numpy")
 def rates(equations, t, y, columns, slope):
     """The right-hand side at one state, into `slope`; columns is room for values in SI."""
     table, coef, scale, breaks, pieces = equations
     n, n_inputs = len(y), pieces.shape[2]
     for i in range(n):
         columns[i] = y[i] * scale[i]
-        slope[i] = 0.0
     if n_inputs:
         place, above = 0, pieces.shape[1]
         while above - place > 1:  # by halves: the span that t is in
@@ -44,12 +56,7 @@ def rates(equations, t, y, columns, slope):
             for power in range(len(pieces)):
                 value = value * since + pieces[power, place, j]
             columns[n + j] = value
-    for k in range(len(table)):
-        value = columns[table[k, 0]]
-        for factor in range(1, table.shape[1]):
-            value *= columns[table[k, factor]]
-        for i in range(n):
-            slope[i] += value * coef[k, i]
+    _add_terms(table, coef, columns, slope)
 
 
 @compiled(error_model="numpy")
@@ -199,59 +206,56 @@ def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, 
 
 
 @compiled(error_model="numpy")
+def _runge_kutta(table, coef, drive, h, x, total, slope, columns):
+    """One classical step of length h, x in place. drive: (inputs, 3), start, middle and end.
+
+    Source: Hairer, Norsett & Wanner 1993, II.1.
+    """
+    n = len(x)
+    for stage in range(4):
+        ahead = 0.5 * h if stage < 3 else h
+        for i in range(n):
+            columns[i] = x[i] + ahead * slope[i] if stage else x[i]
+        for j in range(len(drive)):
+            columns[n + j] = drive[j, (stage + 1) // 2]
+        _add_terms(table, coef, columns, slope)
+        for i in range(n):
+            if stage == 0:
+                total[i] = slope[i]
+            else:
+                total[i] += (2.0 if stage < 3 else 1.0) * slope[i]
+    for i in range(n):
+        x[i] = x[i] + h / 6.0 * total[i]
+
+
+@compiled(error_model="numpy")
 def run_many(table, coefs, start, steps_s, drive, n_substeps, centre, reach):
     """Many models from many starts, by classical Runge-Kutta steps: states and what is bounded.
 
-    table: as above. coefs: (terms, states, models); start: (states, windows); steps_s: (steps,
-    windows); drive: (inputs, steps, 3, windows), at the start, middle and end of a step. Returns
-    states (samples, states, models, windows) after every `n_substeps`, and (samples, models,
-    windows), whether all have kept within reach (states,) of the centre; one that has not stays
-    where it last was. Source of the scheme: Hairer, Norsett & Wanner 1993, II.1.
+    coefs: (models, terms, states); start: (windows, states); steps_s: (windows, steps); drive:
+    (windows, steps, inputs, 3). Returns states (samples, states, models, windows) after every
+    n_substeps steps, and (samples, models, windows), whether all have kept within reach (states,)
+    of the centre; a run that has not stays where it last was.
     """
-    n, n_models, n_windows = start.shape[0], coefs.shape[2], start.shape[1]
-    n_inputs, n_samples = drive.shape[0], len(steps_s) // n_substeps
+    n_windows, n = start.shape
+    n_models, n_samples = len(coefs), steps_s.shape[1] // n_substeps
     paths = np.empty((n_samples, n, n_models, n_windows))
     inside = np.empty((n_samples, n_models, n_windows), dtype=np.bool_)
-    x, moved, total = np.empty(n), np.empty(n), np.empty(n)
-    slope, columns = np.empty(n), np.ones(n + n_inputs + 1)
+    x, last = np.empty(n), np.empty(n)
+    total, slope, columns = np.empty(n), np.empty(n), np.ones(n + drive.shape[2] + 1)
     for m in range(n_models):
         for w in range(n_windows):
             bounded = True
             for i in range(n):
-                x[i] = start[i, w]
+                x[i] = last[i] = start[w, i]
             for k in range(n_samples):
+                for step in range(k * n_substeps, (k + 1) * n_substeps * bounded):
+                    at, h = drive[w, step], steps_s[w, step]
+                    _runge_kutta(table, coefs[m], at, h, x, total, slope, columns)
                 for i in range(n):
-                    moved[i] = x[i]
-                for step in range(k * n_substeps, (k + 1) * n_substeps):
-                    if not bounded:
-                        break
-                    h = steps_s[step, w]
-                    for stage in range(4):
-                        ahead = 0.0 if stage == 0 else (0.5 * h if stage < 3 else h)
-                        for i in range(n):
-                            columns[i] = moved[i] + ahead * slope[i] if stage else moved[i]
-                        for j in range(n_inputs):
-                            columns[n + j] = drive[j, step, (stage + 1) // 2, w]
-                        for i in range(n):
-                            slope[i] = 0.0
-                        for term in range(len(table)):
-                            value = columns[table[term, 0]]
-                            for factor in range(1, table.shape[1]):
-                                value *= columns[table[term, factor]]
-                            for i in range(n):
-                                slope[i] += coefs[term, i, m] * value
-                        for i in range(n):
-                            if stage == 0:
-                                total[i] = slope[i]
-                            else:
-                                total[i] += (2.0 if stage < 3 else 1.0) * slope[i]
-                    for i in range(n):
-                        moved[i] = moved[i] + h / 6.0 * total[i]
+                    bounded = bounded and abs(x[i] - centre[i]) <= reach[i]
                 for i in range(n):
-                    bounded = bounded and abs(moved[i] - centre[i]) <= reach[i]
-                for i in range(n):
-                    if bounded:
-                        x[i] = moved[i]
-                    paths[k, i, m, w] = x[i]
+                    last[i] = x[i] if bounded else last[i]
+                    paths[k, i, m, w] = last[i]
                 inside[k, m, w] = bounded
     return paths, inside

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -159,15 +159,19 @@ class Ensemble:
         """
         library, coef = self._used
         if not library.functions:
-            known = [*self.states, *self.inputs]
-            yield from zip(
-                *kernels.run_many(
-                    library.columns_of(known), np.ascontiguousarray(coef),
-                    np.ascontiguousarray(windows.start), windows.steps_s, windows.drive,
-                    N_SUBSTEPS, centre[:, 0, 0], BLOW_UP * spread[:, 0, 0],
-                ),
-                strict=True,
-            )  # fmt: skip
+            # Copied in one order: of other orders, kernels would be compiled anew.
+            copied = partial(np.array, order="C")
+            paths, inside = kernels.run_many(
+                library.columns_of([*self.states, *self.inputs]),
+                copied(coef.transpose(2, 0, 1)),
+                copied(windows.start.T),
+                copied(windows.steps_s.T),
+                copied(windows.drive.transpose(3, 1, 0, 2)),
+                N_SUBSTEPS,
+                copied(centre[:, 0, 0]),
+                BLOW_UP * spread[:, 0, 0],
+            )
+            yield from zip(paths, inside, strict=True)
             return
         # States first: each operation then runs along models and windows, in one stretch.
         x = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)

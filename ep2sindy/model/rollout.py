@@ -234,7 +234,8 @@ def _scaled_rhs(model: Equations, drive: Drive | None, scale: np.ndarray) -> Rat
     present = np.flatnonzero(model.coef.any(axis=1))
     coef, known = model.coef[present] / scale, [*model.states, *model.inputs]
     curves = spline_pieces(drive, len(model.inputs))
-    if curves is not None and not model.library.take(present).functions:
+    uses_functions = model.library.exponents[present, len(model.library.variables) :].any()
+    if curves is not None and not uses_functions:
         return Products(model.library.columns_of(known, present), coef, scale, *curves)
     values, terms = model.library.at_points(known, present)
     n = len(model.states)

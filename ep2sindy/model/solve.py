@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from time import monotonic
 
 import numpy as np
@@ -43,15 +43,16 @@ class Products:
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         from ep2sindy.model import kernels
 
-        slope = np.empty(len(y))
-        columns = np.ones(len(y) + self.pieces.shape[2] + 1)
-        kernels.rates(self.parts, float(t), np.asarray(y), columns, slope)
+        slope, columns = np.empty(len(y)), np.ones(len(y) + self.pieces.shape[2] + 1)
+        # Copied: of a column or of what is read only, kernels would be compiled anew.
+        kernels.rates(self.parts, float(t), np.array(y), columns, slope)
         return slope
 
-    @property
+    @cached_property
     def parts(self) -> tuple[np.ndarray, ...]:
         """What compiled functions take: see `model.kernels`."""
-        return self.table, self.coef, self.scale, self.breaks, self.pieces
+        parts = self.table, self.coef, self.scale, self.breaks, self.pieces
+        return tuple(np.array(part, order="C") for part in parts)
 
 
 @cache
@@ -230,7 +231,7 @@ def _compiled_stage(
     from ep2sindy.model import kernels
 
     assert isinstance(rhs.rates, Products)
-    equations, times = rhs.rates.parts, np.ascontiguousarray(t)
+    equations, times = rhs.rates.parts, np.array(t)
     now, state, out = float(t[0]), np.array(y), np.empty((len(t), len(y)))
     slope = rhs.rates(now, state)
     h = _first_step(rhs.rates, now, float(t[-1]) - now, state, slope, rtol)
