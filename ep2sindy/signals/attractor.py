@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import read_only
-from ep2sindy.signals.spectrum import dominant_frequency, is_uniform, power_spectrum
+from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
 
 LEAST_PERIODS = 3.0  # of a record that can be said to repeat
 
@@ -79,7 +79,8 @@ def find_cycle(
     if not (spread > 1e-9 * np.abs(states).max(axis=0)).any():
         return None
     scaled = (states - states.mean(axis=0)) / zero_to_one(spread)
-    lines = [_line(t, column) for column in scaled.T]
+    spectra = [power_spectrum(t, column) for column in scaled.T]
+    lines = [_line(*spectrum) for spectrum in spectra]
     leader = int(np.argmax([sharpness for _, sharpness in lines]))
     rough_Hz = lines[leader][0]
     if not rough_Hz * (t[-1] - t[0]) >= LEAST_PERIODS:
@@ -98,7 +99,7 @@ def find_cycle(
     whole = np.square(scaled).sum(axis=0)
     if not (whole - rest >= LEAST_VISIBLE * whole).any():
         return None
-    noise = len(t) * np.array([white_variance(t, column) for column in scaled.T])
+    noise = len(t) * np.array([_white_variance(*spectrum) for spectrum in spectra])
     known = np.maximum(whole - noise, 1e-12)
     share = 1.0 - float(np.maximum(rest - noise, 0.0).sum() / known.sum())
     if not (share >= LEAST_SHARE and frequency_Hz > 0.0):
@@ -112,12 +113,11 @@ def find_cycle(
     )
 
 
-def _line(t: np.ndarray, column: np.ndarray) -> tuple[float, float]:
-    """Dominant frequency in Hz, and the share of the power within two bins of it."""
-    rough_Hz = dominant_frequency(t, column)
+def _line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
+    """Dominant frequency in Hz of a spectrum, and the share of the power within two bins of it."""
+    rough_Hz = peak(frequency, power)
     if rough_Hz <= 0.0:
         return 0.0, 0.0
-    frequency, power = power_spectrum(t, column)
     near = np.abs(frequency - rough_Hz) <= 2.5 * frequency[1]
     return rough_Hz, float(power[near].sum() / power.sum())
 
@@ -127,7 +127,10 @@ def white_variance(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samp
 
     The median of the power there: lines of a signal do not move it.
     """
-    frequency, power = power_spectrum(t, x)
+    return _white_variance(*power_spectrum(t, x))
+
+
+def _white_variance(frequency: np.ndarray, power: np.ndarray) -> float:
     upper = power[len(power) // 2 :]
     return float(np.median(upper) / np.log(2.0) * frequency[-1]) if upper.size else 0.0
 

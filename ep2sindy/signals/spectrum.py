@@ -42,7 +42,11 @@ def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
     A parabola through the log power of the peak and its neighbours: for a Hann window and a
     pure tone the error is below 2 % of a bin. Zero for a signal that does not change.
     """
-    frequency, power = power_spectrum(t, x)
+    return peak(*power_spectrum(t, x))
+
+
+def peak(frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"]) -> float:
+    """Frequency in Hz of the highest peak of a power spectrum: see `dominant_frequency`."""
     if len(power) < 4 or power.max() <= 0.0:
         return 0.0
     k = int(np.clip(np.argmax(power[1:]) + 1, 2, len(power) - 2))

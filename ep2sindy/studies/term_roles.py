@@ -100,16 +100,19 @@ def term_roles(
     """
     model, expected = found.model, compared.expected(data, length_m)
     support = {state: list(model.terms(state)) for state in model.states}
-    roles = []
+    roles, window = [], two_periods(train)
     terms = [(s, term, coef) for s in model.states for term, coef in model.terms(s).items()]
     for state, term, coef in counted(progress, terms, "term", "models without a term"):
         less = support | {state: [name for name in support[state] if name != term]}
-        run = _run(found, less, (), train, held, bounds, progress) if less[state] else None
+        run = None
+        if less[state]:
+            run = _run(found, less, (), train, held, bounds, progress, window=window)
         roles.append(Role(state, term, coef, expected.get((state, term)), run))
     product = f"{compared.ions}*{compared.neutrals}"
     relation = parse_relation(f"{compared.ions}: {product} == -1 * {compared.neutrals}: {product}")
     both = {state: list(dict.fromkeys([*terms, product])) for state, terms in support.items()}
-    return Roles(roles, _run(found, both, (relation,), train, held, bounds, progress))
+    shared = _run(found, both, (relation,), train, held, bounds, progress, window=window)
+    return Roles(roles, shared)
 
 
 def _run(
@@ -120,12 +123,14 @@ def _run(
     held: Trajectory,
     bounds: Bounds,
     progress: Progress,
+    *,
+    window: int | None,
 ) -> FreeRun | None:
-    """These terms fitted, refined on windows of two periods, and run; None if they cannot be."""
+    """These terms fitted, refined on windows of so many samples, and run; None if they cannot."""
     held_to = constraint(found.model.library, support, relations)
     problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
     start = constrained_fit(problems, held_to, units=train.units)
-    refined = _refined(start, held_to, train, progress)
+    refined = _refined(start, held_to, train, progress, window=window)
     if refined.status == "non_finite":
         return None
     initial = start_of(held, refined.model)
@@ -133,14 +138,19 @@ def _run(
 
 
 def _refined(
-    start: SparseModel, held_to: Constraint, train: Trajectory, progress: Progress
+    start: SparseModel,
+    held_to: Constraint,
+    train: Trajectory,
+    progress: Progress,
+    *,
+    window: int | None,
 ) -> Refinement:
     from ep2sindy.refinement.refine import refine  # torch, for those alone who refine
 
     return refine(
         start,
         [train],
-        window=two_periods(train),
+        window=window,
         constraint=held_to,
         n_reweights=0,
         rng=0,
