@@ -38,7 +38,8 @@ def warm() -> None:
     if stamp.is_file() and stamp.read_text("utf-8") == state:
         return
     print(ANNOUNCEMENT, file=sys.stderr, flush=True)
-    _compile_side_by_side()
+    if not _compiled_side_by_side():
+        return
     with suppress(OSError):  # a disk that takes no more costs the next run this half minute again
         stamp.parent.mkdir(parents=True, exist_ok=True)
         stamp.write_text(state, "utf-8")
@@ -54,9 +55,11 @@ def _state() -> str:
     return sha256(repr((files, versions)).encode()).hexdigest()
 
 
-def _compile_side_by_side() -> None:
-    """Each part in a process of its own; what fails there fails again in a run, and says why."""
-    n_kernels = sum(path.read_text("utf-8").count("\n@compiled") for path in sources())
+def _compiled_side_by_side() -> bool:
+    """Whether all parts, each in a process of its own, ended well; one that fails says why."""
+    inlined = '\n@compiled(inline="always")'  # part of those that call them
+    texts = [path.read_text("utf-8") for path in sources()]
+    n_kernels = sum(text.count("\n@compiled") - text.count(inlined) for text in texts)
     reader, writer = os.pipe()
     command = [sys.executable, "-m", "ep2sindy.app.warm"]
     parts = [subprocess.Popen([*command, part], stdout=writer) for part in PARTS]
@@ -66,8 +69,8 @@ def _compile_side_by_side() -> None:
         for name in lines:
             advance(int(name not in names))
             names.add(name)
-    for part in parts:
-        part.wait()
+    statuses = [part.wait() for part in parts]
+    return not any(statuses)
 
 
 def _search() -> None:
@@ -81,9 +84,10 @@ def _search() -> None:
 
 def _refinement() -> None:
     """Refinement, trial runs, and the simulator along the axis."""
-    point, step_s = ep.OperatingPoint(300.0, 5.0), 1e-6
-    brief = partial(ep.simulate, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
-    brief(ep.Thruster(), point, n_cells=20, progress=False)
+    point, step_s = ep.OperatingPoint(300.0, 5.0), 1e-7
+    for n_samples in (20, 60):  # in one piece, and in several, which are slices
+        brief = partial(ep.simulate, duration_s=n_samples * step_s, warm_up_s=0.0, sample_s=step_s)
+        brief(ep.Thruster(), point, n_cells=20, progress=False)
     system = ep.lotka_volterra()
     for step in (ep.RungeKutta(), ep.HermiteSimpson()):
         method = ep.MultipleShooting(step=step)

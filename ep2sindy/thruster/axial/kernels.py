@@ -74,17 +74,15 @@ def add_changes(sums, state, sign):
 
 
 @compiled(**ENTRY)
-def advance(state, model, sample_s, averaged, fields, series, first, stop):
-    """Fill rows `first` to `stop` of fields (cell sums, rows, cells) and series (rows, series).
-
-    Returns how many it filled. The arrays come whole: of slices, kernels would be compiled anew.
+def advance(state, model, sample_s, averaged, fields, series):
+    """Fill the rows of fields (cell sums, rows, cells) and series (rows, series); return how many.
 
     Averages over each sample, or the values at its end. Rows before the one that breaks stay.
     """
     size = state.n_n.size
     work, rows = np.zeros((26, size)), np.zeros(size, np.uint64)
     sums = Sums(np.zeros((fields.shape[0], size)), np.zeros(series.shape[1]))
-    for row in range(first, stop):
+    for row in range(series.shape[0]):
         start_density(state)
         sums.cells[:] = 0.0
         sums.series[:] = 0.0
@@ -97,10 +95,10 @@ def advance(state, model, sample_s, averaged, fields, series, first, stop):
                 sums.series[:] = 0.0
                 weight = dt
             if not dt > SHORTEST_STEP * sample_s:
-                return row - first
+                return row
             heavy_step(state, model, dt, sums, work)
             if not electron_step(state, model, dt, rows, work):
-                return row - first
+                return row
             add_instant(sums, state, dt, work)
             left -= dt
         add_changes(sums, state, 1.0)
@@ -112,4 +110,4 @@ def advance(state, model, sample_s, averaged, fields, series, first, stop):
                 fields[k, row, i] = sums.cells[k, i + 1] / weight
         for k in range(series.shape[1]):
             series[row, k] = sums.series[k] / weight
-    return stop - first
+    return series.shape[0]

@@ -164,7 +164,7 @@ def run(model: Model, beginning: Beginning, settings: Settings, advance: Advance
     before, state.hottest_eV[0] = stored_energy(state, model), 0.0
     fields = np.empty((n_fields, n_samples if whole else 0, size - 2), np.float32)
     series = np.empty((fields.shape[1], len(SERIES_SUMS)))
-    filled = _fill(model, state, settings, fields, series, len(series), advance)
+    filled = _fill(model, state, settings, fields, series, advance)
     return Record(
         fields[:, :filled],
         series[:filled],
@@ -189,7 +189,7 @@ def _pass(
     series = np.empty((CHUNK_ROWS, len(SERIES_SUMS)))
     while n_rows > 0:
         n = min(n_rows, CHUNK_ROWS)
-        if _fill(model, state, settings, fields, series, n, advance) < n:
+        if _fill(model, state, settings, fields[:, :n], series[:n], advance) < n:
             return False
         n_rows -= n
     return True
@@ -201,19 +201,18 @@ def _fill(
     settings: Settings,
     fields: Float[np.ndarray, "sums samples cells"],
     series: Float[np.ndarray, "samples series"],
-    n_rows: int,
     advance: Advance,
 ) -> int:
-    """Advance and record n_rows samples, or until the run breaks; how many samples it took."""
+    """Advance and record until the arrays are full or the run breaks; how many samples it took."""
     filled = 0
-    while filled < n_rows:
-        stop = min(filled + CHUNK_ROWS, n_rows)
+    while filled < len(series):
+        part = slice(filled, filled + CHUNK_ROWS)
         done = kernels.advance(
-            state, model, settings.sample_s, settings.averaged, fields, series, filled, stop
+            state, model, settings.sample_s, settings.averaged, fields[:, part], series[part]
         )
-        advance(done)
         filled += done
-        if filled < stop:
+        advance(done)
+        if done < len(series[part]):
             break
     return filled
 

@@ -1,0 +1,108 @@
+"""Kernels are compiled once, and a run says at once what it is."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from ep2sindy.app import warm
+from ep2sindy.machine import compilation
+
+
+@pytest.fixture
+def compilations(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[bool]:
+    """What comes of each compilation, the next one first; the stamp lies in `tmp_path`."""
+    outcomes = [True, True, True]
+    monkeypatch.setattr(warm, "kept_in", lambda: tmp_path / "kernels")
+    monkeypatch.setattr(warm, "_compiled_side_by_side", lambda: outcomes.pop(0))
+    return outcomes
+
+
+def test_kernels_are_compiled_once_and_said_to_be(
+    compilations: list[bool], capsys: pytest.CaptureFixture[str]
+) -> None:
+    warm.warm()
+    assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
+    warm.warm()
+    assert capsys.readouterr().err == ""
+    assert len(compilations) == 2
+
+
+def test_kernels_are_compiled_again_where_a_source_has_changed(
+    compilations: list[bool], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    source = tmp_path / "my_kernels.py"
+    source.write_text("one")
+    monkeypatch.setattr(warm, "sources", lambda: [source])
+    warm.warm()
+    source.write_text("longer")
+    warm.warm()
+    assert len(compilations) == 1
+
+
+def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None:
+    compilations.insert(0, False)
+    warm.warm()
+    warm.warm()
+    assert len(compilations) == 2
+
+
+def test_a_folder_that_cannot_be_written_costs_no_run(
+    compilations: list[bool], tmp_path: Path
+) -> None:
+    (tmp_path / "kernels").write_text("a file")
+    warm.warm()
+    assert len(compilations) == 2
+
+
+def test_kernels_of_the_package_alone_are_told_and_in_place_of_the_announcement(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names: list[str] = []
+    monkeypatch.setattr(compilation, "_TOLD", [])
+    compilation.tell_each_kernel(names.append)
+    listener = compilation._Listener()
+    for module in ("ep2sindy.model.kernels", "numba.np.arrayobj"):
+        event = SimpleNamespace(
+            data={"dispatcher": SimpleNamespace(__module__=module, __name__="f")}
+        )
+        listener.on_start(event)
+        listener.on_end(event)
+    assert names == ["ep2sindy.model.kernels.f"]
+    assert capsys.readouterr().err == ""
+
+
+def test_a_call_that_compiles_says_so_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(compilation, "_TOLD", [])
+    listener, event = compilation._Listener(), SimpleNamespace(data={})
+    for _ in range(3):
+        listener.on_start(event)
+        listener.on_end(event)
+    assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
+
+
+@pytest.mark.slow
+def test_every_kernel_is_compiled_and_then_none_is(tmp_path: Path) -> None:
+    """From nothing; and a search, a refinement and a simulation find all that they call."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "ep2sindy.app.main", "warm"]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert compilation.ANNOUNCEMENT in run.stderr
+    kept = {path.name.split("-")[0] for path in tmp_path.rglob("*.nbi")}
+    texts = {path.stem: path.read_text("utf-8").split("\n@compiled")[1:] for path in warm.sources()}
+    names = {
+        f"{stem}.{part.split('def ', 1)[1].split('(', 1)[0]}"
+        for stem, parts in texts.items()
+        for part in parts
+        if not part.startswith('(inline="always")')  # part of those that call them
+    }
+    assert names - kept == set()
+    again = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert again.stderr == ""
