@@ -53,6 +53,7 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.simulator
 	$(BIN)/python -m benchmarks.simulator_2d
 	$(BIN)/python -m benchmarks.source
+	$(BIN)/python -m benchmarks.free_runs
 	$(BIN)/python -m benchmarks.hallthruster
 	$(BIN)/python -m benchmarks.refine
 	$(BIN)/python -m benchmarks.intervals
