@@ -283,7 +283,9 @@ def _are_close(before: list[Any], now: list[Any], share: float) -> bool:
         one, other = (np.array(values, dtype=np.float64) for values in (before, now))
     except (TypeError, ValueError):
         return False
-    allowed = share * np.maximum(np.nanstd(one), np.maximum(np.abs(one), 1e-3))
+    known = one[np.isfinite(one)]
+    spread = known.std() if known.size else 0.0
+    allowed = share * np.maximum(spread, np.maximum(np.abs(one), 1e-3))
     both = np.isnan(one) & np.isnan(other)
     return one.ndim == 1 and bool((both | (np.abs(one - other) <= allowed)).all())
 

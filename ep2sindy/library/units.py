@@ -142,6 +142,8 @@ class Clock:
 
         Raises ValueError for what is no unit of time.
         """
+        if unit == "s":
+            return SECONDS
         try:
             check_unit(unit)
             seconds = float(registry().Quantity(1.0, unit).to("s").magnitude)
