@@ -9,6 +9,7 @@ Only Hydra is imported here: `--help` must not wait for the numerics.
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import sys
@@ -33,6 +34,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 def main() -> None:
     """Errors of the user's making end in one message; all others keep their traceback."""
     gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
+    atexit.register(gc.freeze)  # to look through them all once more at the end takes a second
     sys.path.insert(0, os.getcwd())  # as `python -m` does: studies and functions of one's own
     end_as_interrupted()
     start_on_one_thread()

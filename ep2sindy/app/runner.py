@@ -21,7 +21,7 @@ from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
 from ep2sindy.machine.own import own_module
-from ep2sindy.machine.progress import counted
+from ep2sindy.machine.progress import Bars, counted
 from ep2sindy.report.about import ASIDE, About, asked_of, by_place
 from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
@@ -46,10 +46,14 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     overrides: what was set on the command line; one that the study does not use is an error.
     """
     check_common(config)
-    check_targets(config)
-    kind = study_class(config.get("study"))
-    check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
-    study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
+    with Bars().stage(3, "step", "loading") as advance:
+        check_targets(config)
+        advance(1)
+        kind = study_class(config.get("study"))
+        advance(1)
+        check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
+        study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
+        advance(1)
     warm()
     with started_run(config) as run:
         outcome = study.compute(run)
