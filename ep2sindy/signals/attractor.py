@@ -83,9 +83,9 @@ def find_cycle(
     lines = [_line(*spectrum) for spectrum in spectra]
     leader = int(np.argmax([sharpness for _, sharpness in lines]))
     rough_Hz = lines[leader][0]
-    if not rough_Hz * (t[-1] - t[0]) >= LEAST_PERIODS:
-        return None
     n_periods = rough_Hz * (t[-1] - t[0])
+    if not n_periods >= LEAST_PERIODS:
+        return None
     most = _most_harmonics(len(t), n_periods) if n_harmonics is None else n_harmonics
     phase = 2.0 * np.pi * rough_Hz * (t - t[0])
     for _ in range(3):
