@@ -87,13 +87,7 @@ def find_cycle(
     if not n_periods >= LEAST_PERIODS:
         return None
     most = _most_harmonics(len(t), n_periods) if n_harmonics is None else n_harmonics
-    phase = 2.0 * np.pi * rough_Hz * (t - t[0])
-    for _ in range(3):
-        phase = _sharpened(t, phase, scaled, 1)
-    if n_periods >= 2.0 * PERIODS_TRACKED:
-        phase = phase + _drift(t, scaled[:, leader], phase)
-    for _ in range(2):
-        phase = _sharpened(t, phase, scaled, most)
+    phase = _phase(t, scaled, leader, rough_Hz, most)
     frequency_Hz = float(np.polynomial.Polynomial.fit(t, phase, 1).convert().coef[1]) / (2 * np.pi)
     series, rest = _series(phase, scaled, most, chosen=n_harmonics is None)
     whole = np.square(scaled).sum(axis=0)
@@ -111,6 +105,20 @@ def find_cycle(
         harmonics=(series[1::2] - 1j * series[2::2]) * spread,
         share=share,
     )
+
+
+def _phase(
+    t: np.ndarray, scaled: np.ndarray, leader: int, rough_Hz: float, most: int
+) -> np.ndarray:
+    """Phase at every sample, from a rough frequency of the leading state, by up to `most` terms."""
+    phase = 2.0 * np.pi * rough_Hz * (t - t[0])
+    for _ in range(3):
+        phase = _sharpened(t, phase, scaled, 1)
+    if rough_Hz * (t[-1] - t[0]) >= 2.0 * PERIODS_TRACKED:
+        phase = phase + _drift(t, scaled[:, leader], phase)
+    for _ in range(2):
+        phase = _sharpened(t, phase, scaled, most)
+    return phase
 
 
 def _line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
