@@ -1,6 +1,8 @@
 """What all tests share."""
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from ep2sindy.app.warm import warm
+from ep2sindy.report import folder
 
 # Workers share the cores: threads of their own would only get in each other's way.
 threadpool_limits(1)
@@ -18,6 +21,24 @@ def pytest_configure(config: pytest.Config) -> None:
     """Before workers start; a run of one process compiles as it goes."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
         warm()
+
+
+def pytest_collection_finish() -> None:
+    """What is loaded by now stays: garbage is looked for among what tests make."""
+    gc.freeze()
+
+
+def pytest_unconfigure() -> None:
+    """At the end nothing is looked for any more."""
+    gc.freeze()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def coarse_figures() -> Iterator[None]:
+    """Files of figures have few pixels, for nobody looks at them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(folder, "DPI", 40)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -148,6 +148,7 @@ def betrayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     return kind, (folder / "notes").read_text("utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noted", [noted for _, noted in SONGS.values()], ids=SONGS)
 def test_a_config_that_runs_something_is_betrayed(noted: str, betrayed: tuple[str, str]) -> None:
     """A module of one's own may be run, and stands here for what must not be."""

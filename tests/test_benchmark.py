@@ -58,7 +58,9 @@ def outcomes_of(**settings) -> pd.DataFrame:
     return benchmark(**(defaults | settings)).drop(columns="cpu_s")
 
 
-@pytest.mark.parametrize("name", ["oscillator", "lotka_volterra"])
+@pytest.mark.parametrize(
+    "name", ["oscillator", pytest.param("lotka_volterra", marks=pytest.mark.slow)]
+)
 def test_a_seed_fixes_every_realization(name: str) -> None:
     (first, (run,)), (again, (same,)) = (realization(name, 0.05, 3, seed=1) for _ in range(2))
     np.testing.assert_array_equal(run.states, same.states)
@@ -98,6 +100,7 @@ def test_leaving_a_variant_out_changes_no_other() -> None:
     pd.testing.assert_frame_equal(kept, outcomes_of(variants={"BALASSO": BALASSO}))
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_changes_nothing() -> None:
     settings = {"variants": {"BALASSO": BALASSO, "STLSQ": STLSQ_}}
     pd.testing.assert_frame_equal(

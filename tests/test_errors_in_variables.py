@@ -82,7 +82,11 @@ def test_noise_in_a_linear_term_does_not_shrink_its_coefficient() -> None:
     assert np.mean(ratios["followed"]) == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize("system", [lotka_volterra(), lorenz()], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "system",
+    [lotka_volterra(), pytest.param(lorenz(), marks=pytest.mark.slow)],
+    ids=lambda s: s.name,
+)
 def test_errors_are_of_the_size_that_the_covariance_says(system: System) -> None:
     scores = []
     for k in range(5):
@@ -138,7 +142,7 @@ def test_terms_that_cannot_explain_the_data_still_give_finite_rows() -> None:
     [
         pytest.param(None, Recipe(), id="None-joint"),
         pytest.param(None, Recipe(WeightedWeak()), id="None-regression"),
-        pytest.param("x", Recipe(), id="x-joint"),
+        pytest.param("x", Recipe(), id="x-joint", marks=pytest.mark.slow),
         pytest.param("x", Recipe(WeightedWeak()), id="x-regression"),
         pytest.param("x*y", Recipe(), id="x*y-joint", marks=pytest.mark.slow),
         pytest.param("x*y", Recipe(WeightedWeak()), id="x*y-regression"),

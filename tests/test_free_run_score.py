@@ -136,7 +136,7 @@ def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
     assert other.model.covariance is not None  # refined, too
 
 
-@pytest.mark.parametrize("zeta", [-0.01, 0.01])
+@pytest.mark.parametrize("zeta", [pytest.param(-0.01, marks=pytest.mark.slow), 0.01])
 def test_a_spiral_is_no_cycle_to_stay_on(zeta):
     # Fourteen periods whose amplitude changes by a third from third to third.
     system = replace(ep.damped_oscillator(zeta=zeta), rate_Hz=25.0)

@@ -413,8 +413,17 @@ def test_of_dependent_products_one_is_left_out_and_named() -> None:
             assert not usable_terms(problem)[library.index(f"cos({v})^2")]
 
 
-@pytest.mark.parametrize("noise", [0.0, pytest.param(0.05, marks=pytest.mark.slow), 0.1])
-@pytest.mark.parametrize("search", ["regression", "joint"])
+FAST = {("regression", 0.1), ("joint", 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("search", "noise"),
+    [
+        pytest.param(search, noise, marks=() if (search, noise) in FAST else pytest.mark.slow)
+        for search in ("regression", "joint")
+        for noise in (0.0, 0.05, 0.1)
+    ],
+)
 def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(search: str, noise: float) -> None:
     """theta' = w, w' = -g/L sin(theta); its energy w^2/2 - g/L cos(theta) stays."""
     system = ep.pendulum()
@@ -473,7 +482,7 @@ def test_a_joint_search_takes_a_function_of_ones_own(tanh: str) -> None:
     assert found.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, rel=0.02)
 
 
-@pytest.mark.parametrize("search", ["regression", "joint"])
+@pytest.mark.parametrize("search", ["regression", pytest.param("joint", marks=pytest.mark.slow)])
 def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
     """Decay with feed, s' = u - b s/(K + s), of some 1e18 and over microseconds."""
     K = 4e17

@@ -324,7 +324,13 @@ def test_draws_are_least_squares_on_repeated_rows() -> None:
     np.testing.assert_allclose(found.mean(axis=0), fit, rtol=1e-12)
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=name, marks=pytest.mark.slow if name == "constrained" else ())
+        for name, case in CASES.items()
+    ],
+)
 def test_draws_of_whitened_rows_spread_as_their_covariance_says(case: Case) -> None:
     run, rng = forced(**TRUTHS[0]), np.random.default_rng(0)
     noise = 0.03 * run.states.std(axis=0) * rng.normal(size=run.states.shape)
@@ -495,7 +501,10 @@ def test_a_record_of_few_blocks_is_refused(points: list[PointData]) -> None:
         results_of(points[:1], how)
 
 
-@pytest.mark.parametrize(("samples_per_period", "missed"), [(25, 0.012), (50, 0.0028)])
+@pytest.mark.parametrize(
+    ("samples_per_period", "missed"),
+    [(25, 0.012), pytest.param(50, 0.0028, marks=pytest.mark.slow)],
+)
 def test_smoothing_biases_least_squares_and_not_refinements(
     samples_per_period: int, missed: float
 ) -> None:

@@ -17,7 +17,12 @@ from ep2sindy.studies.pysindy_variants import (
 )
 from ep2sindy.synthetic.systems import lotka_volterra, van_der_pol
 
-METHODS = [PySINDyStlsq(), PySINDySsr(), PySINDyEnsemble(), PySINDyWeakForm()]
+METHODS = [
+    PySINDyStlsq(),
+    PySINDySsr(),
+    pytest.param(PySINDyEnsemble(), marks=pytest.mark.slow),
+    PySINDyWeakForm(),
+]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)

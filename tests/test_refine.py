@@ -349,7 +349,7 @@ def stiff(k_dt: float) -> tuple[SparseModel, Trajectory]:
     return model, Trajectory(t, solution.y.T, ["x", "y", "z"])
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.05])
 @pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 50.0])
 @pytest.mark.parametrize("step", [RungeKutta(), HermiteSimpson()])
 def test_stiff_model_is_right_or_says_that_it_is_not(

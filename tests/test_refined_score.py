@@ -86,7 +86,9 @@ WRONG = {
 
 
 @pytest.mark.parametrize(
-    ("system", "n_samples"), [(PREY, 600), (lorenz(), 600)], ids=["prey", "Lorenz"]
+    ("system", "n_samples"),
+    [(PREY, 600), pytest.param(lorenz(), 600, marks=pytest.mark.slow)],
+    ids=["prey", "Lorenz"],
 )
 def test_the_truth_is_selected_from_exact_samples(system: System, n_samples: int) -> None:
     run = system.trajectory().window(0, n_samples)
@@ -97,7 +99,7 @@ def test_the_truth_is_selected_from_exact_samples(system: System, n_samples: int
     assert max(scores.min() for scores in found) <= EXACT
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.05])
 def test_biased_coefficients_of_the_truth_are_mended(noise: float) -> None:
     # Unrefined, a needless term with good coefficients beats the truth with poor ones.
     run = PREY.trajectory(noise=noise, rng=np.random.default_rng(0))
@@ -186,7 +188,7 @@ def test_two_windows_refine_and_judge_by_turns() -> None:
     assert picked(RefinedScore(n_windows=2), fronts) == supports(PREY)
 
 
-@pytest.mark.parametrize("number", [2, 5])
+@pytest.mark.parametrize("number", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_windows_without_a_jump_do_not_decide_alone(number: int) -> None:
     # Half of the windows of a slow relaxation oscillator hold none of its two or three jumps, and
     # any multiple of the fast equation follows them.

@@ -58,7 +58,9 @@ def agreement(found: Regimes, truth: RegionField) -> float:
     return adjusted_rand_score(truth.labels.values[inside], found.labels.values[inside])
 
 
-@pytest.mark.parametrize(("noise", "floor"), [(0.0, 0.95), (0.05, 0.9)])
+@pytest.mark.parametrize(
+    ("noise", "floor"), [pytest.param(0.0, 0.95, marks=pytest.mark.slow), (0.05, 0.9)]
+)
 def test_regimes_are_the_regions_away_from_transitions(noise: float, floor: float) -> None:
     assert agreement(grouped("fast", noise), made("fast")) >= floor
 
@@ -87,7 +89,7 @@ def test_regimes_have_the_equations_of_their_regions(noise: float) -> None:
             assert equations[state] == pytest.approx(terms, rel=0.12)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.05])
 def test_a_field_of_one_equation_is_one_regime(noise: float) -> None:
     found = grouped("fast", noise, one_equation=True)
     assert found.n_regimes == 1

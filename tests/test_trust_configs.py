@@ -148,7 +148,7 @@ def test_a_file_cannot_say_what_must_be_typed(
 ) -> None:
     """Through Hydra's own door, in this process: what it would do with the config comes later."""
     (tmp_path / "exp").mkdir()
-    text = "# @package _global_\ndefaults: [discover, _self_]\n" + OmegaConf.to_yaml(said)
+    text = "# @package _global_\ndefaults: [_self_]\n" + OmegaConf.to_yaml(said)
     (tmp_path / "exp" / "theirs.yaml").write_text(text)
     monkeypatch.chdir(tmp_path)
     modes = (RunMode.RUN, RunMode.MULTIRUN) if "hydra" in said else (RunMode.RUN,)

@@ -9,8 +9,9 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 # Read by OpenMP and by the libraries of linear algebra when they are loaded.
 NUMBERS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -29,7 +30,7 @@ def one_thread() -> Iterator[None]:
     """
     torch = sys.modules.get("torch")  # nobody need wait for it here
     n_threads = torch.get_num_threads() if torch else 1
-    with threadpool_limits(limits=1):
+    with _pools(len(sys.modules)).limit(limits=1):
         try:
             if torch:
                 torch.set_num_threads(1)
@@ -37,3 +38,9 @@ def one_thread() -> Iterator[None]:
         finally:
             if torch:
                 torch.set_num_threads(n_threads)
+
+
+@lru_cache(maxsize=1)
+def _pools(n_modules: int) -> ThreadpoolController:
+    """The pools of threads of all libraries, which are looked for again once more are loaded."""
+    return ThreadpoolController()
