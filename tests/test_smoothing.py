@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.signal import periodogram
 
 from ep2sindy.library.units import Clock
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay, difference
@@ -75,6 +76,15 @@ def test_spectrum_integrates_to_the_variance() -> None:
     t = np.arange(2000) * 1e-3
     frequency, power = power_spectrum(t, 3.0 * np.sin(2 * np.pi * 50.0 * t))
     assert np.sum(power) * frequency[1] == pytest.approx(4.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [4, 501, 2000])
+def test_a_spectrum_is_that_of_scipy(n: int) -> None:
+    t = 1e-3 * np.arange(n)
+    x = 7.0 + np.random.default_rng(n).standard_normal(n)
+    theirs = periodogram(x, 1e3, window="hann", detrend="constant")
+    for ours, other in zip(power_spectrum(t, x), theirs, strict=True):
+        np.testing.assert_allclose(ours, other, rtol=1e-10, atol=1e-20)
 
 
 def test_frequencies_read_in_their_own_prefix() -> None:

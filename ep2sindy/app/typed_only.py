@@ -48,9 +48,11 @@ class CheckedLoader(ConfigLoaderImpl):
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
         how = (run_mode, from_shell, validate_sweep_overrides)
-        found = super().load_configuration(config_name, overrides, *how)
         hydras = [text for text in overrides if re.match(r"[+~]*hydra[./=]", text)]
         without = _without_folders(self, hydras).load_configuration(config_name, hydras, *how)
+        if not validate_sweep_overrides:  # Hydra asks for its mode alone, before it composes
+            return without
+        found = super().load_configuration(config_name, overrides, *how)
         typed = _settings(without)
         typed["overrides.task"] = [text for text in overrides if text not in hydras]
         check_hydra(_settings(found), typed)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy import fft
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import read_only
@@ -157,8 +158,6 @@ def phase_along(
 
 def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
     """Phase of x beyond a straight one, smooth over the periods that it is taken from."""
-    from scipy.signal import fftconvolve  # half a second that a search does not need
-
     slow = (x - x.mean()) * np.exp(-1j * straight)
     even = t
     if not is_uniform(t):
@@ -168,9 +167,18 @@ def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
         slow = make_interp_spline(t, slow, k=1)(even)
     per_period = len(t) * 2.0 * np.pi / (straight[-1] - straight[0])
     n = max(3, round(min(PERIODS_TRACKED * per_period, 0.5 * len(t))))
-    drift = np.unwrap(np.angle(fftconvolve(slow, np.hanning(n + 2)[1:-1], mode="same")))
+    drift = np.unwrap(np.angle(_averaged(slow, np.hanning(n + 2)[1:-1])))
     whole = slice(n // 2, len(t) - n // 2)
     return np.interp(t, even[whole], drift[whole])
+
+
+def _averaged(x: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """`scipy.signal.fftconvolve(x, window, "same")`: loading that module takes half a second."""
+    length = len(x) + len(window) - 1
+    fast = fft.next_fast_len(length)
+    whole = fft.ifft(fft.fft(x, fast) * fft.fft(window, fast), fast)
+    first = (length - len(x)) // 2
+    return whole[first : first + len(x)]
 
 
 def _sharpened(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
