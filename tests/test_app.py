@@ -12,8 +12,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
-from ep2sindy.app import main as program
-from ep2sindy.app import sweep
+from ep2sindy.app import program, sweep
 from ep2sindy.app.build import Configured
 from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_config, study_class
 from ep2sindy.app.schema import keys_of, study_of, value_of

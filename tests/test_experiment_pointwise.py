@@ -193,7 +193,6 @@ def test_a_rate_table_that_has_changed_has_other_blocks(grid: Path, tmp_path: Pa
 def test_own_code_that_has_changed_has_other_blocks(
     place: str, grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     source = tmp_path / place
     source.parent.mkdir(exist_ok=True)

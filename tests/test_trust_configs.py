@@ -75,7 +75,6 @@ def test_defaults_that_are_written_out_can_be_built_again(name: str) -> None:
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a module of the user's own."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "my_steps.py").write_text(
         "import os\nimport ep2sindy as ep\n"
         "@ep.for_configs\ndef half(field):\n    return field / 2\n"

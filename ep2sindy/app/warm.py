@@ -18,6 +18,7 @@ import numpy as np
 
 import ep2sindy as ep
 from ep2sindy.machine.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
+from ep2sindy.machine.own import isolated
 from ep2sindy.machine.progress import Bars
 from ep2sindy.model.many import DrivenWindows, Ensemble
 
@@ -61,8 +62,8 @@ def _compiled_side_by_side() -> bool:
     texts = [path.read_text("utf-8") for path in sources()]
     n_kernels = sum(text.count("\n@compiled") - text.count(inlined) for text in texts)
     reader, writer = os.pipe()
-    command = [sys.executable, "-m", "ep2sindy.app.warm"]
-    parts = [subprocess.Popen([*command, part], stdout=writer) for part in PARTS]
+    command, environment = isolated("ep2sindy.app.warm")
+    parts = [subprocess.Popen([*command, each], stdout=writer, env=environment) for each in PARTS]
     os.close(writer)
     with open(reader, encoding="utf-8") as lines, Bars().stage(n_kernels, "kernel") as advance:
         names: set[str] = set()  # parts share some

@@ -9,8 +9,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core import event
+from ep2sindy.machine.own import away_from
+
+SETTINGS = ".numba_config.yaml"  # of the current folder, which may be anybody's
+
+with away_from(SETTINGS):
+    import numba
+    from numba.core import config, event
+config._config_fname = ""  # looked for again whenever something is compiled
 
 PACKAGE = Path(__file__).resolve().parents[1]
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."

@@ -11,11 +11,14 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from threading import RLock
+from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
-from joblib import Parallel, delayed
+import cloudpickle
+from joblib import Parallel, delayed, effective_n_jobs
 
 from ep2sindy.machine.interruption import end_with
+from ep2sindy.machine.own import isolated_children, own_packages
 from ep2sindy.machine.threads import one_thread
 
 # Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
@@ -64,15 +67,25 @@ def rows_in_order(
     return [row for number in sorted(found) for row in found[number]]
 
 
-def _in_worker(
-    function: Callable[[Any], Any], parent: int, numbered: tuple[int, Any]
-) -> tuple[int, Any]:
+def _in_worker(code: bytes, parent: int, numbered: tuple[int, Any]) -> tuple[int, Any]:
     from tqdm import tqdm
 
-    if os.getpid() != parent:  # on one core, and within a worker, joblib stays in the process
+    if os.getpid() != parent:  # within a worker, joblib stays in the process
         end_with(parent)
         tqdm.set_lock(RLock())  # by default a semaphore, of which the end of a worker would be told
-    return _on_one_thread(function, numbered)
+    return _sent_on_one_thread(code, numbered)
+
+
+def _sent_on_one_thread(code: bytes, numbered: tuple[int, Any]) -> tuple[int, Any]:
+    return _on_one_thread(pickle.loads(code), numbered)
+
+
+def _with_its_code(function: Callable[[Any], Any], *packages: ModuleType) -> bytes:
+    """A pickle that holds the code of packages which workers cannot import by their names:
+    these, and what configs have named in the folder of the run."""
+    for package in (*packages, *own_packages()):
+        cloudpickle.register_pickle_by_value(package)
+    return cloudpickle.dumps(function)
 
 
 @dataclass(frozen=True)
@@ -105,10 +118,15 @@ class Loky:
     def run(
         self, function: Callable[[Any], Any], pieces: Iterable[Any]
     ) -> Iterator[tuple[int, Any]]:
+        if effective_n_jobs(self.n_jobs) == 1:
+            yield from ONE_BY_ONE.run(function, pieces)
+            return
         # Pieces are pickled as they are: joblib would keep a copy of every large array on disk.
         workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
-        numbered = enumerate(pieces)
-        yield from workers(delayed(_in_worker)(function, os.getpid(), each) for each in numbered)
+        code, numbered = _with_its_code(function), enumerate(pieces)
+        with isolated_children():  # all workers start before the first result is asked for
+            found = workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
+        yield from found
 
 
 @dataclass(frozen=True)
@@ -156,7 +174,8 @@ class Dask:
         function: Callable[[Any], Any],
         pieces: Iterable[Any],
     ) -> Iterator[tuple[int, Any]]:
-        waiting, n_running, code = enumerate(pieces), 0, _with_its_code(function)
+        waiting, n_running = enumerate(pieces), 0
+        code = _with_its_code(function, *_package_of(function))
 
         def submitted() -> list[Any]:
             """What keeps all threads busy, of workers that have joined since, too."""
@@ -180,21 +199,14 @@ class Dask:
             yield result
 
 
-def _with_its_code(function: Callable[[Any], Any]) -> bytes:
-    """A pickle that holds the code of every package but this one, which workers have."""
-    import cloudpickle  # comes with distributed
-
+def _package_of(function: Callable[[Any], Any]) -> list[ModuleType]:
+    """Where a function comes from, unless workers have it: this package, or the main program."""
     inner: Any = function
     while isinstance(inner, partial):
         inner = inner.func
     package = inner.__module__.partition(".")[0]
-    if package not in (__name__.partition(".")[0], "__main__"):
-        cloudpickle.register_pickle_by_value(sys.modules[package])
-    return cloudpickle.dumps(function)
-
-
-def _sent_on_one_thread(code: bytes, numbered: tuple[int, Any]) -> tuple[int, Any]:
-    return _on_one_thread(pickle.loads(code), numbered)
+    known = package in (__name__.partition(".")[0], "__main__")
+    return [] if known else [sys.modules[package]]
 
 
 def _distributed() -> Any:

@@ -93,7 +93,7 @@ class RunFolder:
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> dict[str, Any]:
         """Which code a run is made by, in provenance.json; returned as well."""
         found = {
-            "commit": commit(Path(__file__).parent),
+            "commit": commit(Path(__file__).resolve().parents[2]),
             "seed": seed,
             "command": list(command),
             "versions": {"python": platform.python_version(), **versions()},

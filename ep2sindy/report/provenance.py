@@ -13,7 +13,9 @@ VERSIONED = (
 
 
 def commit(folder: Path) -> str:
-    """Git commit of the code in `folder`, with "+changes" if some are not committed."""
+    """Git commit of a checkout's folder, with "+changes" if some are not committed."""
+    if not (folder / ".git").exists():
+        return "unknown: not a git checkout"  # git would take that of a folder around it
     try:
         head = _git(folder, "rev-parse", "HEAD")
         return head + ("+changes" if _git(folder, "status", "--porcelain") else "")

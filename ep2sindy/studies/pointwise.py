@@ -7,7 +7,6 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +22,7 @@ from ep2sindy.discovery.regimes import regimes
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
 from ep2sindy.machine.files import fingerprint
+from ep2sindy.machine.own import own_source
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.machine.progress import Advance
 from ep2sindy.report.run import Run
@@ -163,10 +163,8 @@ def blocks_key(settings: Mapping[str, Any]) -> str:
 def own_sources(settings: Mapping[str, Any]) -> list[Path]:
     """Modules and packages other than ours that the settings name: the user's own code."""
     names = [text for key, text in texts(settings) if key in ("_target_", "study") and "." in text]
-    modules = {name.split(".")[0] for name in names} - {"ep2sindy"}
-    origins = [spec.origin for name in sorted(modules) if (spec := find_spec(name))]
-    paths = [Path(origin) for origin in origins if origin]
-    return [path.parent if path.name == "__init__.py" else path for path in paths]
+    found = {own_source(name) for name in names if not name.startswith("ep2sindy.")}
+    return sorted(path for path in found if path is not None)
 
 
 def texts(settings: object, key: str = "") -> Iterator[tuple[str, str]]:

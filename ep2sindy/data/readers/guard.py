@@ -7,12 +7,12 @@ import os
 import select
 import signal
 import subprocess
-import sys
 from functools import cache, lru_cache
 from pathlib import Path
 from threading import Lock
 
 from ep2sindy.data.readers.limits import size_of
+from ep2sindy.machine.own import isolated
 
 PATIENCE_S = 20.0  # and a second per 10 MB: slower than any disk
 SPEED = 1e7  # bytes per s
@@ -80,11 +80,11 @@ def _answers(prober: subprocess.Popen, patience_s: float) -> bool:
 @cache
 def _prober(process: int) -> subprocess.Popen:
     """One for each process of ours: a fork must not share its parent's."""
-    paths = os.pathsep.join(path for path in sys.path if path)
+    command, environment = isolated("ep2sindy.data.readers.probe")
     return subprocess.Popen(
-        [sys.executable, "-m", "ep2sindy.data.readers.probe"],
+        command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": paths, "MALLOC_PERTURB_": "165"},  # luck is no soundness
+        env={**environment, "MALLOC_PERTURB_": "165"},  # luck is no soundness
     )

@@ -1,0 +1,156 @@
+"""The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
+
+`ep2sindy compare RUN RUN` sets run folders side by side instead.
+`ep2sindy inspect PATH` looks into files instead, and `ep2sindy warm` compiles what is compiled
+once after installation.
+
+Only Hydra is imported here: `--help` must not wait for the numerics.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from ep2sindy.app.typed_only import check_places, checked_loader, resolved
+from ep2sindy.machine.interruption import end_as_interrupted
+from ep2sindy.machine.own import isolated_children
+from ep2sindy.machine.threads import start_on_one_thread
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def run() -> None:
+    """Errors of the user's making end in one message; all others keep their traceback."""
+    gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
+    atexit.register(gc.freeze)  # to look through them all once more at the end takes a second
+    end_as_interrupted()
+    start_on_one_thread()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
+    sweeps: list[Path] = []
+    failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
+    try:
+        conf = conf_folder()
+        if command(sys.argv[1:], conf):
+            return
+        prepare_arguments(conf)
+
+        @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")
+        def job(config: DictConfig) -> None:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
+            failed.extend(run_job(config, conf))
+
+        with checked_loader(), isolated_children():
+            job()
+    except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
+        sys.exit(f"error: {str(error) or type(error).__name__}")
+    except OSError as error:
+        sys.exit(
+            f"error: {error}; where a run writes is chosen with output=PATH, and where it keeps "
+            "what it can use again with data.cache=PATH or keep=PATH"
+        )
+    except KeyboardInterrupt:
+        sys.exit("interrupted: files under their final names are whole")
+    finally:
+        for sweep in sweeps:
+            from ep2sindy.app.sweep import index_text
+
+            print(index_text(sweep))
+    if failed:
+        sys.exit(f"error: {failed[0]}" if len(failed) == 1 else f"error: {len(failed)} jobs failed")
+
+
+def command(arguments: Sequence[str], conf: Path) -> bool:
+    """Whether the first argument names a command, which has been carried out then."""
+    name, rest = "".join(arguments[:1]), arguments[1:]
+    if name == "compare":
+        from ep2sindy.app.compare import main as compare_runs
+
+        compare_runs(rest)
+    elif name == "inspect":
+        from ep2sindy.app.inspection import main as inspect_files
+
+        inspect_files(rest, conf)
+    elif name == "warm":
+        from ep2sindy.app.warm import main as compile_kernels
+
+        compile_kernels(rest)
+    return name in ("compare", "inspect", "warm")
+
+
+def conf_folder() -> Path:
+    """The package's configs: beside it in a checkout, inside it where it is installed."""
+    places = (PACKAGE.parent / "conf", PACKAGE / "conf")
+    for place in places:
+        if (place / "config.yaml").is_file():
+            return place
+    raise ValueError(
+        f"the package's configs must lie in one of {list(map(str, places))}: none of them has a "
+        "config.yaml; install the package again"
+    )
+
+
+def prepare_arguments(conf: Path) -> None:
+    """Flags may stand anywhere, and configs in ./conf are found as with `--config-dir ./conf`."""
+    flags = [text for text in sys.argv[1:] if text in ("-m", "--multirun")]
+    sys.argv[1:] = [*flags, *(text for text in sys.argv[1:] if text not in flags)]
+    primary = ("--config-path", "-cp", "--config-name", "-cn")
+    if other := [text for text in sys.argv[1:] if text.startswith(primary)]:
+        raise ValueError(
+            f"every run begins with the package's own config.yaml, not with {other[0]!r}; "
+            "--config-dir FOLDER adds configs of yours"
+        )
+    own = Path.cwd() / "conf"
+    named = any(text.startswith(("--config-dir", "-cd")) for text in sys.argv[1:])
+    if own.is_dir() and own.resolve() != conf.resolve() and not named:
+        sys.argv[1:] = ["--config-dir", str(own), *sys.argv[1:]]
+
+
+def run_job(config: DictConfig, conf: Path) -> list[str]:
+    """One run, and why it ended early, if it did; a sweep notes that and goes on."""
+    from ep2sindy.app.sweep import noted_job
+
+    with noted_job() as (done, ended_early):
+        try:
+            if config.experiment is None:
+                raise ValueError(
+                    f"choose an experiment with +exp=NAME; there are {known(conf)}. A config of "
+                    "your own begins with the line '# @package _global_'"
+                )
+            typed = HydraConfig.get().overrides.task
+            check_places(resolved(config), typed)
+            print(first_word(config), flush=True)  # what follows takes seconds to load
+            from ep2sindy.app.runner import run_config
+
+            finished = run_config(config, overrides=typed)
+        except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
+            ended_early(error)
+            return [str(error)]
+        done(finished.folder, finished.headline)
+    print(finished.folder)
+    return []
+
+
+def first_word(config: DictConfig) -> str:
+    """What a run is, and where it will write."""
+    folder = Path(str(config.get("output")), str(config.experiment))
+    return f"{config.experiment}: loading study={config.get('study')}; writes below {folder}/"
+
+
+def known(conf: Path) -> str:
+    """Experiments that there are to choose from."""
+    folders = {conf, Path.cwd() / "conf"}
+    return ", ".join(sorted({path.stem for each in folders for path in each.glob("exp/*.yaml")}))

@@ -1,0 +1,166 @@
+"""A folder full of what others wrote: nothing of it is run but what is named."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from ep2sindy.machine.own import leave_folder, own_module, own_packages
+from ep2sindy.machine.parallel import Loky
+from ep2sindy.report import provenance
+
+PROGRAM = Path(sysconfig.get_path("scripts")) / "ep2sindy"
+SPY = "with open({ran!r}, 'a') as file:\n    print(__name__, file=file)\n"
+CSV = (
+    "+exp=discover", "data=file", "data.path=run.csv", "data.z.name=null",
+    "data.variables.n_i.name=null", "data.variables.n_n.name=null",
+    "+data.variables.x.name=x", "+data.variables.x.unit=1",
+    "+data.variables.y.name=y", "+data.variables.y.unit=1", "trajectory.states=[x,y]",
+)  # fmt: skip
+RUNS: dict[str, Sequence[str]] = {
+    "help": ("--help",),
+    "inspect": ("inspect", "run.h5"),
+    "discover": CSV,
+    "sweep": ("-m", *CSV, "seed=1,2"),
+    "workers": (
+        "+exp=benchmark", "systems=[oscillator]", "noises=[0]", "variants=[STLSQ]",
+        "n_realizations=2", "parallel=loky",
+    ),
+    "compare": ("compare", "run.h5"),
+}  # fmt: skip
+FAST = ("help", "inspect")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every module that there is stands here by its name, and notes that it is run."""
+    folder = tmp_path_factory.mktemp("downloads")
+    spy = SPY.format(ran=str(folder / "ran"))
+    loaded = {name.partition(".")[0] for name in sys.modules}
+    for name in {*sys.stdlib_module_names, *loaded, "cupy", "sitecustomize"} - {"ep2sindy"}:
+        (folder / f"{name}.py").write_text(spy)
+    for package in ("hydra_plugins", "json5", "sparse"):
+        (folder / package).mkdir()
+        (folder / package / "__init__.py").write_text(spy)
+        (folder / package / "mine.py").write_text(spy)
+    (folder / "matplotlibrc").write_text("savefig.dpi: 7\nfont.size: 99\n")
+    (folder / ".numba_config.yaml").write_text("disable_jit: 1\n")
+    t = np.arange(400) * 0.05
+    x, y = np.sin(t) + 2.0, np.cos(t)
+    rows = np.column_stack([t, x, y])
+    np.savetxt(folder / "run.csv", rows, delimiter=",", header="time,x,y", comments="")
+    with h5py.File(folder / "run.h5", "w") as file:
+        file["time"], file["x"] = t, x
+    return folder
+
+
+CASES = [
+    pytest.param(run, flag, id=f"{run}{flag}", marks=() if run in FAST else pytest.mark.slow)
+    for run in RUNS
+    for flag in ("", "-P", "-I")
+]
+
+
+@pytest.mark.parametrize(("run", "flag"), CASES)
+def test_nothing_of_the_folder_is_imported(run: str, flag: str, folder: Path) -> None:
+    command = [sys.executable, *filter(None, [flag]), str(PROGRAM), *RUNS[run]]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert not (folder / "ran").exists(), (folder / "ran").read_text()
+    assert done.returncode == (run == "compare"), done.stderr
+
+
+SETTINGS = """
+import ep2sindy.figures, ep2sindy.machine.compilation, matplotlib, numba
+print(matplotlib.rcParams["font.size"], numba.config.DISABLE_JIT)
+"""
+
+
+def test_settings_of_the_folder_are_not_obeyed(folder: Path) -> None:
+    command = [sys.executable, "-P", "-c", SETTINGS]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert done.stdout == "10.0 0\n"
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for modules of one's own, of which none is left behind."""
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    for module in own_packages():
+        for name in [each for each in sys.modules if each.partition(".")[0] == module.__name__]:
+            del sys.modules[name]
+
+
+def test_a_module_is_made_from_its_source(here: Path) -> None:
+    """What lies beside it, compiled, may say anything else."""
+    (here / "mine.py").write_text("value = 1\n")
+    first = own_module("mine")
+    assert first is own_module("mine")
+    assert not (here / "__pycache__").exists()
+    assert (first.value, first.__file__) == (1, str(here / "mine.py"))
+
+
+def test_modules_of_a_folder_import_each_other_by_its_name(here: Path) -> None:
+    (here / "studies").mkdir()
+    (here / "studies" / "tools.py").write_text("value = 2\n")
+    (here / "studies" / "mine.py").write_text("from studies.tools import value\n")
+    assert own_module("studies.mine").value == 2
+    (here / "pack").mkdir()
+    (here / "pack" / "__init__.py").write_text("from pack.inner import value\n")
+    (here / "pack" / "inner.py").write_text("value = 3\n")
+    assert own_module("pack").value == 3
+
+
+@pytest.mark.parametrize("name", ["json", "numpy", "tabnanny"])
+def test_a_module_by_the_name_of_another_is_refused(name: str, here: Path) -> None:
+    (here / f"{name}.py").write_text("raise AssertionError('this ran')\n")
+    with pytest.raises(ModuleNotFoundError, match=f"{name!r} is another's; rename it"):
+        own_module(name)
+
+
+def test_a_module_that_fails_is_not_kept(here: Path) -> None:
+    (here / "mine.py").write_text("raise RuntimeError('half done')\n")
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="half done"):
+            own_module("mine")
+    assert "mine" not in sys.modules
+
+
+@pytest.mark.slow
+def test_workers_get_the_code_of_ones_own(here: Path) -> None:
+    (here / "mine.py").write_text("def double(x):\n    return 2 * x\n")
+    found = Loky(2).run(own_module("mine").double, range(3))
+    assert sorted(found) == [(0, 0), (1, 2), (2, 4)]
+
+
+def test_the_folder_leaves_the_path_and_nothing_else_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path), str(other), *sys.path])
+    leave_folder()
+    assert sys.path[0] == str(other)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no folder that is in use can be removed there")
+def test_a_folder_that_is_gone_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(ValueError, match="has been removed; change to another: cd FOLDER"):
+        leave_folder()
+
+
+def test_the_commit_is_not_that_of_a_folder_around(tmp_path: Path) -> None:
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    (tmp_path / "inside").mkdir()
+    assert provenance.commit(tmp_path / "inside") == "unknown: not a git checkout"
