@@ -9,6 +9,7 @@ from pathlib import Path
 from ep2sindy.app.compare_view import compared, figures_of
 from ep2sindy.app.read_run import read_run
 from ep2sindy.machine.files import write_text
+from ep2sindy.machine.screen import say
 from ep2sindy.report.page import TEMPLATES, page_html
 from ep2sindy.report.screen import Screen
 
@@ -32,4 +33,4 @@ def main(arguments: Sequence[str]) -> None:
     html = page_html("Runs compared", sections, figures_of(runs), template=template)
     Screen().show(sections)
     write_text(page, html)
-    print(page)
+    say(str(page))

@@ -16,6 +16,7 @@ from ep2sindy.data.inspection import Inspection, check_alike, inspect
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import files_of
 from ep2sindy.machine.files import write_text
+from ep2sindy.machine.screen import in_line, say
 
 ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks like time, z and r,
 and what is missing for which experiment. Several files, or a pattern in quotes, are several
@@ -40,16 +41,16 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     paths = files_of(given.path)
     found = [inspect(path) for path in paths]
     for each in found:
-        print("\n".join(each.lines()), end="\n\n")
+        say("\n".join(each.lines()) + "\n")
     name = re.sub(r"\W+", "_", given.write or Path(paths[0]).stem).strip("_")
     if given.write is None:
-        print(f"--write makes conf/data/{name}.yaml of it, for data={name}")
+        say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
         return
     check_alike(found)
     path = own_config(name, conf)
     write_text(path, config_text(found, paths))
-    print(f"written: {path}; next, for example:")
-    print("\n".join(f"  {command}" for command in commands(found[0], name)))
+    say(f"written: {path}; next, for example:")
+    say("\n".join(f"  {command}" for command in commands(found[0], name)))
 
 
 def own_config(name: str, conf: Path) -> Path:
@@ -68,7 +69,7 @@ def config_text(found: Sequence[Inspection], paths: Sequence[str]) -> str:
     variables = {n: Variable(None, u) for n, u in {**KNOWN_UNITS, "T_e_eV": "eV"}.items()}
     variables |= first.variables
     lines = [
-        f"# {paths[0]}{' ...' if len(paths) > 1 else ''}, as `ep2sindy inspect` found it.",
+        f"# {in_line(paths[0])}{' ...' if len(paths) > 1 else ''}, as `ep2sindy inspect` found it.",
         "# A name is the one in the file; null: the file has it not. Correct what is wrong.",
         "_target_: ep2sindy.open_field",
         f"path: {_flow(paths[0] if len(paths) == 1 else list(paths))}",
@@ -97,15 +98,18 @@ def _node(variable: Variable) -> dict[str, Any]:
 
 
 def _flow(value: Any) -> str:
-    """YAML on one line; what reads back as something else than text stands in quotes."""
+    """YAML on one line that Hydra reads back as it is: text that could mean more is quoted."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_flow, value)) + "]"
     if not isinstance(value, str):
         return "null" if value is None else repr(value)
-    plain = re.fullmatch(r"[\w./^-]+", value) and yaml.safe_load(value) == value
-    return value if plain else "'" + value.replace("'", "''") + "'"
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)  # what Hydra would replace
+    if in_line(text) != text:
+        return yaml.safe_dump(text, default_style='"', width=float("inf")).strip()
+    is_plain = re.fullmatch(r"[\w./^-]+", text) and yaml.safe_load(text) == text
+    return text if is_plain else "'" + text.replace("'", "''") + "'"
 
 
 def _word(found: Inspection, name: str) -> str:

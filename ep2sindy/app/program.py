@@ -13,8 +13,11 @@ import atexit
 import gc
 import os
 import sys
+import traceback
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -27,15 +30,18 @@ from yaml import YAMLError
 from ep2sindy.app.typed_only import check_places, checked_loader, resolved
 from ep2sindy.machine.interruption import end_as_interrupted
 from ep2sindy.machine.own import isolated_children
+from ep2sindy.machine.screen import plain, say
 from ep2sindy.machine.threads import start_on_one_thread
 
 PACKAGE = Path(__file__).resolve().parents[1]
+USUAL_WARNING = warnings.formatwarning
 
 
 def run() -> None:
     """Errors of the user's making end in one message; all others keep their traceback."""
     gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
     atexit.register(gc.freeze)  # to look through them all once more at the end takes a second
+    sys.excepthook, warnings.formatwarning = _print_error, _warning_text
     end_as_interrupted()
     start_on_one_thread()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
@@ -56,21 +62,35 @@ def run() -> None:
         with checked_loader(), isolated_children():
             job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
-        sys.exit(f"error: {str(error) or type(error).__name__}")
+        sys.exit(plain(f"error: {str(error) or type(error).__name__}"))
     except OSError as error:
-        sys.exit(
-            f"error: {error}; where a run writes is chosen with output=PATH, and where it keeps "
-            "what it can use again with data.cache=PATH or keep=PATH"
+        where = (
+            "where a run writes is chosen with output=PATH, and where it keeps what it can use "
+            "again with data.cache=PATH or keep=PATH"
         )
+        sys.exit(plain(f"error: {error}; {where}"))
     except KeyboardInterrupt:
         sys.exit("interrupted: files under their final names are whole")
     finally:
         for sweep in sweeps:
             from ep2sindy.app.sweep import index_text
 
-            print(index_text(sweep))
+            say(index_text(sweep))
     if failed:
-        sys.exit(f"error: {failed[0]}" if len(failed) == 1 else f"error: {len(failed)} jobs failed")
+        why = failed[0] if len(failed) == 1 else f"{len(failed)} jobs failed"
+        sys.exit(plain(f"error: {why}"))
+
+
+def _print_error(*error: Any) -> None:
+    """As Python does, but for what would steer a terminal."""
+    print(plain("".join(traceback.format_exception(*error))), end="", file=sys.stderr)
+
+
+def _warning_text(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int,
+    line: str | None = None,
+) -> str:  # fmt: skip
+    return plain(USUAL_WARNING(message, category, filename, lineno, line))
 
 
 def command(arguments: Sequence[str], conf: Path) -> bool:
@@ -132,7 +152,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
                 )
             typed = HydraConfig.get().overrides.task
             check_places(resolved(config), typed)
-            print(first_word(config), flush=True)  # what follows takes seconds to load
+            say(first_word(config))  # what follows takes seconds to load
             from ep2sindy.app.runner import run_config
 
             finished = run_config(config, overrides=typed)
@@ -140,7 +160,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
             ended_early(error)
             return [str(error)]
         done(finished.folder, finished.headline)
-    print(finished.folder)
+    say(str(finished.folder))
     return []
 
 

@@ -16,6 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from ep2sindy.machine.files import write_json, write_text
+from ep2sindy.machine.screen import say
 
 RECORDS = "jobs"
 
@@ -35,14 +36,14 @@ def noted_job() -> Iterator[
     job, overrides = HydraConfig.get().job.num, list(HydraConfig.get().overrides.task)
     sweep = Path(HydraConfig.get().sweep.dir)
     record: dict[str, Any] = {"job": job, "overrides": overrides, "status": "failed"}
-    print(f"job {job}: {' '.join(overrides)}", flush=True)
+    say(f"job {job}: {' '.join(overrides)}")
 
     def done(folder: Path, headline: Mapping[str, float]) -> None:
         record.update(status="done", folder=str(folder), headline=dict(headline))
 
     def ended_early(error: BaseException) -> None:
         record["error"] = f"{error}" or type(error).__name__
-        print(f"job {job} failed: {record['error']}", flush=True)
+        say(f"job {job} failed: {record['error']}")
 
     try:
         yield done, ended_early

@@ -20,6 +20,7 @@ import ep2sindy as ep
 from ep2sindy.machine.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
 from ep2sindy.machine.own import isolated
 from ep2sindy.machine.progress import Bars
+from ep2sindy.machine.screen import say
 from ep2sindy.model.many import DrivenWindows, Ensemble
 
 ABOUT = """Compiles all kernels of the package, once after installation: half a minute on two cores.
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str]) -> None:
     """Compile, and say where the kernels are kept."""
     argparse.ArgumentParser("ep2sindy warm", description=ABOUT).parse_args(arguments)
     warm()
-    print(f"all kernels are compiled; they are kept in {kept_in()}")
+    say(f"all kernels are compiled; they are kept in {kept_in()}")
 
 
 def warm() -> None:
@@ -38,7 +39,7 @@ def warm() -> None:
     stamp, state = kept_in() / "warm", _state()
     if stamp.is_file() and stamp.read_text("utf-8") == state:
         return
-    print(ANNOUNCEMENT, file=sys.stderr, flush=True)
+    say(ANNOUNCEMENT, error=True)
     if not _compiled_side_by_side():
         return
     with suppress(OSError):  # a disk that takes no more costs the next run this half minute again

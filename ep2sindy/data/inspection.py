@@ -14,7 +14,7 @@ from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.recognition import Recognised, recognised
-from ep2sindy.machine.screen import WIDTH, html_table, one_screen, text_table
+from ep2sindy.machine.screen import WIDTH, html_table, in_line, one_screen, text_table
 
 # What the experiments need beside time; those that take any variables are not here.
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -84,7 +84,8 @@ class Inspection:
 
     def is_trace(self, variable: Variable) -> bool:
         """Whether a variable has only time, varies, and does not rise all along."""
-        (one,) = (e for e in self.found.held if str(variable.name).split("[")[0] == e.name)
+        held = {each.name: each for each in self.found.held}
+        one = held.get(str(variable.name)) or held[str(variable.name).rpartition("[")[0]]
         n_axes = 1 + (one.name != variable.name)
         of_time = len(one.lengths) == n_axes and self.found.n_samples in one.lengths
         return of_time and one.step is None and one.low < one.high
@@ -121,14 +122,15 @@ class Inspection:
     def lines(self) -> list[str]:
         """The file, its arrays, and what is to be known of them, in lines of a screen's width."""
         words = f"; {self.words}" if self.words else ""
+        texts = map(in_line, (*self.notes(), *self.experiments()))
         notes = [
             line
-            for text in (*self.notes(), *self.experiments())
+            for text in texts
             for line in textwrap.wrap(text, WIDTH, initial_indent="- ", subsequent_indent="  ",
                                       break_long_words=False, break_on_hyphens=False)
         ]  # fmt: skip
         head = f"{self.path}: {self.kind}{words}"
-        return [head, *text_table(HEADER, self._rows()), *notes]
+        return [in_line(head), *text_table(HEADER, self._rows()), *notes]
 
     def __repr__(self) -> str:
         return one_screen(self.lines(), n_lines=60)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, partial
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ep2sindy.machine.own import away_from
+from ep2sindy.machine.screen import say
 
 SETTINGS = ".numba_config.yaml"  # of the current folder, which may be anybody's
 
@@ -84,7 +84,7 @@ class _Listener(event.Listener):
     def on_start(self, event: event.Event) -> None:
         if not _TOLD:
             _TOLD.append(lambda name: None)  # numba tells of every function; people need it once
-            print(ANNOUNCEMENT, file=sys.stderr, flush=True)
+            say(ANNOUNCEMENT, error=True)
 
     def on_end(self, event: event.Event) -> None:
         kernel: Any = event.data.get("dispatcher")

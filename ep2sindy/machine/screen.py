@@ -2,16 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import TextIO
 
 WIDTH, N_LINES = 100, 25
+
+# Controls but tab and new line, marks of direction, signs without width, halves of signs.
+_HIDDEN = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800-\udfff\ufeff]"
+)
+
+
+def plain(text: str) -> str:
+    """Text from anywhere as a terminal may be given it: what steers terminals is written out."""
+    return _HIDDEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def in_line(text: str) -> str:
+    """The same for what stands within a line."""
+    return plain(text).replace("\n", "\\n").replace("\t", "\\t")
+
+
+def say(text: str, *, error: bool = False) -> None:
+    """A line for who watches; error: on standard error. See `on_screen`."""
+    stream = sys.stderr if error else sys.stdout
+    with on_screen(stream):
+        print(plain(text), file=stream, flush=True)
+
+
+@contextmanager
+def on_screen(stream: TextIO) -> Iterator[None]:
+    """Print within: a screen that has gone away (`| head`), or that is full, ends nothing.
+
+    What is printed after goes nowhere.
+    """
+    try:
+        yield
+    except OSError:
+        with suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
 
 
 def one_screen(lines: Sequence[str], *, n_lines: int = N_LINES) -> str:
     """Lines cut to the width of a screen, and to its height: `... 7 more lines`."""
     if len(lines) > n_lines:
         lines = [*lines[: n_lines - 1], f"... {len(lines) - n_lines + 1} more lines"]
-    return "\n".join(cut(line) for line in lines)
+    return "\n".join(cut(plain(line)) for line in lines)
 
 
 def cut(text: str, width: int = WIDTH) -> str:
@@ -38,7 +80,7 @@ def wrapped(parts: Sequence[str], *, what: str, n_lines: int, indent: str = "   
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Columns side by side, each as wide as its longest cell."""
-    cells = [header, *rows]
+    cells = [[in_line(cell) for cell in row] for row in (header, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return [
         "  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)).rstrip() for row in cells

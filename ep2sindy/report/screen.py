@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,16 @@ from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
 from ep2sindy.machine.files import writing
+from ep2sindy.machine.screen import on_screen, plain
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
+
+
+class Terminal(Console):
+    def on_broken_pipe(self) -> None:
+        """Rich would end the program."""
+        raise BrokenPipeError
 
 
 class Screen:
@@ -26,15 +34,16 @@ class Screen:
         self._path = log or Path()
         with writing(self._path):
             self._log = None if log is None else log.open("a", encoding="utf-8")
-        terminal = Console()
+        terminal = Terminal()
         if not terminal.is_terminal:
             terminal.width = WIDTH
-        self._consoles = [terminal]
+        self._consoles: list[Console] = [terminal]
         if self._log is not None:
             self._consoles.append(Console(file=self._log, width=WIDTH, no_color=True))
 
     def print(self, *renderables: RenderableType) -> None:
-        self._consoles[0].print(*renderables, highlight=False)
+        with on_screen(sys.stdout):
+            self._consoles[0].print(*renderables, highlight=False)
         with writing(self._path):
             for console in self._consoles[1:]:
                 console.print(*renderables, highlight=False)
@@ -44,7 +53,7 @@ class Screen:
         """Into run.log alone."""
         with writing(self._path):
             for console in self._consoles[1:]:
-                console.print(text, highlight=False, markup=False)
+                console.print(plain(text), highlight=False, markup=False)
             self._flush()
 
     def show(self, sections: Sequence[Section]) -> None:
@@ -52,7 +61,7 @@ class Screen:
         for section in sections:
             shown = [each for block in section.blocks for each in renderables(block)]
             if shown:
-                self.print(f"\n[bold]{escape(section.title)}[/bold]")
+                self.print(f"\n[bold]{_text(section.title)}[/bold]")
                 for each in shown:
                     self.print(each)
 
@@ -71,10 +80,10 @@ def renderables(block: Block) -> Iterator[RenderableType]:
     """What a terminal shows of a block."""
     match block:
         case Text(page_only=False):
-            text = escape(block.text)
+            text = _text(block.text)
             yield f"[bold red]{text}[/bold red]" if block.warning else text
         case Equation(on_screen=True):
-            text = escape(block.text)
+            text = _text(block.text)
             yield f"[italic]{text}[/italic]" if block.aside else text
         case Table(page_only=False):
             yield rich_table(block)
@@ -82,21 +91,28 @@ def renderables(block: Block) -> Iterator[RenderableType]:
             pass
 
 
+def _text(text: str) -> str:
+    """Text that is neither markup nor steers a terminal."""
+    return escape(plain(text))
+
+
 def rich_table(table: Table) -> RichTable:
     numbers = [kind.kind in "iuf" for kind in table.rows.dtypes]
-    cells = [[cell_text(value) for value in row] for row in table.rows.itertuples(index=False)]
+    cells = [
+        [plain(cell_text(value)) for value in row] for row in table.rows.itertuples(index=False)
+    ]
     lines = [list(map(str, table.rows.columns)), *cells]
     width = sum(max(len(line[k]) for line in lines) + 3 for k in range(len(lines[0])))
     rich = RichTable(
-        title=escape(table.title) or None,
+        title=_text(table.title) or None,
         title_justify="left",
-        caption=escape(table.note) or None,
+        caption=_text(table.note) or None,
         caption_justify="left",
         show_edge=False,
         padding=(0, 1) if width <= WIDTH else (0, 0),
     )
     for name, is_number in zip(table.rows.columns, numbers, strict=True):
-        rich.add_column(escape(str(name)), justify="right" if is_number else "left")
+        rich.add_column(_text(str(name)), justify="right" if is_number else "left")
     for k, row in enumerate(cells):
         style = "bold green" if k in table.bold else "italic" if k in table.italic else None
         rich.add_row(*map(Cell, row), style=style, end_section=k in table.breaks)

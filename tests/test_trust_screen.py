@@ -1,0 +1,121 @@
+"""Texts of files on a terminal, and a terminal that goes away."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from ep2sindy.app import program
+from ep2sindy.app.inspection import commands, config_text
+from ep2sindy.data.inspection import inspect
+from ep2sindy.machine.screen import in_line, one_screen, plain, say
+from ep2sindy.report.screen import Screen
+from tests.test_trust_folder import CSV
+
+ODD = (
+    "\x1b[31mred\x1b[0m",
+    "${oc.env:HOME}",
+    r"back\${x}",
+    "ok\u202eabc",
+    "I [arb]",
+    "it's",
+    "c\x85d",
+)
+
+
+@pytest.fixture
+def odd(tmp_path: Path) -> Path:
+    """Columns whose names steer terminals, or would mean something in a config."""
+    path = tmp_path / "a\n_target_: b.csv"
+    t = 0.05 * np.arange(60)
+    rows = np.column_stack([t, *(np.sin(t + k) for k in range(len(ODD)))])
+    np.savetxt(path, rows, delimiter=",", header=",".join(["time", *ODD]), comments="")
+    return path
+
+
+def test_what_steers_a_terminal_is_written_out() -> None:
+    assert plain("a\tb\nc\x1b[2Jd\re\u202ef\udcffg é ∂ 中") == (
+        r"a	b" "\n" r"c\x1b[2Jd\re\u202ef\udcffg é ∂ 中"
+    )
+    assert in_line("a\tb\nc") == r"a\tb\nc"
+    assert one_screen(["a\x1bb"]) == r"a\x1bb"
+
+
+def test_an_inspection_shows_odd_names_in_full_and_steers_nothing(odd: Path) -> None:
+    lines = inspect(odd).lines()
+    assert all(line.isprintable() for line in lines)
+    assert any(r"\x1b[31mred\x1b[0m" in line for line in lines)
+
+
+def test_a_config_for_odd_names_reads_back_as_they_are(odd: Path) -> None:
+    """None becomes an interpolation, a line of YAML, or part of one."""
+    found = inspect(odd)
+    config = OmegaConf.create(config_text([found], [str(odd)]))
+    assert config.path == str(odd)
+    assert config._target_ == "ep2sindy.open_field"
+    names = {variable.name for variable in config.variables.values() if variable.name}
+    assert names == {*ODD}
+    assert commands(found, "mine")[-1].startswith("ep2sindy +exp=discover data=mine")
+
+
+def test_a_run_says_odd_names_without_obeying_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    screen = Screen(tmp_path / "run.log")
+    screen.log("a\x1b[2Jb")
+    say("c\x1b[2Jd")
+    screen.close()
+    assert (tmp_path / "run.log").read_text() == "a\\x1b[2Jb\n"
+    assert capsys.readouterr().out == "c\\x1b[2Jd\n"
+
+
+def test_warnings_and_errors_of_the_program_are_plain(capsys: pytest.CaptureFixture[str]) -> None:
+    text = program._warning_text(UserWarning("a\x1bb"), UserWarning, "file.py", 1)
+    assert text.endswith("UserWarning: a\\x1bb\n")
+    try:
+        raise RuntimeError("c\x1bd")
+    except RuntimeError:
+        program._print_error(*sys.exc_info())
+    assert capsys.readouterr().err.endswith("RuntimeError: c\\x1bd\n")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
+def test_a_screen_that_has_gone_away_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as gone:
+        monkeypatch.setattr(sys, "stdout", gone)
+        screen = Screen(tmp_path / "run.log")
+        for text in ("first", "second"):
+            screen.print(text)
+            say(text)
+        screen.close()
+    assert (tmp_path / "run.log").read_text() == "first\nsecond\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("screen", ["head", "full"])
+def test_a_run_whose_screen_is_lost_leaves_all_its_files(screen: str, tmp_path: Path) -> None:
+    t = 0.05 * np.arange(400)
+    rows = np.column_stack([t, np.sin(t) + 2.0, np.cos(t)])
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="time,x,y", comments="")
+    command = [sys.executable, "-m", "ep2sindy.app.main", *CSV]
+    if screen == "head":
+        run = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE)
+        assert run.stdout is not None
+        assert run.stdout.readline().startswith(b"discover: loading")
+        run.stdout.close()
+    else:
+        with open("/dev/full", "w") as full:
+            run = subprocess.Popen(command, cwd=tmp_path, stdout=full)
+    assert run.wait() == 0
+    (folder,) = (tmp_path / "outputs" / "discover").iterdir()
+    names = {path.name for path in folder.iterdir()}
+    assert {"summary.json", "report.html", "figures", "models", "tables", "run.log"} <= names
+    assert "Run freely from the first sample" in (folder / "run.log").read_text()
