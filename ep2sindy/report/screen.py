@@ -24,7 +24,7 @@ WIDTH = 120  # columns of run.log, and of output that goes to a file
 class Terminal(Console):
     def on_broken_pipe(self) -> None:
         """Rich would end the program."""
-        raise BrokenPipeError
+        raise BrokenPipeError("the terminal has gone away")
 
 
 class Screen:
