@@ -31,6 +31,33 @@ def test_arrays_are_named_x() -> None:
     assert trajectories_of((T, X[:, 0]))[0].state_names == ("x",)
 
 
+def test_numbered_columns_are_named_as_those_of_arrays() -> None:
+    """A state called 1 could not be told from the constant term."""
+    table = pd.DataFrame(X).assign(t=T)
+    assert trajectories_of(table)[0].state_names == ("x0", "x1")
+
+
+@pytest.mark.parametrize("name", ["1", "", "x^2", "x*y", "=cmd", "a b", "1/x", "<a", "x\n", "${x}"])
+def test_names_that_no_term_could_hold_are_refused_at_every_door(name: str) -> None:
+    message = r"must be a word of letters, digits and _, .* came; rename it, perhaps '[a-z]\w*'"
+    with pytest.raises(ValueError, match=message):
+        trajectories_of(pd.DataFrame({"t": T, name: X[:, 0], "y": X[:, 1]}))
+    with pytest.raises(ValueError, match=message):
+        ep.Trajectory(T, X, ["y", name])
+    with pytest.raises(ValueError, match=message):
+        ep.Library(["y", name], np.eye(2, dtype=np.int64))
+
+
+def test_averages_of_products_are_names() -> None:
+    assert ep.Trajectory(T, X, ["x", "<x^2*y>"]).names == ("x", "<x^2*y>")
+
+
+def test_columns_that_repeat_are_refused() -> None:
+    table = pd.DataFrame(np.column_stack([T, X]), columns=["t", "x", "x"])
+    with pytest.raises(ValueError, match=r"\['t', 'x', 'x'\] came; rename or drop those"):
+        trajectories_of(table)
+
+
 def test_a_list_holds_several_runs_of_any_kind() -> None:
     table = pd.DataFrame({"t": T, "x0": X[:, 0], "x1": X[:, 1]})
     runs = trajectories_of([ep.Trajectory(T, X, ["x0", "x1"]), (T, X), table])

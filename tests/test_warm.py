@@ -88,6 +88,11 @@ def test_a_call_that_compiles_says_so_once(
     assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
 
 
+@pytest.mark.parametrize("part", warm.PARTS)
+def test_parts_of_the_package_that_call_kernels_run(part: str) -> None:
+    warm.PARTS[part]()
+
+
 @pytest.mark.slow
 def test_every_kernel_is_compiled_and_then_none_is(tmp_path: Path) -> None:
     """From nothing; and a search, a refinement and a simulation find all that they call."""

@@ -29,8 +29,9 @@ def trajectories_of(runs: object) -> list[Trajectory]:
     """One run or a list of them as trajectories.
 
     A run is a Trajectory; a pandas DataFrame with a column of times in s (`time`, `t`, `time_s`,
-    `t_s`) or an index of that name, its other columns being states, and rows that hold a NaN left
-    out with the warning `MissingSamples`; or a tuple (t, x) of times
+    `t_s`) or an index of that name, its other columns being states (numbered ones are called x0,
+    x1 ... by their numbers), and rows that hold a NaN left out with the warning `MissingSamples`;
+    or a tuple (t, x) of times
     (samples,) and states (samples,) or (samples, n_states), which are then called x, or x0, x1 ...
     Raises ValueError for anything else, and as Trajectory does.
     """
@@ -69,27 +70,38 @@ def _trajectory(run: object, which: str) -> Trajectory:
 def _from_table(table: pd.DataFrame) -> Trajectory:
     if table.index.name in TIMES:
         table = table.reset_index()
+    table = table.set_axis([_word(name) for name in table.columns], axis="columns")
+    if not table.columns.is_unique:
+        raise ValueError(
+            f"columns of a table must have names of their own: {list(table.columns)} came; rename "
+            "or drop those that repeat"
+        )
     times = [name for name in table.columns if name in TIMES]
     if len(times) != 1:
         raise ValueError(
             f"a table must have one time column, called one of {list(TIMES)}, in s: its columns "
-            f"are {list(map(str, table.columns))}; rename one with table.rename(columns=...)"
+            f"are {list(table.columns)}; rename one with table.rename(columns=...)"
         )
     states = [name for name in table.columns if name != times[0]]
-    kinds = {str(name): table[name].dtype for name in (times[0], *states)}
+    kinds = {name: table[name].dtype for name in (times[0], *states)}
     wrong = {name: str(kind) for name, kind in kinds.items() if kind.kind not in "iuf"}
-    if kinds[str(times[0])].kind in "mM":
-        del wrong[str(times[0])]
+    if kinds[times[0]].kind in "mM":
+        del wrong[times[0]]
     if wrong:
-        way_out = "give time in s, as numbers or dates" if str(times[0]) in wrong else "drop them"
+        way_out = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
         raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
     values = table[states].to_numpy(dtype=np.float64)
     t = seconds(_times(table[times[0]]))
     if np.isnan(values).any():
-        present = present_rows(dict(zip(map(str, states), values.T, strict=True)))
+        present = present_rows(dict(zip(states, values.T, strict=True)))
         t, values = t[present], values[present]
         warnings.warn(gap_words(t, len(table)), MissingSamples, stacklevel=5)
-    return Trajectory(t, values, list(map(str, states)))
+    return Trajectory(t, values, states)
+
+
+def _word(label: object) -> str:
+    """A column's label as a name: that of a number could not be told from a constant term."""
+    return f"x{label}" if isinstance(label, int | np.integer) else str(label)
 
 
 def _times(column: pd.Series) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
+from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.machine.screen import html_table, one_screen, text_table
 
@@ -47,7 +48,8 @@ class Trajectory:
     clock: the unit that people read its times in; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are
     not finite (what is masked, too), not real numbers or of a size below 1e-50, repeated
-    names, fewer than two samples, or a state that never changes.
+    names or names that are no words of letters, digits and _, fewer than two samples, or a state
+    that never changes.
 
     >>> t = np.linspace(0.0, 1e-3, 101)
     >>> run = ep.Trajectory(t, np.sin(6e4 * t)[:, None], ["I_d"], units={"I_d": "A"})
@@ -77,6 +79,8 @@ class Trajectory:
             "units": MappingProxyType({n: self.units.get(n, "1") for n in self.names}),
         }.items():
             object.__setattr__(self, name, value)
+        for name in self.names:
+            check_state(name)
         self._check_shapes()
         check_time(self.t)
         check_finite(self.t, self.values, self.names)

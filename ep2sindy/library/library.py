@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.library.display import library_html, library_text
 from ep2sindy.library.functions import Function
+from ep2sindy.library.names import check_state
 from ep2sindy.library.size import check_degrees, check_values
 from ep2sindy.library.terms import Factor, Term, Variable, functions_named, product, read_term
 
@@ -25,7 +26,7 @@ class Library:
     exponents: (terms, variables then functions), non-negative integers; a row of zeros is the
     constant. functions: the factors that are not variables; none makes every term a monomial.
     Term names read `1`, `n_i`, `n_i*n_n`, `n_i^2`, factors in the order of `variables`.
-    Raises ValueError for repeated variables or terms, or no term at all.
+    Raises ValueError for repeated variables or terms, a variable that is no word, or no term.
     """
 
     variables: Sequence[str]
@@ -38,6 +39,8 @@ class Library:
         object.__setattr__(self, "variables", tuple(self.variables))
         object.__setattr__(self, "functions", tuple(self.functions))
         object.__setattr__(self, "exponents", exponents)
+        for name in self.variables:
+            check_state(name)
         if len(set(self.variables)) < len(self.variables):
             raise ValueError(f"variables must be unique: {list(self.variables)}")
         if not len(exponents):

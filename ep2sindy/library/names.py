@@ -44,13 +44,24 @@ _ARGUMENT = re.compile(
 )
 
 
+_FACTOR = r"[^\W\d]\w{,99}(?:\^\d{1,3})?"
+
+
 def check_variable(name: str) -> None:
     """Raise ValueError for a name that no term could hold: it is no path and no markup either."""
-    if not re.fullmatch(r"[^\W\d]\w{,99}", name):
+    if not isinstance(name, str) or not re.fullmatch(r"[^\W\d]\w{,99}", name):
+        word = re.sub(r"\W+", "_", str(name)).strip("_")[:50] or "x"
+        other = f"x{word}" if word[0].isdecimal() else word
         raise ValueError(
             f"a variable's name must be a word of letters, digits and _, such as 'n_i': {name!r} "
-            "came"
+            f"came; rename it, perhaps {other!r}"
         )
+
+
+def check_state(name: str) -> None:
+    """The same for a variable of a library: it may be an average of a product, `<n_i*n_n>`, too."""
+    if not (isinstance(name, str) and re.fullmatch(rf"<{_FACTOR}(?:\*{_FACTOR})*>", name)):
+        check_variable(name)
 
 
 LONGEST_POWER = 100  # digits: what has more is no number of anything
