@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TextIO
+from typing import Any
 
 WIDTH, N_LINES = 100, 25
 
@@ -35,8 +35,8 @@ def say(text: str, *, error: bool = False) -> None:
 
 
 @contextmanager
-def on_screen(stream: TextIO) -> Iterator[None]:
-    """Print within: a screen that has gone away (`| head`), or that is full, ends nothing.
+def on_screen(stream: Any) -> Iterator[None]:
+    """Print to a stream within: a screen that has gone away (`| head`), or is full, ends nothing.
 
     What is printed after goes nowhere.
     """
