@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import fftconvolve
 
 from ep2sindy.signals.attractor import (
+    _averaged,
     best_shift,
     distribution_distances,
     find_cycle,
@@ -28,6 +30,13 @@ def spiky(t: np.ndarray, *, shift: float = 0.0, f_Hz: float = F_HZ) -> np.ndarra
 
 def times(n_periods: float) -> np.ndarray:
     return DT_S * np.arange(round(n_periods / (F_HZ * DT_S)) + 1)
+
+
+@pytest.mark.parametrize("n", [7, 64])
+def test_averages_under_a_window_are_those_of_scipy(n: int) -> None:
+    x = np.exp(1j * np.arange(301) ** 1.5)
+    window = np.hanning(n)
+    np.testing.assert_allclose(_averaged(x, window), fftconvolve(x, window, "same"), atol=1e-12)
 
 
 @pytest.mark.parametrize("n_periods", [6.3, 20.0, 81.7])

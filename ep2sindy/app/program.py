@@ -29,11 +29,10 @@ from yaml import YAMLError
 
 from ep2sindy.app.typed_only import check_places, checked_loader, resolved
 from ep2sindy.machine.interruption import end_as_interrupted
-from ep2sindy.machine.own import isolated_children
+from ep2sindy.machine.own import PACKAGE, isolated_children
 from ep2sindy.machine.screen import plain, say
 from ep2sindy.machine.threads import start_on_one_thread
 
-PACKAGE = Path(__file__).resolve().parents[1]
 USUAL_WARNING = warnings.formatwarning
 
 

@@ -8,7 +8,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from ep2sindy.machine.own import away_from
+from ep2sindy.machine.own import PACKAGE, away_from
 from ep2sindy.machine.screen import say
 
 SETTINGS = ".numba_config.yaml"  # of the current folder, which may be anybody's
@@ -18,7 +18,6 @@ with away_from(SETTINGS):
     from numba.core import config, event
 config._config_fname = ""  # looked for again whenever something is compiled
 
-PACKAGE = Path(__file__).resolve().parents[1]
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."
 
 
