@@ -12,6 +12,8 @@ from jaxtyping import Float
 from ep2sindy.constraints.relations import Relation
 from ep2sindy.constraints.support import relations_of
 from ep2sindy.data.given import Runs, trajectories_of
+from ep2sindy.data.repeats import check_repeats
+from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import Choice, choose
 from ep2sindy.discovery.estimated import estimated
@@ -43,6 +45,7 @@ class Discovery:
     ambiguities: terms that these data cannot tell apart, and rows that are few for the terms.
     note: how a rule that judges whole systems of equations came to its model, how sure a joint
     search is, or that a model leaves more than noise; else empty.
+    remarks: what the samples show that is not as assumed, in sentences (`Estimate.remarks`).
     estimate: of states and coefficients together, where the search was joint.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
@@ -59,6 +62,7 @@ class Discovery:
     model: SparseModel = field(repr=False)
     ambiguities: Sequence[Ambiguity]
     note: str = ""
+    remarks: Sequence[str] = ()
     estimate: Estimate | None = field(default=None, repr=False)
 
     @property
@@ -70,15 +74,17 @@ class Discovery:
         )
 
     def __repr__(self) -> str:
-        notes = [f"note: {a.message}" for a in self.ambiguities][:MOST_NOTES]
-        left = len(self.ambiguities) - len(notes)
+        said = [*self.remarks, *(a.message for a in self.ambiguities)]
+        notes = [f"note: {each}" for each in said[:MOST_NOTES]]
+        left = len(said) - len(notes)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
         head = [self._headline(), *([self.note] if self.note else [])]
         body = model_lines(self.model, n_lines=N_LINES - len(head) - len(tail))
         return one_screen([*head, *body, *tail])
 
     def _repr_html_(self) -> str:
-        notes = "".join(f"<li>{html.escape(a.message)}</li>" for a in self.ambiguities)
+        said = [*self.remarks, *(a.message for a in self.ambiguities)]
+        notes = "".join(f"<li>{html.escape(each)}</li>" for each in said)
         lines = [self._headline(), *([self.note] if self.note else [])]
         head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
         return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
@@ -120,6 +126,7 @@ def discover(
     check_kind("recipe", recipe, Recipe, "ep.Recipe(selection=ep.EBIC())")
     asked = Asked(relations_of(relations), terms or {})
     check_asked(asked, library, trajectories[0].state_names)
+    check_repeats(trajectories)
     watch = as_progress(progress)
     estimate, fronts = _searched(trajectories, library, recipe, asked, seed, watch)
     choice = choose(
@@ -128,14 +135,14 @@ def discover(
         estimate=estimate, progress=watch,
     )  # fmt: skip
     choice = _judged(choice, trajectories, library, recipe)
-    findings = _findings([front.problem for front in fronts.values()], recipe, asked)
     return Discovery(
         fronts=fronts,
         scores=dict(zip(fronts, choice.scores, strict=True)),
         chosen=dict(zip(fronts, choice.chosen, strict=True)),
         model=choice.model,
-        ambiguities=findings,
+        ambiguities=_findings([front.problem for front in fronts.values()], recipe, asked),
         note=choice.note,
+        remarks=_limits(trajectories) if estimate is None else estimate.remarks,
         estimate=estimate,
     )
 
@@ -149,6 +156,14 @@ def _judged(choice: Choice, runs: Sequence[Trajectory], library: Library, recipe
     misfit = misfit_of(chosen)
     model = replace(choice.model, covariance=None) if misfit else choice.model
     return replace(choice, chosen=chosen, model=model, note=choice.note or misfit)
+
+
+def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
+    """What is said of clipped or rounded samples where rows are regressed on them."""
+    found = [bounds_of(run.states, run.state_names) for run in runs]
+    words = dict.fromkeys(each for bounds in found if bounds for each in bounds.words)
+    way_out = "rows take them for values; Recipe(search=Joint()) reads them as limits"
+    return tuple(f"{each}: {way_out}" for each in words)
 
 
 def _findings(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.estimation.lateness import DelayedGram, delayed_gram
 from ep2sindy.estimation.likelihood import FAR, Fit, Level, enough_substeps, fitted, gram, squares
 from ep2sindy.estimation.problem import Problem
 from ep2sindy.estimation.supports import alternatives, best_support, excess
@@ -25,11 +26,15 @@ WITHIN, MOST_TRIED, MOST_ROUNDS = 12.0, 6, 6  # above the chosen score; of each 
 
 @dataclass(frozen=True, eq=False)
 class Annealed:
-    """A fit, the level that it ended at, and its squares plus the prices of its terms."""
+    """A fit, the level that it ended at, and its squares plus the prices of its terms.
+
+    around: what is near it, where its support was weighed against others.
+    """
 
     fit: Fit
     level: Level
     score: float
+    around: DelayedGram | None = None
 
 
 def annealed(
@@ -44,7 +49,7 @@ def annealed(
     """Fit level by level; at each, exchange terms as long as squares plus prices fall."""
     n_substeps, score = 1, np.inf
     for rho, share in schedule:
-        fit, level = _at_level(problem, fit, Level(noise, rho, n_substeps))
+        fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
         n_substeps = level.n_substeps
         fit, score = _exchanged(problem, fit, level, share * prices, max_terms)
     return Annealed(fit, level, score)
@@ -61,8 +66,9 @@ def polished(
         return found
     tried = {found.fit.support.tobytes()}
     for _ in range(MOST_ROUNDS):
-        warmer, level = _at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
-        pair = gram(problem, warmer, level)
+        warmer, level = at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
+        around = delayed_gram(problem, warmer, level)
+        pair = around.at_rest
         if not (pair.finite and np.isfinite(found.score)):
             return found
         others = alternatives(
@@ -72,18 +78,18 @@ def polished(
         for each in others[:MOST_TRIED]:
             tried.add(each.support.tobytes())
             start = replace(warmer, support=each.support, free=each.free)
-            fit, cold = _at_level(problem, start, level)
-            fit, cold = _at_level(problem, fit, replace(cold, rho=found.level.rho))
+            fit, cold = at_level(problem, start, level)
+            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho))
             score = float(fit.total + prices[fit.support].sum())
             if score < found.score:
                 found = Annealed(fit, cold, score)
                 break
         else:
-            return found
+            return replace(found, around=around)
     return found
 
 
-def _at_level(problem: Problem, fit: Fit, level: Level) -> tuple[Fit, Level]:
+def at_level(problem: Problem, fit: Fit, level: Level) -> tuple[Fit, Level]:
     """Fit at a level, with as many substeps as that asks for."""
     level = replace(level, n_substeps=enough_substeps(problem, fit, level))
     if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():

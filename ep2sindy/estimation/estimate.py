@@ -10,10 +10,12 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
 from ep2sindy.data.domain import check_domain
+from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.joint import SAMPLES_PER_TERM, Joint, Solution, enough_samples, solve
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.problem import Problem, scaled_problem
+from ep2sindy.estimation.remarks import delay_words, late_words, remarks
 from ep2sindy.estimation.size import check_size
 from ep2sindy.estimation.supports import priced, supports_by_size
 from ep2sindy.library.library import Library
@@ -22,6 +24,7 @@ from ep2sindy.model.model import SparseModel
 
 MOST_RIVALS = 5
 LEAST_ODDS = 1e-3  # of a rival that is worth a word
+EVEN = 0.2  # odds of a rival that leave it open which of the two is right
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,11 @@ class Estimate:
     empty where they do. few: a word where there are too few samples to tell; else empty.
     weighed: by state, the best supports of every size. rivals: what else may be, most likely
     first.
+    remarks: what the samples show that is not as assumed, in sentences: limits of sensors, noise
+    that lasts, grows or has outliers, states that hang together.
+    kurtosis: (d,), of the noise, 3 where it is normal. growth: (d,), share of its variance that
+    grows with the state. delays_s: (d,), by which channels come late; `Joint(align=True)` brings
+    them together, and leaves out what that takes at the ends.
     """
 
     model: SparseModel
@@ -69,6 +77,10 @@ class Estimate:
     few: str
     weighed: Mapping[str, Sequence[Weighed]] = field(repr=False)
     rivals: Sequence[Rival]
+    remarks: tuple[str, ...]
+    kurtosis: Float[np.ndarray, " d"]
+    growth: Float[np.ndarray, " d"]
+    delays_s: Float[np.ndarray, " d"]
 
     @property
     def note(self) -> str:
@@ -79,7 +91,9 @@ class Estimate:
             return self.few or "no other support of an equation has odds above 1:1000"
         first = self.rivals[0]
         odds = f"{first.state}' of {', '.join(first.terms)} at odds of 1:{1.0 / first.odds:.3g}"
-        return f"{self.few}; next is {odds}" if self.few else f"the next best: {odds}"
+        if self.few:
+            return f"{self.few}; next is {odds}"
+        return f"{'not decided' if first.odds > EVEN else 'the next best'}: {odds}"
 
 
 def estimate(
@@ -107,27 +121,57 @@ def estimate(
     watch = as_progress(progress)
     with watch.stage(None, "step", "states and coefficients") as advance:
         problem = scaled_problem(runs, library, relations, terms, advance=advance)
-        found = solve(problem, max_terms=search.terms_for(problem))
+        answer = _answered(problem, search)
+    problem, found = answer.problem, answer.found
     fit, level = found.annealed.fit, found.annealed.level
     pair = gram(problem, fit, level)
     weighed = {
         state: _weighed(problem, pair, found, block, search)
         for block, state in counted(watch, list(enumerate(problem.states)), "equation", "rivals")
     }
-    misfit = _misfit(problem, found) or _at_limit(problem, found, search)
     model = _model(problem, library, found, units or runs[0].units, provenance or {})
     return Estimate(
         # The intervals of a model that leaves more than noise would not hold the truth.
-        model=replace(model, covariance=None) if misfit else model,
+        model=replace(model, covariance=None) if answer.misfit else model,
         paths=tuple(path * problem.scale for path in fit.paths),
         noise_std=found.noise.std * problem.scale,
         memory=found.noise.memory,
         flow_error=found.flow_error,
-        misfit=misfit,
+        misfit=answer.misfit,
         few=_few(problem, search.terms_for(problem)),
         weighed=weighed,
         rivals=_rivals(problem, found, weighed),
+        remarks=(*answer.said, *remarks(problem, found.noise)),
+        kurtosis=found.noise.kurtosis,
+        growth=found.noise.growth,
+        delays_s=answer.delays * problem.step_s,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """What is reported: of the samples as they are, or of those brought together, if asked for.
+
+    delays: (d,), in mean steps. said: what was done to the samples.
+    """
+
+    problem: Problem
+    found: Solution
+    misfit: str
+    delays: Float[np.ndarray, " d"]
+    said: tuple[str, ...] = ()
+
+
+def _answered(problem: Problem, search: Joint) -> _Answer:
+    found, late = solve(problem, max_terms=search.terms_for(problem))
+    if late is None:
+        misfit = _misfit(problem, found) or _at_limit(problem, found, search)
+        return _Answer(problem, found, misfit, np.zeros(len(problem.states)))
+    if not search.align:
+        return _Answer(problem, found, late_words(problem, late), late.delays)
+    said = f"{delay_words(problem, late.delays)}: brought together with the others"
+    misfit = _at_limit(late.problem, late.solution, search)
+    return _Answer(late.problem, late.solution, misfit, late.delays, (said,))
 
 
 def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
@@ -145,6 +189,7 @@ def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
             "use a smaller library or more data"
         )
     check_domain(runs, library)
+    check_repeats(runs)
     for run in runs:
         if run.n_samples < 5:
             raise ValueError(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
+from math import inf, log
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed, polished
+from ep2sindy.estimation.lateness import PAYS, moved, suspected, with_delays
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import Problem
 from ep2sindy.estimation.start import smoothed_start
@@ -18,6 +19,8 @@ SAMPLES_PER_TERM = 5  # of the library: fewer do not tell which
 SAMPLES_PER_COEFFICIENT = 10  # of an equation, where they do not: more terms follow the noise
 LET_GO = 0.5  # of a state's spread: what is left of a state that the model does not follow
 ENOUGH_SAMPLES = 300  # to trust the first start: fewer are quickly tried from all
+# Moves of late channels, since the model of a delay is linear; mean steps that need no other.
+MOST_MOVES, SETTLED = 3, 0.05
 MOST_PASSES = 4  # until noise and support agree: two are the rule
 # Of the smoother, by log10 of process to measurement noise: where the likely one leads astray.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
@@ -29,11 +32,13 @@ class Joint:
 
     For noisy samples of all states of a system whose law the library holds: no derivative is
     estimated, so it finds what no regression can (docs/estimation.md). White noise, or noise that
-    lasts for some samples. max_terms: of one equation.
+    lasts for some samples. max_terms: of one equation. align: channels that are found to come late
+    are brought forward; else the model is said to be a misfit, with their delays.
     Raises ValueError for fewer than one term.
     """
 
     max_terms: int = 7
+    align: bool = False
 
     def __post_init__(self) -> None:
         if self.max_terms < 1:
@@ -73,8 +78,21 @@ class Solution:
         return exact and bool(np.isfinite(self.score))
 
 
-def solve(problem: Problem, *, max_terms: int) -> Solution:
-    """The most likely support from the likely smoothing, and from others where it fits badly."""
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """What fits samples whose channels were brought forward by their delays.
+
+    delays: (d,), in mean steps.
+    """
+
+    problem: Problem
+    solution: Solution
+    delays: Float[np.ndarray, " d"]
+
+
+def solve(problem: Problem, *, max_terms: int) -> tuple[Solution, Aligned | None]:
+    """The most likely support from the likely smoothing, and from others where it fits badly; and
+    what explains the samples better, if some channels come late."""
     spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
 
     def rank(each: Solution) -> tuple[int, float]:
@@ -82,12 +100,39 @@ def solve(problem: Problem, *, max_terms: int) -> Solution:
         let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
         return int(let_go.sum()), each.score
 
-    best = _from_start(problem, None, max_terms)
+    best = first = _from_start(problem, None, max_terms)
+    late = _aligned(problem, first, max_terms)
     for log10_ratio in OTHER_STARTS:
-        if best.fits and problem.n_samples >= ENOUGH_SAMPLES:
+        if late or (best.fits and problem.n_samples >= ENOUGH_SAMPLES):
             break
         best = min([best, _from_start(problem, log10_ratio, max_terms)], key=rank)
-    return best
+    return best, late if best is first else _aligned(problem, best, max_terms)
+
+
+def _aligned(problem: Problem, found: Solution, max_terms: int) -> Aligned | None:
+    """What fits, and is likelier, with channels that come late; None where none does."""
+    around = found.annealed.around
+    if around is None:  # no model follows the samples
+        return None
+    support = found.annealed.fit.support
+    step = suspected(problem, around, support, found.prices, max_terms=max_terms)
+    if step is None:
+        return None
+    here, now, late, delays = problem, found, step != 0.0, np.zeros(len(step))
+    for _ in range(MOST_MOVES):
+        delays = delays + step
+        here = moved(here, now.annealed.fit.paths, step)
+        now = _from_start(here, None, max_terms)
+        if now.annealed.around is None:
+            return None
+        around, support = now.annealed.around, now.annealed.fit.support
+        step = with_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
+        if np.abs(step).max() < SETTLED:
+            break
+    # Samples at the ends are left out: their share of the likelihood is that of the others.
+    score = now.score + now.noise.deviance * (problem.n_samples / here.n_samples - 1.0)
+    price = late.sum() * log(problem.n_samples) + PAYS
+    return Aligned(here, now, delays) if now.fits and score + price < found.score else None
 
 
 def _from_start(problem: Problem, log10_ratio: float | None, max_terms: int) -> Solution:

@@ -7,15 +7,17 @@ as it falls they become an exact trajectory of the model, and the squares its ch
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.estimation.kernels import departures, eliminated
-from ep2sindy.estimation.problem import Flow, Problem
+from ep2sindy.estimation.observed import seen
+from ep2sindy.estimation.problem import Flow, Problem, Record
 
 FREE_START = 100.0  # variance of the first state before any sample: ten times its RMS
 MOST_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
@@ -92,7 +94,7 @@ def squares(
             problem.records, paths, level.variances, level.processes, strict=True
         ):
             misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
-            total += np.nansum(np.square(record.samples - path) / variance, axis=0)
+            total += seen(record, path, variance).squares.sum(axis=0)
             total += (np.square(misses) / process).sum(axis=0)
     return np.where(np.isfinite(total), total, np.inf)
 
@@ -185,11 +187,9 @@ def _step(
     for k, (record, path, flow) in enumerate(zip(problem.records, fit.paths, flows, strict=True)):
         misses = flow.ends - path[1:] + flow.slopes[:, :, d:] @ step
         by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-        residuals = record.samples - path
+        residuals, variance, _ = seen(record, path, level.variances[k])
         moves.append(
-            departures(
-                by_state, misses, residuals, level.variances[k], level.processes[k], FREE_START
-            )
+            departures(by_state, misses, residuals, variance, level.processes[k], FREE_START)
         )
     return change, moves
 
@@ -197,25 +197,33 @@ def _step(
 def _hessian(
     problem: Problem, fit: Fit, support: Bool[np.ndarray, " free"], level: Level
 ) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
-    """Half the second derivatives by the support's coefficients, minus half the first, the least
-    squares with none of them changed, and the flows."""
-    n = int(support.sum())
-    hessian, gradient, least, flows = np.zeros((n, n)), np.zeros(n), 0.0, []
+    """`hessian` by a support's coefficients."""
+    return hessian(
+        problem,
+        fit,
+        level,
+        lambda record, path: problem.flow(record, path[:-1], fit.free, support, level.n_substeps),
+    )
+
+
+def hessian(
+    problem: Problem, fit: Fit, level: Level, flow_of: Callable[[Record, np.ndarray], Flow]
+) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
+    """Half the second derivatives by what the flow has slopes of, minus half the first, the least
+    squares with none of it changed, and the flows."""
+    total: list[Any] = [0.0, 0.0, 0.0]
+    flows = []
     for record, path, variance, process in zip(
         problem.records, fit.paths, level.variances, level.processes, strict=True
     ):
-        flow = problem.flow(record, path[:-1], fit.free, support, level.n_substeps)
-        h, g, rest, _ = eliminated(
-            flow.slopes,
-            flow.ends - path[1:],
-            record.samples - path,
-            variance,
-            process,
-            FREE_START,
+        flow = flow_of(record, path)
+        residuals, apparent, _ = seen(record, path, variance)
+        parts = eliminated(
+            flow.slopes, flow.ends - path[1:], residuals, apparent, process, FREE_START
         )
-        hessian, gradient, least = hessian + h, gradient + g, least + rest
+        total = [whole + part for whole, part in zip(total, parts[:3], strict=True)]
         flows.append(flow)
-    return hessian, gradient, least, flows
+    return total[0], total[1], total[2], flows
 
 
 def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:

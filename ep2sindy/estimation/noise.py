@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.estimation.kernels import eliminated
 from ep2sindy.estimation.likelihood import FREE_START, Fit, Level, fitted
+from ep2sindy.estimation.likelihood import squares as squares_of
+from ep2sindy.estimation.observed import seen
 from ep2sindy.estimation.problem import Problem
 
 FLOOR = 1e-3  # of the RMS: no model and no integration is exact
@@ -17,10 +19,12 @@ SIGNIFICANT = 3.5  # standard errors of an autocorrelation
 MOST_LASTING = 0.98
 ALIKE = 7.0  # of the logarithm of their mean square, which scatters by 2.15 over sqrt(n)
 LONGER = 6.0  # of autocorrelations, which scatter by up to 1.7 over sqrt(n)
+NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # that are tried beside limits
 LAGS = (2, 3, 4, 5, 6)
 TINY = float(np.finfo(np.float64).tiny)
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of variance that grows
 GROWTH_SHOWS = 12.0  # by which growing noise must be likelier, twice its logarithm
+OUTLYING = 5.0  # standard deviations
 ORDER = 3  # of differences: they leave little of a signal that the samples resolve
 LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of error of the flow that are tried
 # What is believed beforehand, worth so many samples: noise is alike in all states. Else, with few
@@ -36,14 +40,19 @@ class Noise:
     std: (d,), RMS over all samples, scaled, no lower than the floor. shape: by record,
     (samples, d), the size at a sample in units of std: one, or growing with the state. memory:
     (d,), correlation from one sample to the next where noise lasts, else 0. unexplained: (d,), the
-    same where the samples show no such noise: then it is the model's error. deviance: -2 log
-    likelihood of the residuals.
+    same where the samples show no such noise: then it is the model's error. growth: (d,), share of
+    the variance that grows with the state. kurtosis: (d,), of normal noise 3; outliers: (d,), how
+    many samples are off by five standard deviations of what most show. deviance: -2 log likelihood
+    of the residuals.
     """
 
     std: Float[np.ndarray, " d"]
     shape: tuple[np.ndarray, ...]
     memory: Float[np.ndarray, " d"]
     unexplained: Float[np.ndarray, " d"]
+    growth: Float[np.ndarray, " d"]
+    kurtosis: Float[np.ndarray, " d"]
+    outliers: Int[np.ndarray, " d"]
     deviance: float
 
     @property
@@ -67,36 +76,90 @@ def noise_beside(problem: Problem, fit: Fit) -> Noise:
     left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
     n = problem.n_samples
     per_state = fit.support.sum() / len(problem.states) + len(left)
-    freedom = n / max(n - per_state, 1.0)
-    std = np.sqrt(freedom * sum(np.square(e).sum(axis=0) for e in left) / n)
-    shape = _shapes(fit.paths, left)
+    freedom = np.sqrt(n / max(n - per_state, 1.0))
+    std = freedom * np.sqrt(sum(np.square(e).sum(axis=0) for e in left) / n)
+    shape, growth = _shapes(fit.paths, left)
+    limited = problem.limited
+    if limited.any():
+        shape = tuple(np.where(limited, 1.0, each) for each in shape)
+        growth = np.where(limited, 0.0, growth)
+        likely, between = _likeliest_std(problem, fit, std)
+        std = np.where(limited, freedom * likely, std)
+        left = _pulls(problem, fit, std)
     unit = [e / s for e, s in zip(left, shape, strict=True)]
-    squares = sum(np.square(e).sum(axis=0) for e in unit)
-    lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in unit)
-    memory = np.clip(lagged / np.maximum(squares, TINY), 0.0, MOST_LASTING)
+    memory = _memory(unit)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, std, memory)
     std = np.maximum(std, FLOOR)
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std).mean()
-    logs = sum(np.log(np.square(s)).sum() for s in shape)
+    logs = n * np.log(alike) + sum(np.log(np.square(s)).sum(axis=0) for s in shape)
+    if limited.any():
+        logs = np.where(limited, between, logs)
+    kurtosis, outliers = _tails(unit, memory)
     return Noise(
         std=std,
         shape=shape,
         memory=lasting,
         unexplained=np.where(shows & ~believed, memory, 0.0),
-        deviance=float(logs + n * np.log(alike * (1.0 - np.square(lasting))).sum()),
+        growth=growth,
+        kurtosis=kurtosis,
+        outliers=outliers,
+        deviance=float((logs + n * np.log1p(-np.square(lasting))).sum()),
     )
+
+
+def _likeliest_std(
+    problem: Problem, fit: Fit, std: Float[np.ndarray, " d"]
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """Where sensors have limits: the noise under which the samples are likeliest, and -2 log of
+    their likelihood, beside that of values alone."""
+    best, found = np.full(len(std), np.inf), std
+    for share in NOISE_SHARES:
+        tried = np.maximum(share * std, FLOOR)
+        deviance = np.zeros(len(std))
+        for record, path in zip(problem.records, fit.paths, strict=True):
+            squares = seen(record, path, np.tile(np.square(tried), (len(path), 1))).squares
+            values = record.n_values
+            deviance += squares.sum(axis=0) + values * (np.log(np.square(tried)) - 1.0)
+        found = np.where(deviance < best, tried, found)
+        best = np.minimum(deviance, best)
+    return found, best
+
+
+def _pulls(
+    problem: Problem, fit: Fit, std: Float[np.ndarray, " d"]
+) -> list[Float[np.ndarray, "samples d"]]:
+    """What is left of values; of limits, what the noise is thought to have been."""
+    pulls = []
+    for record, path in zip(problem.records, fit.paths, strict=True):
+        by_sample = seen(record, path, np.tile(np.square(std), (len(path), 1)))
+        pull = by_sample.residuals / by_sample.variance * np.square(std)
+        pulls.append(np.where(np.isfinite(pull), pull, 0.0))
+    return pulls
+
+
+def _memory(left: Sequence[Float[np.ndarray, "samples d"]]) -> Float[np.ndarray, " d"]:
+    """Correlation from one sample to the next."""
+    squares = sum(np.square(e).sum(axis=0) for e in left)
+    lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in left)
+    return np.clip(lagged / np.maximum(squares, TINY), 0.0, MOST_LASTING)
 
 
 def _shapes(
     paths: Sequence[Float[np.ndarray, "samples d"]], left: Sequence[Float[np.ndarray, "samples d"]]
-) -> tuple[np.ndarray, ...]:
-    """How noise grows with the state: variance of 1 - w + w x^2 / mean of x^2, w by likelihood."""
+) -> tuple[tuple[np.ndarray, ...], Float[np.ndarray, " d"]]:
+    """How noise grows with the state: variance of 1 - w + w x^2 / mean of x^2, w by likelihood.
+
+    Returns its root, by record, and w.
+    """
     x2, e2 = (np.square(np.concatenate(list(parts))) for parts in (paths, left))
     relative = x2 / np.maximum(x2.mean(axis=0), TINY)
-    variance = np.ones_like(x2)
-    best = len(x2) * np.log(np.maximum(e2.mean(axis=0), TINY)) - GROWTH_SHOWS
+    variance, growth = np.ones_like(x2), np.zeros(x2.shape[1])
+    # Squares of noise that lasts come in groups: fewer of them are independent.
+    square = np.square(_memory(left))
+    shows = GROWTH_SHOWS * (1.0 + square) / (1.0 - square)
+    best = len(x2) * np.log(np.maximum(e2.mean(axis=0), TINY)) - shows
     for share in SHARES:
         tried = 1.0 - share + share * relative
         ratio = (e2 / tried).mean(axis=0)
@@ -104,8 +167,22 @@ def _shapes(
         better = deviance < best
         best = np.where(better, deviance, best)
         variance = np.where(better, tried, variance)
+        growth = np.where(better, share, growth)
     ends = np.cumsum([len(path) for path in paths])[:-1]
-    return tuple(np.split(np.sqrt(variance), ends))
+    return tuple(np.split(np.sqrt(variance), ends)), growth
+
+
+def _tails(
+    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"]
+) -> tuple[Float[np.ndarray, " d"], Int[np.ndarray, " d"]]:
+    """Kurtosis of what is new in residuals from one sample to the next, and how many of them are
+    outliers."""
+    new = np.concatenate([e[1:] - memory * e[:-1] for e in left])
+    squares = np.square(new)
+    kurtosis = np.square(squares).mean(axis=0) / np.maximum(np.square(squares.mean(axis=0)), TINY)
+    # The median of squares of a normal variable is 0.455 of its variance.
+    beyond = squares > OUTLYING**2 * np.median(squares, axis=0) / 0.455
+    return kurtosis, beyond.sum(axis=0)
 
 
 def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
@@ -127,18 +204,26 @@ def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
 
 
 def _deviance(problem: Problem, fit: Fit, level: Level) -> float:
-    """-2 log likelihood of the samples by their innovations, all noise scaled to its best size."""
-    least = spread = 0.0
+    """-2 log likelihood of the samples by their innovations, all noise scaled to its best size.
+
+    Where there are limits, by Laplace's approximation, and the noise as it is: it is no scale then.
+    """
+    least = spread = by_limits = 0.0
     none = np.zeros_like(fit.support)
     for record, path, variance, process in zip(
         problem.records, fit.paths, level.variances, level.processes, strict=True
     ):
         flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-        residuals, misses = record.samples - path, flow.ends - path[1:]
+        residuals, apparent, _ = seen(record, path, variance)
+        misses = flow.ends - path[1:]
         _, _, squares, logs = eliminated(
-            flow.slopes, misses, residuals, variance, process, FREE_START
+            flow.slopes, misses, residuals, apparent, process, FREE_START
         )
         least, spread = least + squares, spread + logs
+        if record.limits is not None:
+            by_limits -= np.log(apparent[record.limits.at & np.isfinite(residuals)]).sum()
+    if problem.limited.any():
+        return spread + by_limits + float(squares_of(problem, fit.paths, fit.free, level).sum())
     n = problem.n_squares
     return spread + n * np.log(max(least, TINY) / n)
 
@@ -164,9 +249,9 @@ def _shown_by_samples(
 
     What a model leaves of a signal is smooth: it would make them smaller than they are.
     """
-    differences = [np.diff(r.samples, ORDER, axis=0) for r in problem.records]
-    count = max(sum(map(len, differences)), 1)
-    measured = sum(np.square(d).sum(axis=0) for d in differences) / count
+    differences = np.concatenate([np.diff(r.values, ORDER, axis=0) for r in problem.records])
+    count = np.maximum(np.isfinite(differences).sum(axis=0), 1)
+    measured = np.nansum(np.square(differences), axis=0) / count
     weights = (np.poly1d([1.0, -1.0]) ** ORDER).coeffs
     own, lags = np.convolve(weights, weights[::-1]), np.abs(np.arange(-ORDER, ORDER + 1))
     expected = np.square(std) * (own * memory[:, None] ** lags).sum(axis=1)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.constraints.relations import Relation, constraint
 from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.kernels import sensitivity_stage, term_values
 from ep2sindy.library.library import Library
@@ -21,16 +22,54 @@ STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 
 
 @dataclass(frozen=True, eq=False)
+class Limits:
+    """Samples that are no values: between what they lie, but for their noise.
+
+    at: which. lower, upper: of those, in their order, scaled. words: why.
+    """
+
+    at: Bool[np.ndarray, "samples d"]
+    lower: Float[np.ndarray, " limited"]
+    upper: Float[np.ndarray, " limited"]
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Record:
     """One trajectory in scaled variables.
 
     steps: (samples - 1,), in units of the mean step. samples: (samples, d). inputs: cubics
     through the samples' inputs, of time in units of the mean step; times: (samples,) so.
+    limits: of samples that are clipped or rounded.
     """
 
     times: Float[np.ndarray, " samples"]
     samples: Float[np.ndarray, "samples d"]
     inputs: Float[np.ndarray, "samples n_inputs"]
+    limits: Limits | None = None
+
+    @property
+    def values(self) -> Float[np.ndarray, "samples d"]:
+        """Samples that are values; NaN for limits."""
+        return (
+            self.samples if self.limits is None else np.where(self.limits.at, np.nan, self.samples)
+        )
+
+    def kept(
+        self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
+    ) -> Record:
+        """Some samples alone, with others in their place."""
+        limits = self.limits
+        if limits is not None:
+            lower, upper = self.samples.copy(), self.samples.copy()
+            lower[limits.at], upper[limits.at] = limits.lower, limits.upper
+            at, by = limits.at[kept], samples - self.samples[kept]
+            limits = Limits(at, (lower[kept] + by)[at], (upper[kept] + by)[at], limits.words)
+        return Record(self.times[kept], samples, self.inputs[kept], limits)
+
+    @property
+    def n_values(self) -> Int[np.ndarray, " d"]:
+        return np.isfinite(self.values).sum(axis=0)
 
     @cached_property
     def steps(self) -> Float[np.ndarray, " steps"]:
@@ -92,6 +131,12 @@ class Problem:
     def n_samples(self) -> int:
         return sum(len(record.samples) for record in self.records)
 
+    @cached_property
+    def limited(self) -> Bool[np.ndarray, " d"]:
+        """States of which some samples are limits."""
+        limits = [r.limits.at.any(axis=0) for r in self.records if r.limits is not None]
+        return np.any([np.zeros(len(self.states), dtype=np.bool_), *limits], axis=0)
+
     @property
     def n_squares(self) -> int:
         """Samples times states: about what the squares are where a model fits."""
@@ -118,6 +163,18 @@ class Problem:
         coef = np.zeros((len(self.library), len(self.states)))
         coef[self.column, self.equation] = self.C @ free + self.fixed
         return coef
+
+    @property
+    def driven(self) -> bool:
+        """Whether inputs drive the states."""
+        return any(record.inputs.shape[1] for record in self.records)
+
+    def rates(
+        self, record: Record, states: Float[np.ndarray, "samples d"], free: np.ndarray
+    ) -> Float[np.ndarray, "samples d"]:
+        """Derivatives at the samples, by the mean step."""
+        values = self._product_values(states, record.inputs)
+        return values @ (self._shares[:, 0].T @ self.coef(free))
 
     def ends(
         self,
@@ -179,6 +236,11 @@ class Problem:
         self, record: Record, states: Float[np.ndarray, "steps d"], share: float
     ) -> Float[np.ndarray, "steps products"]:
         inputs = record.inputs_at(share)
+        return self._product_values(states, inputs)
+
+    def _product_values(
+        self, states: Float[np.ndarray, "n d"], inputs: Float[np.ndarray, "n n_inputs"]
+    ) -> Float[np.ndarray, "n products"]:
         columns = np.concatenate([states, inputs, np.ones((len(states), 1))], axis=1)
         return term_values(self._products.with_functions(columns, axis=1), self._products.table)
 
@@ -248,4 +310,13 @@ def _record(run: Trajectory, size: np.ndarray, step_s: float) -> Record:
         times=(run.t - run.t[0]) / step_s,
         samples=run.states / size[:d],
         inputs=run.inputs / size[d:],
+        limits=_limits(run, size[:d]),
     )
+
+
+def _limits(run: Trajectory, size: np.ndarray) -> Limits | None:
+    found = bounds_of(run.states, run.state_names)
+    if found is None:
+        return None
+    at = found.lower < found.upper
+    return Limits(at, (found.lower / size)[at], (found.upper / size)[at], found.words)

@@ -120,7 +120,7 @@ def priced(
     """The least squares on a support, with its terms' prices."""
     free = np.zeros(len(support))
     quadratic, linear = gram.quadratic[np.ix_(support, support)], gram.linear[support]
-    inverse = _inverse(quadratic)
+    inverse = inverse_of(quadratic)
     free[support] = inverse @ linear
     # One refinement: what the cutoff dropped has no part in it.
     free[support] += inverse @ (linear - quadratic @ free[support])
@@ -140,7 +140,7 @@ def _offered(
     own = own & ~problem.required
     if not own.any():
         return [kept]
-    inverse = _inverse(gram.quadratic[np.ix_(kept, kept)])
+    inverse = inverse_of(gram.quadratic[np.ix_(kept, kept)])
     share = gram.quadratic[np.ix_(own, kept)] @ inverse
     xx = gram.quadratic[np.ix_(own, own)] - share @ gram.quadratic[np.ix_(kept, own)]
     xy = gram.linear[own] - share @ gram.linear[kept]
@@ -161,7 +161,7 @@ def _offered(
     return found
 
 
-def _inverse(quadratic: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def inverse_of(quadratic: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     size = unit_sizes(quadratic)
     unit = quadratic / np.outer(size, size)
     return np.linalg.pinv(unit, rcond=CUTOFF, hermitian=True) / np.outer(size, size)

@@ -13,7 +13,8 @@ from ep2sindy.report.document import Block, Section, Table, Text
 
 NOISE = (
     "Noise: standard deviation of what the model leaves of the samples. Memory: its correlation "
-    "from one sample to the next, 0 for white noise."
+    "from one sample to the next, 0 for white noise. Grows: share of its variance that grows with "
+    "the square of the state. Kurtosis: 3 where it is normal, more with outliers."
 )
 
 FITS = (
@@ -43,7 +44,7 @@ def estimate_section(name: str, found: Estimate, data: Trajectory) -> Section:
 
 
 def noise_table(found: Estimate, data: Trajectory) -> pd.DataFrame:
-    """By state: size of the noise in SI and beside the state's spread, and how long it lasts."""
+    """By state: size of the noise, in SI and beside the state's spread, and what it is like."""
     rows = []
     for k, state in enumerate(found.model.states):
         noise, spread = float(found.noise_std[k]), float(data.columns([state]).std())
@@ -53,6 +54,8 @@ def noise_table(found: Estimate, data: Trajectory) -> pd.DataFrame:
                 "noise (std)": f"{noise:.3g} {data.units[state]}".removesuffix(" 1"),
                 "of the state's std": f"{100.0 * noise / spread:.2g} %",
                 "memory": f"{found.memory[k]:.2f}",
+                "grows": f"{100.0 * found.growth[k]:.3g} %",
+                "kurtosis": f"{found.kurtosis[k]:.3g}",
             }
         )
     return pd.DataFrame(rows)
@@ -69,6 +72,10 @@ def estimate_summary(found: Estimate) -> dict[str, Any]:
     return {
         "noise_std": dict(zip(states, np.asarray(found.noise_std).tolist(), strict=True)),
         "memory": dict(zip(states, np.asarray(found.memory).tolist(), strict=True)),
+        "noise_growth": dict(zip(states, np.asarray(found.growth).tolist(), strict=True)),
+        "noise_kurtosis": dict(zip(states, np.asarray(found.kurtosis).tolist(), strict=True)),
+        "delays_s": dict(zip(states, np.asarray(found.delays_s).tolist(), strict=True)),
+        "remarks": list(found.remarks),
         "flow_error": found.flow_error,
         "misfit": found.misfit or None,
         "few": found.few or None,

@@ -225,6 +225,7 @@ def _library_section(name: str, result: LibraryResult, clock: Clock) -> Section:
             f"{len(library)} terms in {', '.join(library.variables)}; "
             f"selection: {result.recipe.selection}"
         ),
+        *(Text(f"note: {each}") for each in found.remarks),
         *(Text(f"note: {each.message}") for each in found.ambiguities if each.exact),
     ]
     n_alike = sum(not each.exact for each in found.ambiguities)
