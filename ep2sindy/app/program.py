@@ -15,11 +15,14 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -58,7 +61,7 @@ def run() -> None:
                 sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
             failed.extend(run_job(config, conf))
 
-        with checked_loader(), isolated_children():
+        with checked_loader(), isolated_children(), said_as_text():
             job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
         sys.exit(plain(f"error: {str(error) or type(error).__name__}"))
@@ -78,6 +81,21 @@ def run() -> None:
     if failed:
         why = failed[0] if len(failed) == 1 else f"{len(failed)} jobs failed"
         sys.exit(plain(f"error: {why}"))
+
+
+@contextmanager
+def said_as_text() -> Iterator[None]:
+    """What Hydra prints instead of a run, such as names of configs for --help, is said as text."""
+    given, _ = get_args_parser().parse_known_args()
+    if not (given.help or given.hydra_help or given.cfg or given.info):
+        yield
+        return
+    text = StringIO()
+    try:
+        with redirect_stdout(text):
+            yield
+    finally:
+        say(text.getvalue().rstrip("\n"))
 
 
 def _print_error(*error: Any) -> None:

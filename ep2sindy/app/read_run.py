@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from yaml import YAMLError
 
 from ep2sindy.app.yaml_files import check_yaml
 from ep2sindy.library.units import Clock
+from ep2sindy.machine.files import read_json
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
 
@@ -77,7 +77,7 @@ def read_run(folder: Path, number: int) -> ReadRun:
 def _checked(path: Path, kinds: Mapping[str, Any]) -> dict[str, Any]:
     """An object of JSON whose keys hold what a page makes of them."""
     with _damage_named(path):
-        found = json.loads(path.read_text("utf-8"))
+        found = read_json(path.read_text("utf-8"))
         if not isinstance(found, dict) or not REQUIRED & {*kinds} <= {*found}:
             raise ValueError(f"an object with {sorted(REQUIRED & {*kinds})} must stand there")
         for name, kind in kinds.items():

@@ -6,17 +6,17 @@ index is made anew from all records there are.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from ep2sindy.machine.files import write_json, write_text
-from ep2sindy.machine.screen import say
+from ep2sindy.machine.files import read_json, write_json, write_text
+from ep2sindy.machine.screen import in_line, say
 
 RECORDS = "jobs"
 
@@ -58,7 +58,7 @@ def noted_job() -> Iterator[
 def records_of(sweep: Path) -> list[dict[str, Any]]:
     """What every job noted, in their order."""
     paths = (sweep / RECORDS).glob("[!.]*.json")  # not what is being written
-    return sorted((json.loads(path.read_text("utf-8")) for path in paths), key=lambda r: r["job"])
+    return sorted((read_json(path.read_text("utf-8")) for path in paths), key=lambda r: r["job"])
 
 
 def write_index(sweep: Path) -> None:
@@ -107,15 +107,16 @@ def index_text(sweep: Path, *, n_figures: int = 4) -> str:
     figures = list(dict.fromkeys(name for r in records for name in r.get("headline", {})))
     table = Table(title=f"sweep of {len(records)} jobs", title_justify="left", show_edge=False)
     for name in ("job", "overrides", "status", *figures[:n_figures], "folder or error"):
-        table.add_column(name, overflow="fold")
+        table.add_column(in_line(name), overflow="fold")
     for record in records:
         headline = record.get("headline", {})
         varied = [text for text in record["overrides"] if text not in everywhere]
         values = [headline.get(name) for name in figures[:n_figures]]
         texts = ["-" if value is None else f"{value:.4g}" for value in values]
         where = record.get("folder") or record.get("error", "")
-        table.add_row(str(record["job"]), " ".join(varied), record["status"], *texts, where)
-    console = Console(width=120)
-    with console.capture() as captured:
-        console.print(table, markup=False)
-    return f"{captured.get()}{sweep / 'index.html'}\n{sweep / 'index.csv'}"
+        cells = [str(record["job"]), " ".join(varied), record["status"], *texts, where]
+        table.add_row(*map(in_line, cells))
+    text = StringIO()  # of no terminal: without colours, which `say` would write out
+    console = Console(file=text, width=120, force_terminal=False, markup=False, emoji=False)
+    console.print(table)
+    return f"{text.getvalue()}{sweep / 'index.html'}\n{sweep / 'index.csv'}"

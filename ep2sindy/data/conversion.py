@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -84,10 +85,15 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
 def same_unit(unit: str, stated: str) -> bool:
     """Whether both texts mean one unit; a text that is no unit says nothing against."""
     try:
-        a, b = _ruler(unit).to_base_units(), _ruler(stated).to_base_units()
+        a, b = _ruler(unit).to_base_units(), _ruler(counted_in(stated)).to_base_units()
     except unit_errors():
         return True
     return a.check(b.dimensionality) and np.allclose(a.magnitude, b.magnitude, rtol=1e-9, atol=0.0)
+
+
+def counted_in(stated: str) -> str:
+    """The unit that times count: days, of `days since 1970-01-01`, as NetCDF says it."""
+    return re.split(r"\s+since\s", stated, maxsplit=1)[0].strip()
 
 
 def _ruler(unit: str) -> Any:

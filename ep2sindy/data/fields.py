@@ -9,7 +9,6 @@ refused, since an average over a changing set of cells is no observable.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.library.units import Clock
+from ep2sindy.machine.files import read_json
 
 DIMS = ("time", "z", "r")
 
@@ -76,7 +76,7 @@ def channel_length_m(attributes: Mapping[str, Any]) -> float | None:
     if "channel_m" in attributes:
         return float(attributes["channel_m"])
     try:
-        length = json.loads(attributes["parameters"])["thruster"]["channel_length"]
+        length = read_json(attributes["parameters"])["thruster"]["channel_length"]
     except (KeyError, TypeError, ValueError):
         return None
     return float(length)

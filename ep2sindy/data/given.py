@@ -69,7 +69,7 @@ def _trajectory(run: object, which: str) -> Trajectory:
 
 def _from_table(table: pd.DataFrame) -> Trajectory:
     if table.index.name in TIMES:
-        table = table.reset_index()
+        table = table.reset_index(allow_duplicates=True)
     table = table.set_axis([_word(name) for name in table.columns], axis="columns")
     if not table.columns.is_unique:
         raise ValueError(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ep2sindy.data.conversion import counted_in
 from ep2sindy.data.mapping import read_array
 from ep2sindy.data.quantities import typical
 from ep2sindy.data.readers.source import Source
@@ -48,7 +49,7 @@ def held_array(source: Source, name: str) -> Held:
         return Held(name, problem=_short(str(error)))
     values = np.asarray(array.values, dtype=np.float64)
     finite = values[np.isfinite(values)]
-    stated = str(array.attrs.get("units", "") or source.units.get(name, ""))
+    stated = counted_in(str(array.attrs.get("units", "") or source.units.get(name, "")))
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     step, even = _step(values.ravel()) if values.size in values.shape else (None, False)
     return Held(

@@ -19,7 +19,7 @@ from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.machine.files import write_text
+from ep2sindy.machine.files import read_json, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
 
@@ -170,7 +170,7 @@ class OperatingLaw:
     def from_json(text: str) -> OperatingLaw:
         """Inverse of `to_json`, exact. Raises ValueError for anything else."""
         try:
-            content = json.loads(text)
+            content = read_json(text)
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']!r}")
             known = content["covariance"]

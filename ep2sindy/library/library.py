@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from ep2sindy.library.display import library_html, library_text
 from ep2sindy.library.functions import Function
 from ep2sindy.library.names import check_state
-from ep2sindy.library.size import check_degrees, check_values
+from ep2sindy.library.size import check_degrees, check_exponents, check_values
 from ep2sindy.library.terms import Factor, Term, Variable, functions_named, product, read_term
 
 
@@ -258,10 +258,12 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
     distinct = list(dict.fromkeys(terms))
     used = (factor for term in distinct for factor, _ in term.factors)
     factors: list[Factor] = list(dict.fromkeys([*map(Variable, variables), *used]))
+    check_exponents(len(distinct), len(factors))
+    places = {factor: k for k, factor in enumerate(factors)}
     exponents = np.zeros((len(distinct), len(factors)), dtype=np.int64)
     for row, term in zip(exponents, distinct, strict=True):
         for factor, power in term.factors:
-            row[factors.index(factor)] = power
+            row[places[factor]] = power
     functions = [factor for factor in factors if isinstance(factor, Function)]
     return Library(variables, exponents, functions)
 
@@ -273,6 +275,7 @@ def by_exponents(library: Library) -> Library:
 
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
     """A library of exactly these terms, in this order."""
+    check_exponents(len(names), len(variables))
     terms = [read_term(name, variables) for name in names]
     if len(set(terms)) < len(terms):
         raise ValueError(f"terms must be unique: {[term.name for term in terms]}")

@@ -1,4 +1,4 @@
-"""Write files so that a final name never stands for a half-written file."""
+"""Write files so that a final name never stands for a half-written file; read JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import platform
 import re
 import uuid
 import zlib
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,23 @@ def _without_nan(content: Any) -> Any:
         return [_without_nan(value) for value in content]
     if isinstance(content, float) and not math.isfinite(content):
         return None
+    return content
+
+
+def read_json(text: str) -> Any:
+    """What a text of JSON says.
+
+    Raises ValueError for any other, and for a key that one object has twice: Python's reader
+    forgets the first.
+    """
+    return json.loads(text, object_pairs_hook=_each_once)
+
+
+def _each_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        ((key, n),) = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"an object of JSON must have each key once: {key!r} comes {n} times")
     return content
 
 

@@ -8,6 +8,8 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
+from ep2sindy.machine.screen import in_line
+
 Piece = TypeVar("Piece")
 Advance = Callable[[int], None]
 
@@ -60,7 +62,7 @@ class Bars:
 
         with tqdm(
             total=total,
-            desc=label or None,
+            desc=in_line(label) or None,
             unit=unit,
             bar_format=_layout(total, unit, label),
             leave=False,

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ep2sindy.data.readers.limits import check_kind
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
+from ep2sindy.machine.files import read_json
 
 FORMAT = "ep2sindy.SparseModel/1"
 
@@ -50,7 +51,7 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
     Raises ValueError for anything else, also where it is `make` that refuses it.
     """
     try:
-        content = json.loads(text)
+        content = read_json(text)
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
         states, equations = names_in(content["states"]), content["equations"]

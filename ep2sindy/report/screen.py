@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
@@ -39,21 +38,23 @@ class Screen:
             terminal.width = WIDTH
         self._consoles: list[Console] = [terminal]
         if self._log is not None:
-            self._consoles.append(Console(file=self._log, width=WIDTH, no_color=True))
+            log_file = Console(file=self._log, width=WIDTH, no_color=True, force_terminal=False)
+            self._consoles.append(log_file)
 
     def print(self, *renderables: RenderableType) -> None:
+        """Text as it is: neither markup nor the name of an emoji means anything."""
         with on_screen(sys.stdout):
-            self._consoles[0].print(*renderables, highlight=False)
+            _print(self._consoles[0], *renderables)
         with writing(self._path):
             for console in self._consoles[1:]:
-                console.print(*renderables, highlight=False)
+                _print(console, *renderables)
             self._flush()
 
     def log(self, text: str) -> None:
         """Into run.log alone."""
         with writing(self._path):
             for console in self._consoles[1:]:
-                console.print(plain(text), highlight=False, markup=False)
+                _print(console, plain(text))
             self._flush()
 
     def show(self, sections: Sequence[Section]) -> None:
@@ -61,7 +62,7 @@ class Screen:
         for section in sections:
             shown = [each for block in section.blocks for each in renderables(block)]
             if shown:
-                self.print(f"\n[bold]{_text(section.title)}[/bold]")
+                self.print(_text(f"\n{section.title}", "bold"))
                 for each in shown:
                     self.print(each)
 
@@ -80,20 +81,22 @@ def renderables(block: Block) -> Iterator[RenderableType]:
     """What a terminal shows of a block."""
     match block:
         case Text(page_only=False):
-            text = _text(block.text)
-            yield f"[bold red]{text}[/bold red]" if block.warning else text
+            yield _text(block.text, "bold red" if block.warning else "")
         case Equation(on_screen=True):
-            text = _text(block.text)
-            yield f"[italic]{text}[/italic]" if block.aside else text
+            yield _text(block.text, "italic" if block.aside else "")
         case Table(page_only=False):
             yield rich_table(block)
         case Picture() | Text() | Equation() | Table():
             pass
 
 
-def _text(text: str) -> str:
+def _print(console: Console, *renderables: RenderableType) -> None:
+    console.print(*renderables, highlight=False, markup=False, emoji=False)
+
+
+def _text(text: str, style: str = "") -> RichText:
     """Text that is neither markup nor steers a terminal."""
-    return escape(plain(text))
+    return RichText(plain(text), style)
 
 
 def rich_table(table: Table) -> RichTable:
@@ -104,9 +107,9 @@ def rich_table(table: Table) -> RichTable:
     lines = [list(map(str, table.rows.columns)), *cells]
     width = sum(max(len(line[k]) for line in lines) + 3 for k in range(len(lines[0])))
     rich = RichTable(
-        title=_text(table.title) or None,
+        title=_text(table.title, "table.title") if table.title else None,
         title_justify="left",
-        caption=_text(table.note) or None,
+        caption=_text(table.note, "table.caption") if table.note else None,
         caption_justify="left",
         show_edge=False,
         padding=(0, 1) if width <= WIDTH else (0, 0),

@@ -16,6 +16,7 @@ from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.machine.screen import in_line
 from ep2sindy.report.run import Run
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.kinds import Deferred
@@ -129,7 +130,7 @@ def say_field(run: Run, field: xr.Dataset) -> None:
         zone_words(None, field),
         f"{len(t)} samples of {(t[-1] - t[0]) / (len(t) - 1):.4g} s from {t[0]:.4g} s",
     ]
-    run.say(f"data: {'; '.join(word for word in words if word)}")
+    run.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
     say_doubts(run, field)
 
 
@@ -155,7 +156,7 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
         units,
         f"dominant frequency {frequencies}",
     ]
-    run.say(f"data: {'; '.join(words)}")
+    run.say(in_line(f"data: {'; '.join(words)}"))
     say_doubts(run, field)
     if data.n_samples < field.sizes["time"]:
         run.warn(gap_words(data.t, field.sizes["time"]))

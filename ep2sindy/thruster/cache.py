@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ from tqdm import tqdm
 from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.machine.files import fingerprint, sweep, writing
 from ep2sindy.machine.progress import Progress
+from ep2sindy.machine.screen import in_line, on_screen
 from ep2sindy.thruster.axial.model import CFL
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.simulate import as_start, simulate_as
@@ -74,7 +76,8 @@ def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
         try:
             return unsealed(read(path), parameters)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
-            tqdm.write(f"{path} cannot be read ({error}); simulating it again")
+            with on_screen(sys.stdout):
+                tqdm.write(in_line(f"{path} cannot be read ({error}); simulating it again"))
     with writing(path.parent):  # now, not after the simulation
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent)

@@ -6,13 +6,13 @@ Configuration; Simulation parameters).
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ep2sindy.machine.files import read_json
 from ep2sindy.thruster.anode import AnodeSheath, FixedAnode
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.hallthruster_models import conduction_of, field_of, transport_of, wall_of
@@ -92,7 +92,7 @@ def read_hallthruster_input(path: str | Path) -> HallThrusterInput:
     if not path.is_file():
         raise ValueError(f"no such input of HallThruster.jl: {path.absolute()}")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} must be JSON: {error}") from error
     content = content.get("input", content) if isinstance(content, dict) else {}

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.thruster import propellants
 from ep2sindy.thruster.propellant_files import propellant
+from ep2sindy.thruster.tables import number, read_cells
 
 
 def ionization_rate(
@@ -68,13 +68,14 @@ def read_rate_table(
     path: Path,
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
     """First two columns of a CSV file: T_e in eV, increasing, and rate in m^3/s."""
-    if not path.is_file():
-        raise ValueError(f"no such rate table: {path.absolute()}")
-    frame = pd.read_csv(path, header=None, comment="#", dtype=str)
-    columns = frame.iloc[:, :2].apply(pd.to_numeric, errors="coerce").dropna().to_numpy(float)
-    if columns.shape[1:] != (2,) or len(columns) < 2 or np.any(np.diff(columns[:, 0]) <= 0):
+    cells = [row[:2] for row in read_cells(path, "rate table", may_be_short=True)]
+    rows = [row for row in cells if any(number(cell) is not None for cell in row)]
+    gaps = [row for row in rows if len(row) < 2 or None in map(number, row)]
+    columns = np.array([] if gaps else rows, dtype=np.float64).reshape(-1, 2)
+    if len(columns) < 2 or np.any(np.diff(columns[:, 0]) <= 0):
+        said = f"a row {gaps[0]}" if gaps else f"{len(columns)} rows of numbers"
         raise ValueError(
             f"a rate table must have two columns, T_e in eV (increasing) and rate in m^3/s, and "
-            f"two rows or more: {path} has numbers of shape {columns.shape}"
+            f"two rows or more: {path} has {said}"
         )
     return columns[:, 0], columns[:, 1]

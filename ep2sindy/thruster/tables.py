@@ -10,14 +10,14 @@ from pathlib import Path
 from ep2sindy.data.readers.source import damage_named
 
 
-def read_cells(path: Path, what: str) -> list[list[str]]:
+def read_cells(path: Path, what: str, *, may_be_short: bool = False) -> list[list[str]]:
     """Rows of a CSV file, but empty ones and those that begin with #; `what` it is, for errors."""
     if not path.is_file():
         raise ValueError(f"no such {what}: {path.absolute()}")
     with damage_named(path), path.open(newline="", encoding="utf-8-sig") as file:
         rows = [[cell.strip() for cell in row] for row in csv.reader(file)]
     rows = [row for row in rows if any(row) and not row[0].startswith("#")]
-    if len(rows) < 2:
+    if len(rows) < 2 and not may_be_short:
         raise ValueError(f"{path} must have two rows or more: it has {len(rows)}")
     return rows
 

@@ -55,10 +55,13 @@ def _models() -> dict[str, Case]:
     equations, n = sound["equations"], sum(map(len, sound["equations"].values()))
     library = sound["library"]
     many = [f"x^{a}*y^{b}*z^{c}" for a in range(1, 48) for b in range(1, 48) for c in range(1, 48)]
+    wide = [f"v{k}" for k in range(8000)]
     twice = json.dumps(sound).replace('"states"', '"states": ["q"], "states"', 1)
     found = {
         "a huge exponent": {"library": [*library, "x^999999999"]},
         "an exponent beyond numbers": {"library": [*library, "x^" + "9" * 5000]},
+        "keys that come twice": twice,
+        "eight thousand variables": {"variables": [*"xyz", *wide], "library": [*library, *wide]},
         "states that repeat": {"states": ["x", "x", "y", "z"]},
         "NaN": {"equations": {**equations, "x": {"x": float("nan")}}},
         "an integer beyond floats": json.dumps(sound).replace("-10.0", "1" + "0" * 400),
@@ -93,7 +96,6 @@ def _models() -> dict[str, Case]:
     }
     cases = {f"model: {name}": model(change) for name, change in found.items()}
     harmless = {
-        "keys that come twice": twice,
         "units that are markup": {"units": {"x": MARKUP}},
         "provenance that is markup": {"provenance": {"a": MARKUP}},
         "units that are code": {"units": {"x": RUNS}},
@@ -133,6 +135,7 @@ def _runs() -> dict[str, Case]:
     bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
     bomb += "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12))
     wrong = {
+        "a summary of keys that come twice": {"summary.json": '{"seed": 0, "seed": 1}'},
         "a summary that is a list": {"summary.json": []},
         "a summary without names": {"summary.json": {}},
         "a headline that is text": {"summary.json": summary | {"headline": {"r2": "x"}}},
@@ -267,13 +270,22 @@ def _archives() -> dict[str, Case]:
 def _texts() -> dict[str, Case]:
     """Tables and JSON."""
     deep = "[" * 100_000
+    rows = "".join(f"{k},{k}\n" for k in range(1, 9))
+    refused = {
+        "twice.json": '{"t": [0, 1], "t": [0, 1, 2], "x": [1, 2, 3]}',
+        "wider.csv": ",".join(["1"] * 200_000) + "\n",
+        "line.csv": "1," * 10_000_000 + "1\n",
+        "thousands.csv": "t\tx\n" + "".join(f"{k}\t1,{k:03d}\n" for k in range(9)),
+        "word.csv": f"t,x\n0,bad\n{rows}",
+        "words.csv": f"t,x\nover,load\n{rows}",
+    }
     wide = "t," + ",".join(map(str, range(20_000))) + "\n" + "1," * 20_000 + "1\n"
     files = {
         "deep.json": deep,
         "names.json": json.dumps({MARKUP: [1.0, 2.0], "t": [0.0, 1.0]}),
         "long.json": '{"x": [1' + "0" * 5000 + ", 2]}",
-        "twice.json": '{"t": [0, 1], "t": [0, 1, 2], "x": [1, 2, 3]}',
         "wide.csv": wide,
+        "repeated.csv": f"t,x,x\n{rows.replace(',', ',1,')}",
         "formula.csv": "t,x\n0,=cmd|' /C calc'!A0\n1,2\n",
         "markup.csv": f"t,[/red]{MARKUP}\n0,1\n1,2\n2,3\n",
         "quoted.csv": 't,x\n0,"1\n' * 50,
@@ -281,6 +293,6 @@ def _texts() -> dict[str, Case]:
         "units.csv": "t (s),x (9**9**9**9)\n0,1\n1,2\n2,3\n",
     }
     return {
-        f"text: {name}": Case(["inspect", name], {name: text}, name, may_pass=True)
-        for name, text in files.items()
+        f"text: {name}": Case(["inspect", name], {name: text}, name, may_pass=name in files)
+        for name, text in (files | refused).items()
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import codecs
 import re
-from itertools import islice
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,15 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
+from ep2sindy.data.readers.notation import ungrouped
 from ep2sindy.data.readers.source import Reader, Source
-from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, Layout, layout_of
+from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, SEPARATORS, Layout, layout_of
 
-N_LOOKED_AT = 2000  # lines that tell the layout: longer preambles there are none
+# Lines that tell the layout, for longer preambles there are none, and characters in them.
+N_LOOKED_AT, CHARACTERS_LOOKED_AT = 2000, 10_000_000
+
+# What pandas gets: it takes hundreds of bytes for every column.
+LONGEST_LINE, MOST_COLUMNS = 1_000_000, 10_000
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -23,14 +28,12 @@ UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 def read_csv(path: Path) -> Source:
     """Text with one row per sample, its columns parted by , ; | tabs or blanks.
 
-    Decimal commas, a preamble and a line of units are told from the content; a header need not be.
-    A name is the header's without its unit, or the column's number, from 0. Columns of text are
-    left out, and an empty cell is NaN.
+    Decimal commas, marks of thousands, a preamble and a line of units are told from the content; a
+    header need not be. A name is the header's without its unit, or the column's number, from 0;
+    names that repeat are x.0, x.1. Columns of text are left out, and an empty cell is NaN.
     """
     encoding = _encoding(path)
-    with path.open(encoding=encoding, newline=None) as file:
-        lines = list(islice(file, N_LOOKED_AT))
-    layout = layout_of(lines)
+    layout = layout_of(_first_lines(path, encoding))
     frame = _frame(path, layout, encoding)
     header = layout.header
     names = {header.names[j]: j for j in layout.columns if j < len(header.names)}
@@ -47,6 +50,28 @@ def read_csv(path: Path) -> Source:
         path, [*names], read, aliases=aliases, words=layout.words, step_s=header.step_s,
         is_table=True,
     )  # fmt: skip
+
+
+def _first_lines(path: Path, encoding: str) -> list[str]:
+    """Raises ValueError for lines, or numbers of columns, that no table has."""
+    lines: list[str] = []
+    n_characters = 0
+    with path.open(encoding=encoding, newline=None) as file:
+        while len(lines) < N_LOOKED_AT and n_characters < CHARACTERS_LOOKED_AT:
+            line = file.readline(LONGEST_LINE + 1)
+            if not line:
+                break
+            lines.append(line)
+            n_characters += len(line)
+            n_cells = max(len(line.split(sign)) for sign in SEPARATORS)
+            if n_cells > MOST_COLUMNS or len(line) > LONGEST_LINE:
+                raise ValueError(
+                    f"a table may have up to {MOST_COLUMNS} columns, in lines of up to "
+                    f"{LONGEST_LINE} characters: line {len(lines)} has {n_cells} cells in its "
+                    f"first {len(line)} characters; write one sample per line, and large arrays "
+                    "as npz, HDF5 or NetCDF"
+                )
+    return lines
 
 
 def _encoding(path: Path) -> str:
@@ -95,7 +120,10 @@ def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, 
     """A column as numbers; raises ValueError with the row of a cell that is none."""
     if column.dtype.kind in "fiu":
         return column.to_numpy(dtype=np.float64)
-    text = column.astype("string").str.strip().str.replace(layout.decimal, ".", regex=False)
+    text = column.astype("string").str.strip()
+    if layout.has_marks:
+        text = text.map(partial(ungrouped, decimal=layout.decimal), na_action="ignore")
+    text = text.str.replace(layout.decimal, ".", regex=False)
     text = text.str.replace(r"[dD](?=[+-]?\d+$)", "e", regex=True)  # Fortran's exponents
     values = pd.to_numeric(text, errors="coerce")
     wrong = np.flatnonzero(values.isna() & text.notna() & ~text.str.lower().isin(MISSING))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from functools import reduce
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.readers.source import Reader, Source, leaves
+from ep2sindy.machine.files import read_json
 
 UNITS = {
     "t": "s", "z": "m", "grid": "m", "cell_centers": "m", "n": "m^-3", "ni": "m^-3", "nn": "m^-3",
@@ -31,7 +31,7 @@ def read_hallthruster(path: Path) -> Source:
     beside the frames is named by its path from the top.
     Source: https://um-pepl.github.io/HallThruster.jl (Use JSON for input and output).
     """
-    content = json.loads(path.read_text(encoding="utf-8-sig"))
+    content = read_json(path.read_text(encoding="utf-8-sig"))
     frames, beside = _parted(content)
     columns = {name: v for name, v in leaves(beside).items() if _is_column(v)}
     if not frames and not columns:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.source import UNDECODED, Reader, Source
+from ep2sindy.data.readers.source import PACKED_BY, UNDECODED, Reader, Source, check_packing
 
 if TYPE_CHECKING:
     import h5py
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 UNITS = ("units", "Units", "UNITS", "unit", "Unit", "UNIT")
 
 # Attributes by which NetCDF packs numbers and marks those that are missing; other programs too.
-PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value")
+PACKING = (*PACKED_BY, "_FillValue", "missing_value")
 
 
 def read_hdf5(path: Path) -> Source:
@@ -32,10 +32,8 @@ def read_hdf5(path: Path) -> Source:
     def read(name: str) -> xr.DataArray:
         with h5py.File(path) as file:
             found = file[name]
-            attrs = {key: _plain(found.attrs[key]) for key in PACKING if key in found.attrs}
-            attrs["units"] = next((_plain(found.attrs[k]) for k in UNITS if k in found.attrs), "")
-            dims = [f"dim_{k}" for k in range(len(found.shape))]
-            packed = xr.Variable(dims, written(found), attrs)
+            values, attrs = written(found), _attributes(found, name)
+            packed = xr.Variable([f"dim_{k}" for k in range(values.ndim)], values, attrs)
         plain = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
         return xr.DataArray(plain.values, attrs={"units": attrs["units"]})
 
@@ -57,9 +55,11 @@ def names_in_hdf5(path: Path) -> list[str]:
 def written(found: h5py.Dataset) -> np.ndarray:
     """The values of a data set; NaN where none were ever written, for HDF5 gives zeros there.
 
-    Raises ValueError where not one was.
+    Raises ValueError where not one was, and for a null dataspace, which has no place for any.
     """
-    values = found[()]
+    if found.shape is None:
+        raise ValueError(f"{found.name!r} is empty: its dataspace is null, and holds no values")
+    values = np.asarray(found[()])
     holes = holes_of(found)
     if not holes:
         return values
@@ -90,8 +90,28 @@ def holes_of(found: h5py.Dataset) -> list[tuple[slice, ...]]:
     ]
 
 
+def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:
+    """Unit and packing; an attribute that holds nothing says no unit, and no number."""
+    said = {key: _plain(found.attrs[key]) for key in (*PACKING, *UNITS) if key in found.attrs}
+    attrs = {key: said[key] for key in PACKING if key in said}
+    if empty := [key for key, value in attrs.items() if value is None]:
+        raise ValueError(
+            f"{empty[0]} of {name!r} must be a number: the attribute is empty, its dataspace is "
+            "null; give it a value, or take it away"
+        )
+    check_packing(name, attrs)
+    return attrs | {"units": next((said[key] or "" for key in UNITS if key in said), "")}
+
+
 def _plain(value: Any) -> Any:
-    """An attribute as one value; text as such, also where it stands in an array of one."""
+    """An attribute as one value; text as such, also where it stands in an array of one.
+
+    None for a null dataspace.
+    """
+    import h5py
+
+    if isinstance(value, h5py.Empty):
+        return None
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,12 @@ from ep2sindy.library.units import unit_like
 WITH_UNIT = (re.compile(r"(.*\S)\s*[\(\[](.+)[\)\]]"), re.compile(r"(.*\S)\s*/\s*(\S+)"))
 
 TIMES = frozenset({"time", "t", "x-axis", "x"})
+
+# Units of time that are hardly anything else: `a,b` may be years and barns.
+SECONDS = frozenset({"s", "ms", "us", "µs", "μs", "ns", "sec", "second", "seconds"})
+
+# What stands in a line of units for what has none.
+NO_UNIT = frozenset({"", "-", "--", "1", "a.u.", "arb", "arb.", "counts", "none", "n/a"})
 
 NUMBER = re.compile(r"[+-]?[\d.,]+([eE][+-]?\d+)?")
 
@@ -33,21 +40,47 @@ class Header:
     step_s: float | None = None
 
 
-def header_of(above: Sequence[Sequence[str]], n_columns: int, *, strict: bool) -> Header:
-    """From the cells of the lines above the rows.
+@dataclass(frozen=True)
+class Line:
+    """The cells of a line above the rows. number: in the file, from 1."""
+
+    number: int
+    cells: Sequence[str]
+    is_comment: bool = False
+
+    @property
+    def is_word(self) -> bool:
+        return len(self.cells) == 1 and not re.search(r"\s", self.cells[0])
+
+    @property
+    def has_numbers(self) -> bool:
+        return any(NUMBER.fullmatch(cell) for cell in self.cells)
+
+    def may_be_names(self, n_columns: int) -> bool:
+        """As many words as columns; a line of several words is no single name."""
+        fits = len(self.cells) == n_columns and (n_columns > 1 or self.is_word)
+        return fits and not self.is_comment and not self.has_numbers
+
+    @property
+    def begins_with_time(self) -> bool:
+        return bool(self.cells) and _parted(self.cells[0])[0].lower() in TIMES
+
+
+def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
+    """From the lines above the rows.
 
     strict: a last line of several cells is a header, so that its number must be right.
-    Raises ValueError where it is not.
+    Raises ValueError where it is not, and where it may be a row with a word in it.
     """
-    step_s = _step_s(above)
+    cells = [line.cells for line in above]
+    step_s = _step_s(cells)
     numbered = Header(tuple(map(str, range(n_columns))), ("",) * n_columns, step_s)
     if not above:
         return numbered
-    if (counted := _counted(above, n_columns)) is not None:
+    if (counted := _counted(cells, n_columns)) is not None:
         return counted
-    names, units = above[-1], None
-    if len(above) > 1 and _are_units(above[-1], above[-2]):
-        names, units = above[-2], [unit.strip("()[] ") for unit in above[-1]]
+    has_units = len(above) > 1 and _are_units(cells[-1], cells[-2])
+    names, units = (cells[-2], cells[-1]) if has_units else (cells[-1], [])
     if len(names) != n_columns or all(NUMBER.fullmatch(name) for name in names):
         if strict and len(names) > 1:
             raise ValueError(
@@ -56,10 +89,35 @@ def header_of(above: Sequence[Sequence[str]], n_columns: int, *, strict: bool) -
                 "name columns by their numbers, from 0"
             )
         return numbered
+    if not has_units:
+        _check_names(above, n_columns)
     parted = [_parted(name) for name in names]
-    units = units or [unit for _, unit in parted]
+    units = [_unit(cell) for cell in units] or [unit for _, unit in parted]
     units = [*units, *[""] * n_columns][:n_columns]
     return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)), step_s)
+
+
+def _check_names(above: Sequence[Line], n_columns: int) -> None:
+    """Raise ValueError for a last line that may be a row, or less than the names above it.
+
+    Names for time leave no doubt, nor do comments; a preamble may have lines as long as its names.
+    """
+    last, before = above[-1], above[-2] if len(above) > 1 else None
+    if last.begins_with_time or last.is_comment:
+        return
+    if last.has_numbers:
+        raise ValueError(
+            f"line {last.number}, {list(last.cells)}, is neither names nor a row of numbers: leave "
+            "a cell empty whose number is missing, and begin names with one for time, such as 't'"
+        )
+    if before is None or not before.may_be_names(n_columns):
+        return
+    if before.begins_with_time or len(above) == 2:
+        raise ValueError(
+            f"lines {before.number} and {last.number} may both be names, {list(before.cells)} and "
+            f"{list(last.cells)}: leave one of them, or begin it with #; a line of units stands "
+            "in brackets, such as (s),(V)"
+        )
 
 
 def _step_s(above: Sequence[Sequence[str]]) -> float | None:
@@ -85,8 +143,14 @@ def _plain(unit: str) -> str:
     return unit if unit_like(unit) or not unit_like(unit.lower()) else unit.lower()
 
 
+def _unit(cell: str) -> str:
+    """Of a line of units."""
+    unit = cell.strip("()[] ")
+    return "" if unit.lower() in NO_UNIT else unit
+
+
 def _are_units(cells: Sequence[str], names: Sequence[str]) -> bool:
-    """A line of units below the names: in brackets, or a unit of time below a word for time.
+    """A line of units below the names: in brackets, or beginning with one of time.
 
     `t,V` alone could be names or tonnes and volts.
     """
@@ -97,9 +161,10 @@ def _are_units(cells: Sequence[str], names: Sequence[str]) -> bool:
         return unit_like(_plain(texts[0].strip("()[] ")))
     if len(cells) < len(names):
         return False
-    first = _plain(cells[0])
-    is_time = names[0].lower() in TIMES and unit_like(first, like="s")
-    return is_time and all(unit_like(_plain(cell)) for cell in cells if cell)
+    are_words = not any(map(NUMBER.fullmatch, names))
+    is_time = cells[0].lower() in SECONDS and are_words
+    is_time |= names[0].lower() in TIMES and unit_like(_plain(cells[0]), like="s")
+    return is_time and all(not _unit(cell) or unit_like(_plain(cell)) for cell in cells)
 
 
 def _counted(above: Sequence[Sequence[str]], n_columns: int) -> Header | None:
@@ -114,10 +179,16 @@ def _counted(above: Sequence[Sequence[str]], n_columns: int) -> Header | None:
 
 
 def _unique(names: Sequence[str]) -> tuple[str, ...]:
-    """A name that comes again gets a number: x, x.1."""
-    found: list[str] = []
-    for k, name in enumerate(names):
-        name = name or str(k)
-        again = sum(each == name for each in names[:k])
-        found.append(f"{name}.{again}" if again else name)
+    """Names that come more than once get numbers: x.0, x.1; none is taken for x itself.
+
+    Raises ValueError where such a name is there already.
+    """
+    names = [name or str(k) for k, name in enumerate(names)]
+    counts, met = Counter(names), Counter[str]()
+    found = []
+    for name in names:
+        found.append(f"{name}.{met[name]}" if counts[name] > 1 else name)
+        met[name] += 1
+    if twice := [name for name, n in Counter(found).items() if n > 1]:
+        raise ValueError(f"columns must have names of their own: {twice[0]!r} comes more than once")
     return tuple(found)

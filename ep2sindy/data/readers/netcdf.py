@@ -12,7 +12,7 @@ import xarray as xr
 
 from ep2sindy.data.readers.classic import check_places
 from ep2sindy.data.readers.hdf5 import holes_of
-from ep2sindy.data.readers.source import UNDECODED, Reader, Source, dataset_source
+from ep2sindy.data.readers.source import Reader, Source, dataset_source
 
 # What the netCDF library reads where nothing was written and no attribute says otherwise; bytes
 # have none. Source: netcdf.h, NC_FILL_SHORT and its kin.
@@ -39,7 +39,7 @@ def read_netcdf(path: Path) -> Source:
         kind = variable.dtype.str[1:]
         if kind in FILLS and not {"_FillValue", "missing_value"} & set(variable.attrs):
             variable.attrs["_FillValue"] = variable.dtype.type(FILLS[kind])
-    source = dataset_source(path, xr.decode_cf(dataset, decode_coords=False, **UNDECODED))
+    source = dataset_source(path, dataset)
     return source if head.startswith(b"CDF") else _without_holes(source, _with_holes(path))
 
 

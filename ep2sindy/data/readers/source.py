@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import channel_length_m
@@ -16,6 +18,8 @@ from ep2sindy.data.readers.limits import ALWAYS, check_declared
 
 # Time stays a number, whatever its attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
+
+PACKED_BY = ("scale_factor", "add_offset")
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -43,6 +47,14 @@ class Source:
     words: str = ""
     is_table: bool = False
     attributes: Mapping[str, str | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(set(self.names)) < len(self.names):
+            ((name, n),) = Counter(self.names).most_common(1)
+            raise ValueError(
+                f"arrays of a file must have names of their own: {name!r} comes {n} times; rename "
+                "all but one"
+            )
 
     @cached_property
     def known(self) -> frozenset[str]:
@@ -131,12 +143,32 @@ def file_named(path: Path) -> Iterator[None]:
         raise ValueError(f"{path}: {error}") from error
 
 
+def check_packing(name: str, attributes: Mapping[str, Any]) -> None:
+    """Raise ValueError for a scale or an offset that turns packed numbers into none."""
+    for key in PACKED_BY:
+        value = np.asarray(attributes.get(key, 1.0))
+        is_number = value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value).all()
+        if not is_number or (key == "scale_factor" and not value.all()):
+            raise ValueError(
+                f"{key} of {name!r} must be a finite number, and no zero scale: "
+                f"{value.tolist()!r:.80} came; put the attribute right, or take it away to read "
+                "the numbers as they are stored"
+            )
+
+
 def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
-    """Variables of a dataset whose dimensions the file names."""
-    names = [str(name) for name in dataset.variables]
+    """Variables of a dataset as it is stored, whose dimensions the file names; unpacked here."""
+    stored = {str(name): dict(variable.attrs) for name, variable in dataset.variables.items()}
+    for variable in dataset.variables.values():
+        for key in {*PACKED_BY} & {*variable.attrs}:
+            packed_by = np.asarray(variable.attrs.pop(key))
+            if packed_by.size == 1 and packed_by.dtype.kind in "iuf":
+                variable.attrs[key] = packed_by.reshape(())[()]
+    dataset = xr.decode_cf(dataset, decode_coords=False, **UNDECODED)
     length = channel_length_m(dataset.attrs)
 
     def read(name: str) -> xr.DataArray:
+        check_packing(name, stored[name])
         array = dataset[name]
         check_declared(repr(name), array.nbytes, path)
         if array.nbytes <= ALWAYS:
@@ -144,18 +176,30 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
         return array
 
     said = {str(k): v for k, v in dataset.attrs.items() if isinstance(v, str | int | float)}
-    return Source(path, names, read, dims_named=True, channel_m=length, attributes=said)
+    return Source(path, [*stored], read, dims_named=True, channel_m=length, attributes=said)
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:
-    """Nested dicts and lists of them as {"a.b.0": value}; a list of numbers is one value."""
-    if isinstance(node, dict):
-        items = list(node.items())
-    elif isinstance(node, list) and any(isinstance(item, dict | list) for item in node):
-        items = list(enumerate(node))
-    else:
-        return {path: node}
-    found: dict[str, Any] = {}
-    for key, item in items:
-        found |= leaves(item, f"{path}.{key}" if path else str(key))
+    """Nested dicts and lists of them as {"a.b.0": value}; a list of numbers is one value.
+
+    Raises ValueError for two values of one such name, as {"a.b": 1, "a": {"b": 2}} has.
+    """
+    pairs = list(_leaves(node, path))
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"a name must mean one value: {name!r} means two; rename one")
     return found
+
+
+def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
+    items: Iterable[tuple[Any, Any]]
+    if isinstance(node, dict):
+        items = node.items()
+    elif isinstance(node, list) and any(isinstance(item, dict | list) for item in node):
+        items = enumerate(node)
+    else:
+        yield path, node
+        return
+    for key, item in items:
+        yield from _leaves(item, f"{path}.{key}" if path else str(key))

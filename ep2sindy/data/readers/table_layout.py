@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ep2sindy.data.readers.header import Header, header_of
+from ep2sindy.data.readers.header import Header, Line, header_of
+from ep2sindy.data.readers.notation import PLAIN, decimals_shown, is_grouped, is_number
 
 SEPARATORS = (",", ";", "\t", "|", None)  # None: blanks
 COMMENTS = ("#", "%", "//", "!")
+PARTED = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "blanks"}
 
 # A missing sample, as programs write it.
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "inf", "-inf"})
 
-NUMBERS = {
-    ".": re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?"),
-    ",": re.compile(r"[+-]?\d+(,\d+)?([eEdD][+-]?\d+)?"),
-}
+# A line that is drawn under names.
+RULE = re.compile(r"[\s|+,;]*[-=_]{2,}[-=_\s|+,;]*")
 
 # Lines at the end of what is looked at, which say what a row is like: no more than a quarter of it,
 # for a preamble may be longer than the rows.
@@ -26,23 +27,29 @@ N_JUDGED = 40
 
 @dataclass(frozen=True)
 class Layout:
-    """separator: None for blanks. first: the line of the first row, from 0. columns: of numbers."""
+    """separator: None for blanks. first: the line of the first row, from 0. columns: of numbers.
+
+    has_marks: whether thousands are parted, as in 1,000.5. left_out: names of all other columns.
+    """
 
     separator: str | None
     decimal: str
     first: int
     columns: tuple[int, ...]
     header: Header
+    has_marks: bool = False
+    left_out: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         """What was taken for what, for those who look into the file."""
-        parted = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "blanks"}
         n_columns = len(self.columns)
         parts = [f"{n_columns} column{'s' * (n_columns > 1)} of numbers"]
-        parts[0] += f" between {parted[self.separator]}" if n_columns > 1 else ""
+        parts[0] += f" between {PARTED[self.separator]}" if n_columns > 1 else ""
         parts += ["decimal commas"] if self.decimal == "," else []
+        parts += ["marks between thousands"] if self.has_marks else []
         parts += [f"rows from line {self.first + 1}"]
+        parts += [f"left out, with few numbers: {', '.join(self.left_out)}"] * bool(self.left_out)
         return ", ".join(parts)
 
 
@@ -50,32 +57,53 @@ def layout_of(lines: Sequence[str]) -> Layout:
     """The table in the first lines of a file.
 
     What a row is like is told by the last of them, for what stands above may be anything.
-    Raises ValueError for lines without a row of numbers, for one among the rows that is none, and
-    for a header that names more or fewer columns than the rows have.
+    Raises ValueError for lines without a row of numbers, for one among the rows that is none, for
+    numbers that may be read in two ways, and for a header that does not name the columns.
     """
     rows = [line for line in lines if line.strip() and not is_comment(line)]
-    rows = rows[-max(2, min(N_JUDGED, len(rows) // 4)) :]
-    options = [(s, d) for s in SEPARATORS for d in NUMBERS if s != d]
-    judged = [(*_judged(rows, s, d), s, d) for s, d in options]
+    last = rows[-max(2, min(N_JUDGED, len(rows) // 4)) :]
+    judged = [(*_judged(last, s, d), s, d) for d in PLAIN for s in SEPARATORS]
     share, _, columns, separator, decimal = max(judged, key=lambda option: option[:2])
     if not share:
         raise ValueError("it holds no rows of numbers")
+    table = [split(line, separator) for line in rows]
+    cells = [row[j] for row in table for j in columns if j < len(row)]
+    decimal = _decimal(cells, separator, decimal)
+    columns = _judged(last, separator, decimal)[2]
     first = _first_row(lines, columns, separator, decimal)
     below = [_trimmed(split(line, separator)) for line in lines[first:] if not is_comment(line)]
     n_columns = max(map(len, below))
     above = [
-        _trimmed(split(without_mark(line), separator)) for line in lines[:first] if line.strip()
+        Line(k + 1, _trimmed(split(without_mark(line), separator)), is_comment(line))
+        for k, line in enumerate(lines[:first])
+        if line.strip() and not _is_rule(line)
     ]
     header = header_of(above, n_columns, strict=separator is not None)
-    return Layout(separator, decimal, first, columns, header)
+    _check_width(above, below, separator)
+    others = [j for j in range(n_columns) if j not in columns]
+    for j in others:
+        _check_text([row[j] for row in below if j < len(row)], header.names[j], decimal)
+    has_marks = any(is_grouped(cell, decimal) for cell in cells)
+    filled = [j for j in others if any("".join(row[j : j + 1]) for row in below)]
+    left_out = tuple(header.names[j] for j in filled)
+    return Layout(separator, decimal, first, columns, header, has_marks, left_out)
 
 
 def split(line: str, separator: str | None) -> list[str]:
-    return [cell.strip().strip("\"'").strip() for cell in line.strip("\r\n ").split(separator)]
+    line = line.strip("\r\n ")
+    if '"' in line and separator is not None:
+        cells = next(csv.reader([line], delimiter=separator))
+    else:
+        cells = line.split(separator)
+    return [cell.strip().strip("\"'").strip() for cell in cells]
 
 
 def is_comment(line: str) -> bool:
     return line.lstrip().startswith(COMMENTS)
+
+
+def _is_rule(line: str) -> bool:
+    return bool(RULE.fullmatch(line))
 
 
 def without_mark(line: str) -> str:
@@ -99,12 +127,26 @@ def _judged(
     n_numbers, n_cells, columns = 0, 0, []
     for j in range(width):
         cells = [cells[j] for cells in table if j < len(cells) and not _is_missing(cells[j])]
-        numbers = [bool(NUMBERS[decimal].fullmatch(cell)) for cell in cells]
+        numbers = [is_number(cell, decimal) for cell in cells]
         n_numbers, n_cells = n_numbers + sum(numbers), n_cells + len(cells)
         # A cell or two that are no number are a fault of those lines, not another kind of column.
         if sum(numbers) > 0.5 * len(numbers) and len(numbers) > 0.25 * len(table):
             columns.append(j)
     return n_numbers / max(n_cells, 1) if columns else 0.0, len(columns), tuple(columns)
+
+
+def _decimal(cells: Sequence[str], separator: str | None, judged: str) -> str:
+    """The decimal sign; judged: that of the last rows, which decides where both are shown."""
+    shown = decimals_shown(cells)
+    if len(shown) == 1:
+        return shown.pop()
+    open_ = next((cell for cell in cells if "," in cell and is_grouped(cell, ".")), None)
+    if not shown and open_ and separator != ",":
+        raise ValueError(
+            f"{open_!r} may be {open_.replace(',', '.')} or {open_.replace(',', '')}, and no "
+            "number of the file tells which: write decimal points, and no marks between thousands"
+        )
+    return judged if shown else "."
 
 
 def _is_missing(cell: str) -> bool:
@@ -115,20 +157,53 @@ def _first_row(
     lines: Sequence[str], columns: Sequence[int], separator: str | None, decimal: str
 ) -> int:
     """The line of the first row; raises ValueError where rows stand above one that is none."""
-    is_row = [_is_row(split(line, separator), columns, decimal) for line in lines]
-    blank = [not line.strip() or is_comment(line) for line in lines]
-    last_other = max((k for k in range(len(lines)) if not is_row[k] and not blank[k]), default=-1)
+    table = [split(line, separator) for line in lines]
+    is_row = [_is_row(cells, columns, decimal) for cells in table]
+    is_blank = [not line.strip() or is_comment(line) or _is_rule(line) for line in lines]
+    others = [k for k in range(len(lines)) if not is_row[k] and not is_blank[k]]
+    last_other = others[-1] if others else -1
     first = next((k for k in range(last_other + 1, len(lines)) if is_row[k]), None)
-    n_above = sum(row and not b for row, b in zip(is_row[: last_other + 1], blank, strict=False))
-    if first is None or n_above > 1:
+    whole = [
+        k for k in range(last_other)
+        if is_row[k] and not is_blank[k] and len(_trimmed(table[k])) > max(columns)
+    ]  # fmt: skip
+    if first is None or whole:
+        wrong = next(k for k in others if k > whole[0]) if whole else last_other
         raise ValueError(
             f"every row must hold numbers in its columns {list(columns)}, counted from 0: line "
-            f"{last_other + 1} is {lines[last_other].strip()!r}"
+            f"{wrong + 1} is {lines[wrong].strip()!r:.200}; put it right, leave a cell empty whose "
+            "number is missing, or begin a line with # that is no row"
         )
     return first
 
 
 def _is_row(cells: Sequence[str], columns: Sequence[int], decimal: str) -> bool:
+    """Numbers, or words for missing ones; a word, where there are no numbers and columns beside."""
     at = [cells[j] if j < len(cells) else "" for j in columns]
-    numbers = [bool(NUMBERS[decimal].fullmatch(cell)) for cell in at]
-    return any(numbers) and all(n or _is_missing(c) for n, c in zip(numbers, at, strict=True))
+    numbers = [is_number(cell, decimal) for cell in at]
+    said = any(numbers) or (len(columns) > 1 and any(cell.strip("-") for cell in at))
+    return said and all(n or _is_missing(c) for n, c in zip(numbers, at, strict=True))
+
+
+def _check_width(
+    above: Sequence[Line], below: Sequence[Sequence[str]], separator: str | None
+) -> None:
+    """Raise ValueError for one name above what may be one column of decimal commas, or two."""
+    whole = all(len(row) == 2 and row[1].isdecimal() for row in below)
+    if separator == "," and whole and above and above[-1].is_word:
+        raise ValueError(
+            f"the header must name every column: it is {above[-1].cells}, and rows such as "
+            f"{','.join(below[0])!r} may be two numbers, or one with a decimal comma; name both, "
+            "or write a decimal point"
+        )
+
+
+def _check_text(cells: Sequence[str], name: str, decimal: str) -> None:
+    """Raise ValueError for a column of numbers that are written in another way than the others."""
+    other = "," if decimal == "." else "."
+    strange = [cell for cell in cells if is_number(cell, other) and not is_number(cell, decimal)]
+    if len(strange) > 0.5 * sum(not _is_missing(cell) for cell in cells):
+        raise ValueError(
+            f"all numbers must have one decimal sign: column {name!r} holds {strange[0]!r}, and "
+            f"in others it is {decimal!r}"
+        )

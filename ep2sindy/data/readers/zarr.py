@@ -9,7 +9,8 @@ from typing import Any
 
 import xarray as xr
 
-from ep2sindy.data.readers.source import UNDECODED, Reader, Source, dataset_source
+from ep2sindy.data.readers.source import Reader, Source, dataset_source
+from ep2sindy.machine.files import read_json
 
 # Compressors and filters that turn bytes into bytes or numbers. Others may make objects of them,
 # which can run code (pickle), and a codec that is registered by name may do anything.
@@ -32,7 +33,7 @@ def read_zarr(path: Path) -> Source:
     """
     check_store(path)
     return dataset_source(
-        path, xr.open_dataset(path, engine="zarr", consolidated=False, **UNDECODED)
+        path, xr.open_dataset(path, engine="zarr", consolidated=False, decode_cf=False)
     )
 
 
@@ -53,7 +54,7 @@ def check_store(path: Path) -> None:
 def _metadata(place: Path) -> dict[str, Any]:
     if place.stat().st_size > LARGEST_METADATA:
         raise ValueError(f"{place.name} of {place.stat().st_size} bytes is no array's metadata")
-    found = json.loads(place.read_text("utf-8"))
+    found = read_json(place.read_text("utf-8"))
     if not isinstance(found, dict):
         raise ValueError(f"{place.name} must hold an object: {type(found).__name__} came")
     return found

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.readers.guard import look_through_first
 from ep2sindy.data.readers.source import damage_named
+from ep2sindy.machine.files import read_json
 from ep2sindy.thruster.axial.state_kernels import CURRENT, SERIES_SUMS, Model, State
 from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
@@ -245,7 +246,7 @@ def _ended(run: xr.Dataset | str | Path) -> xr.Dataset:
 
 
 def _check_same_thruster(theirs: str, ours: str) -> None:
-    before: Mapping[str, object] = json.loads(theirs)["thruster"]
+    before: Mapping[str, object] = read_json(theirs)["thruster"]
     now: Mapping[str, object] = json.loads(ours)["thruster"]
     for name in FIXED:
         if before.get(name) != now.get(name):

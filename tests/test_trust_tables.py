@@ -1,0 +1,300 @@
+"""Tables, packed arrays and JSON of other people: read as what they are, or refused by name."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.app.read_run import read_run
+from ep2sindy.data.readers import csv
+from ep2sindy.data.readers.registry import open_source
+from ep2sindy.data.readers.source import leaves
+from ep2sindy.library.library import named_terms
+from ep2sindy.machine.files import read_json
+from ep2sindy.thruster.ionization import read_rate_table
+from tests.test_trust_inputs import RUN
+
+X = np.arange(20) * 250.5  # below a thousand, and above
+
+
+def table(*cells: Callable[[float], str], sep: str) -> str:
+    lines = [sep.join([str(k), *(text(x) for text in cells)]) for k, x in enumerate(X)]
+    return "\n".join([sep.join(["t", *(f"x{j}" for j, _ in enumerate(cells))]), *lines]) + "\n"
+
+
+def english(x: float) -> str:
+    return f"{x:,.1f}"
+
+
+def german(x: float) -> str:
+    return f"{x:,.1f}".translate(str.maketrans(",.", ".,"))
+
+
+def spaced(x: float) -> str:
+    return f"{x:,.1f}".translate(str.maketrans(",.", "\u00a0,"))
+
+
+@pytest.mark.parametrize(
+    ("text", "sep"),
+    [
+        (english, "\t"), (english, ";"), (german, "\t"), (german, ";"), (spaced, ";"),
+        (lambda x: f'"{english(x)}"', ","), (lambda x: f'"{german(x)}"', ","),
+        (lambda x: f"{x:,.1f}".replace(",", "'"), ";"),
+        (lambda x: f"{x:.1f}".replace(".", ","), ";"), (lambda x: f"{x:.1f}", ","),
+    ],
+)  # fmt: skip
+def test_numbers_are_read_with_and_without_marks_of_thousands(
+    text: Callable[[float], str], sep: str, tmp_path: Path
+) -> None:
+    (tmp_path / "a.csv").write_text(table(text, text, sep=sep))
+    source = open_source(tmp_path / "a.csv")
+    assert source.names == ["t", "x0", "x1"]
+    for name in ("x0", "x1"):
+        np.testing.assert_array_equal(source.read(name).values, X)
+    assert ("marks between thousands" in source.words) == (len(text(1000.5).strip('"')) > 6)
+
+
+AMBIGUOUS = {
+    "thousands or decimals": (
+        "t\tx\n" + "".join(f"{k}\t1,{k:03d}\n" for k in range(9)),
+        "'1,000' may be 1.000 or 1000, and no number of the file tells which",
+    ),
+    "two decimal signs": (
+        "t;x;y\n" + "".join(f"{k};0,{k};{k}.25\n" for k in range(9)),
+        r"column 'x' holds '0,0', and in others it is '\.'",
+    ),
+    "one column of decimal commas, or two": (
+        "x\n1,5\n2,5\n3,5\n", r"rows such as '1,5' may be two numbers, or one",
+    ),
+    "a word in the first row": ("t,x\n0,bad\n1,2\n2,4\n", r"line 2, \['0', 'bad'\], is neither"),
+    "a word in the second row": ("t,x\n0,1\n1,bad\n2,4\n3,5\n", "line 3 is '1,bad'"),
+    "words in the second row": ("t,x\n0,1\nover,load\n2,4\n3,5\n", "line 3 is 'over,load'"),
+    "words in the first row": (
+        "t,x\nover,load\n1,2\n2,4\n", "lines 1 and 2 may both be names",
+    ),
+    "a word in the first row, no header": ("0,bad\n1,2\n2,4\n", "line 1, .* is neither names nor"),
+    "a word in the second row, no header": ("0,1\n1,bad\n2,4\n3,5\n", "line 2 is '1,bad'"),
+    "names that no number helps": (
+        "t,x,x,x.1\n" + "0,1,2,3\n" * 5, "must have names of their own: 'x.1' comes more than once",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", AMBIGUOUS)
+def test_what_may_be_read_in_two_ways_is_refused(case: str, tmp_path: Path) -> None:
+    text, message = AMBIGUOUS[case]
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ValueError, match=f"(?s)a.csv cannot be read: .*{message}"):
+        ep.inspect(tmp_path / "a.csv")
+
+
+ROWS = "".join(f"{k},{2 * k}\n" for k in range(9))
+
+
+@pytest.mark.parametrize(
+    ("above", "names", "units", "first"),
+    [
+        ("t,x\ns,A\n", ["t", "x"], ["s", "A"], [0.0, 0.0]),
+        ("t,x\nsec,a.u.\n", ["t", "x"], ["sec", ""], [0.0, 0.0]),
+        ("a,b\nms,A\n", ["a", "b"], ["ms", "A"], [0.0, 0.0]),
+        ("t,x\n---,---\n", ["t", "x"], ["", ""], [0.0, 0.0]),
+        ("t,x\n-1,n/a\n", ["t", "x"], ["", ""], [-1.0, np.nan]),
+        ("t,x\nn/a,n/a\n", ["t", "x"], ["", ""], [np.nan, np.nan]),
+        ("run A,run A\nt,x\n", ["t", "x"], ["", ""], [0.0, 0.0]),
+        ("# from a,scope\na,b\n", ["a", "b"], ["", ""], [0.0, 0.0]),
+    ],
+)
+def test_units_and_missing_samples_below_a_header_cost_no_name_and_no_row(
+    above: str, names: list[str], units: list[str], first: list[float], tmp_path: Path
+) -> None:
+    (tmp_path / "a.csv").write_text(above + ROWS)
+    source = open_source(tmp_path / "a.csv")
+    arrays = [source.read(name) for name in names]
+    assert list(source.names) == names
+    assert [array.attrs["units"] for array in arrays] == units
+    np.testing.assert_array_equal([array.values[0] for array in arrays], first)
+    assert arrays[1].values[-9:].tolist() == [2.0 * k for k in range(9)]
+
+
+def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,x,x\n" + "".join(f"{k},{k**2},7\n" for k in range(9)))
+    found = ep.inspect(tmp_path / "a.csv")
+    assert [each.name for each in found.found.held] == ["t", "x.0", "x.1"]
+    with pytest.raises(ValueError, match=r"no variable 'x' .*it holds t \(9\), x\.0 \(9\), x\.1"):
+        ep.open_field(tmp_path / "a.csv", variables={"x": ep.Variable("x", "1")}, dt_s=1.0)
+
+
+def test_columns_that_are_left_out_are_said(tmp_path: Path) -> None:
+    text = "t,x,note,rare\n" + "".join(f"{k},{k},ok,{k if k == 3 else ''}\n" for k in range(9))
+    (tmp_path / "a.csv").write_text(text)
+    assert "left out, with few numbers: note, rare" in open_source(tmp_path / "a.csv").words
+
+
+def test_an_index_and_a_column_of_one_name_are_refused() -> None:
+    frame = pd.DataFrame({"t": [0.0, 1.0], "x": [1.0, 2.0]})
+    with pytest.raises(ValueError, match="columns of a table must have names of their own"):
+        ep.discover(frame.set_index("t", drop=False))
+
+
+def test_arrays_of_one_name_are_refused(tmp_path: Path) -> None:
+    content = io.BytesIO()
+    np.save(content, np.arange(5.0))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("x.npy", content.getvalue())
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            archive.writestr("x.npy", content.getvalue())
+    with pytest.raises(ValueError, match="a.npz .*names of their own: 'x' comes 2 times"):
+        ep.inspect(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"a name must mean one value: 'a\.b' means two"):
+        leaves({"a.b": 1, "a": {"b": 2}})
+
+
+def test_a_row_of_a_rate_table_with_a_word_is_not_dropped(tmp_path: Path) -> None:
+    (tmp_path / "rates.csv").write_text("T (eV),rate\n1,1e-22\n5,bad\n25,6e-14\n")
+    with pytest.raises(ValueError, match=r"rates.csv has a row \['5', 'bad'\]"):
+        read_rate_table(tmp_path / "rates.csv")
+
+
+def written(path: Path, *, time: str = "s", **packing: object) -> Path:
+    """Two arrays; packing: attributes of x."""
+    t, x = np.arange(5.0), np.arange(5, dtype="i2")
+    if path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file["time"], file["x"] = t, x
+            file["time"].attrs["units"] = time
+            file["x"].attrs.update(packing)
+        return path
+    coords = {"time": ("time", t, {"units": time})}
+    dataset = xr.Dataset({"x": ("time", x, packing)}, coords=coords)
+    if path.suffix == ".zarr":
+        dataset.to_zarr(path, consolidated=False, zarr_format=2)
+    else:
+        dataset.to_netcdf(path, engine="scipy")
+    return path
+
+
+KINDS = [".nc", ".h5", ".zarr"]
+PLAIN = {"x": ep.Variable("x", "1")}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("scale_factor", 0.0), ("scale_factor", np.nan), ("scale_factor", np.inf),
+        ("scale_factor", "two"), ("scale_factor", np.array([1.0, 2.0])),
+        ("add_offset", np.nan), ("add_offset", -np.inf), ("add_offset", "1"),
+    ],
+)  # fmt: skip
+def test_packing_that_leaves_no_numbers_is_refused_with_its_attribute(
+    kind: str, key: str, value: object, tmp_path: Path
+) -> None:
+    path = written(tmp_path / f"a{kind}", **{key: value})
+    with pytest.raises(ValueError, match=f"a{kind} cannot be read: {key} of 'x' must be a finite"):
+        ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
+    assert ep.inspect(path).time is not None  # the other array is read
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sound_packing_is_undone(kind: str, tmp_path: Path) -> None:
+    path = written(tmp_path / f"a{kind}", scale_factor=np.array([0.5]), add_offset=1.0)
+    field = ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
+    assert field["x"].values.tolist() == [1.0, 1.5, 2.0, 2.5, 3.0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("time", ["days since 2000-01-01", "days"])
+def test_days_are_no_seconds(kind: str, time: str, tmp_path: Path) -> None:
+    path = written(tmp_path / f"a{kind}", time=time)
+    with pytest.raises(ValueError, match=f"the mapping says 's', the file '{time}'"):
+        ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
+    for given in (ep.Variable("time", "days"), ep.inspect(path).time):
+        field = ep.open_field(path, variables=PLAIN, time=given)
+        assert field["time"].values[:2].tolist() == [0.0, 86400.0]
+
+
+def test_null_spaces_of_hdf5_are_named(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["t"], file["x"], file["n"] = np.arange(5.0), np.arange(5.0), h5py.Empty("f8")
+        file["y"] = np.arange(5.0) ** 2
+        file["x"].attrs["units"] = h5py.Empty("S1")
+        file["y"].attrs["_FillValue"] = h5py.Empty("f8")
+    held = {each.name: each for each in ep.inspect(tmp_path / "a.h5").found.held}
+    assert "'/n' is empty: its dataspace is null" in held["n"].problem
+    assert "_FillValue of 'y' must be a number: the attribute is empty" in held["y"].problem
+    assert (held["x"].unit, held["x"].problem) == ("", "")
+
+
+def test_a_line_and_a_number_of_columns_are_counted_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(csv, "pd", SimpleNamespace())  # which would take the memory
+    path = tmp_path / "a.csv"
+    texts = {
+        "wide": "1," * 10_000 + "1\n",
+        "blanks": "1 " * 10_001,
+        "long": "t,x\n0," + "1" * 10**6,
+    }
+    for text in texts.values():
+        path.write_text(text)
+        with pytest.raises(ValueError, match="a table may have up to 10000 columns, in lines of"):
+            ep.inspect(path)
+
+
+def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:
+    n = 3000
+    names = ",".join(f"c{k}" for k in range(n))
+    row = ",".join(f"{k}.5" for k in range(n))
+    (tmp_path / "a.csv").write_text(f"t,{names}\n" + "".join(f"{k},{row}\n" for k in range(4)))
+    assert open_source(tmp_path / "a.csv").read("c2999").values.tolist() == [2999.5] * 4
+
+
+def test_exponents_of_a_model_are_counted_first() -> None:
+    """8000 terms of 8000 variables took 2 GiB."""
+    names = [f"v{k}" for k in range(8000)]
+    for variables, terms in ((names, names), (["x"], [f"sin({k}*x)" for k in range(2, 8002)])):
+        with pytest.raises(ValueError, match="may have up to 4 million exponents.*: 8000 terms of"):
+            named_terms(variables, terms)
+    assert len(named_terms(names[:1000], names[:1000])) == 1000
+
+
+TWICE = '{"a": 1, "b": {"c": 1, "c": 2}}'
+
+
+def test_a_key_that_comes_twice_is_refused(tmp_path: Path) -> None:
+    assert read_json('{"a": {"c": 1}, "b": {"c": 2}}') == {"a": {"c": 1}, "b": {"c": 2}}
+    with pytest.raises(ValueError, match="must have each key once: 'c' comes 2 times"):
+        read_json(TWICE)
+
+
+def twice(text: str, key: str) -> str:
+    return text.replace(f'"{key}":', f'"{key}": [], "{key}":', 1)
+
+
+def test_it_is_refused_in_models_runs_inputs_records_and_stores(tmp_path: Path) -> None:
+    model = tmp_path / "model.json"
+    model.write_text(twice(ep.lorenz().model.to_json(), "states"))
+    with pytest.raises(ValueError, match="model.json: .* each key once: 'states' comes 2 times"):
+        ep.SparseModel.load(model)
+    for name, text in (RUN | {"summary.json": twice(RUN["summary.json"], "seed")}).items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match="summary.json cannot be read .*each key once: 'seed'"):
+        read_run(tmp_path, 0)
+    record = tmp_path / "a.json"
+    record.write_text(twice(json.dumps({"config": {}, "t": [0, 1], "x": [1, 2]}), "t"))
+    for read in (ep.inspect, ep.read_hallthruster_input):
+        with pytest.raises(ValueError, match="a.json .*each key once: 't' comes 2 times"):
+            read(record)
+    array = written(tmp_path / "a.zarr") / "x" / ".zarray"
+    array.write_text(twice(array.read_text(), "dtype"))
+    with pytest.raises(ValueError, match="a.zarr cannot be read: .*each key once: 'dtype'"):
+        ep.inspect(tmp_path / "a.zarr")
