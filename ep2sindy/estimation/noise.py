@@ -89,7 +89,7 @@ def noise_beside(problem: Problem, fit: Fit) -> Noise:
     unit = [e / s for e, s in zip(left, shape, strict=True)]
     memory = _memory(unit)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
-    believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, std, memory)
+    believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, fit, std, memory)
     std = np.maximum(std, FLOOR)
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std).mean()
@@ -243,17 +243,27 @@ def _forgets(
 
 
 def _shown_by_samples(
-    problem: Problem, std: Float[np.ndarray, " d"], memory: Float[np.ndarray, " d"]
+    problem: Problem, fit: Fit, std: Float[np.ndarray, " d"], memory: Float[np.ndarray, " d"]
 ) -> Bool[np.ndarray, " d"]:
     """Whether noise of this size and memory would leave differences as large as the samples'.
 
-    What a model leaves of a signal is smooth: it would make them smaller than they are.
+    What a model leaves of a signal is smooth: it would make them smaller than they are. What the
+    samples do not resolve of a signal makes them larger; then those of the residuals count.
     """
-    differences = np.concatenate([np.diff(r.values, ORDER, axis=0) for r in problem.records])
-    count = np.maximum(np.isfinite(differences).sum(axis=0), 1)
-    measured = np.nansum(np.square(differences), axis=0) / count
+    samples = [record.values for record in problem.records]
+    left = [values - path for values, path in zip(samples, fit.paths, strict=True)]
+    measured = np.minimum(_squared_differences(samples), _squared_differences(left))
     weights = (np.poly1d([1.0, -1.0]) ** ORDER).coeffs
     own, lags = np.convolve(weights, weights[::-1]), np.abs(np.arange(-ORDER, ORDER + 1))
     expected = np.square(std) * (own * memory[:, None] ** lags).sum(axis=1)
     far = np.abs(np.log(np.maximum(measured, TINY) / expected))
-    return far < ALIKE / np.sqrt(count)
+    return far < ALIKE / np.sqrt(problem.n_samples)
+
+
+def _squared_differences(
+    values: Sequence[Float[np.ndarray, "samples d"]],
+) -> Float[np.ndarray, " d"]:
+    """Mean squares, NaN left out; zero where there is none."""
+    differences = np.concatenate([np.diff(each, ORDER, axis=0) for each in values])
+    count = np.maximum(np.isfinite(differences).sum(axis=0), 1)
+    return np.nansum(np.square(differences), axis=0) / count
