@@ -91,6 +91,14 @@ def test_what_comes_to_rest_is_not_clipped() -> None:
     assert bounds_of(np.column_stack([settled, switched]), ["a", "b"]) is None
 
 
+def test_in_noise_one_stretch_at_the_start_is_clipped_as_well() -> None:
+    t = np.linspace(0.0, 20.0, 1000)
+    x = np.exp(-0.1 * t) * np.cos(t) + 0.01 * np.random.default_rng(0).standard_normal(1000)
+    found = bounds_of(np.minimum(x, 0.85)[:, None], ["x"])
+    assert found is not None
+    assert found.words == (f"x is clipped, {(x >= 0.85).sum()} samples at 0.85",)
+
+
 @pytest.mark.parametrize("bits", [8, 12])
 def test_turning_points_of_a_rounded_sine_are_not_clipped(bits: int) -> None:
     step = 2.0 / 2**bits

@@ -17,6 +17,7 @@ SAMPLES_PER_LEVEL = 3  # of rounded samples; the least
 EVEN = 0.01  # of a step, by which distances between levels may differ from whole steps
 DITHERED = 0.5  # noise in steps, from which on rounding is noise like any other
 ORDER = 3  # of differences: they leave little of a signal that the samples resolve
+ROUNDING = 1e-9  # of the range, below which differences are those of the number format
 FINE = 3e-3  # of the spread: no model is as exact
 
 
@@ -36,8 +37,9 @@ class Bounds:
 def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]) -> Bounds | None:
     """Limits of clipped samples, and of those that are rounded more coarsely than they scatter.
 
-    Clipped is an end of the range that comes again and again, where the values beside it do not;
-    what comes to rest there, to the end of the record, is not. None where all are values.
+    Clipped is an end of the range that comes again and again, where the values beside it do not.
+    What rests there from the start, or to the end, is not, if the record has no noise that would
+    show. None where all are values.
     """
     lower, upper, words = values.copy(), values.copy(), []
     for j, name in enumerate(names):
@@ -56,7 +58,7 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
             (lower, -np.inf, levels[0], counts[1:]),
         ):
             there = x == level
-            if _clipped(there, others):
+            if _clipped(x, there, others):
                 limit[there, j] = end
                 ends.append(f"{there.sum()} samples at {level:.4g}")
         if ends:
@@ -64,17 +66,32 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
     return Bounds(lower, upper, tuple(words)) if words else None
 
 
-def _clipped(there: Bool[np.ndarray, " samples"], others: Int[np.ndarray, " levels"]) -> bool:
+def _clipped(
+    x: Float[np.ndarray, " samples"],
+    there: Bool[np.ndarray, " samples"],
+    others: Int[np.ndarray, " levels"],
+) -> bool:
     """Whether an end of the range comes too often. others: how often other levels do, nearest
     first."""
     rounded = len(others) < 2 or (others[:-1] > 1).mean() > REPEATS
     most = TIMES * int(others[:NEXT].max(initial=1)) if rounded else FEWEST - 1
     if there.sum() <= most:
         return False
-    inside = there.copy()
-    for ends in (inside, inside[::-1]):  # at rest from the start, or to the end
-        ends[: int(np.argmin(ends))] = False
-    return bool(inside.sum() > most)
+    counted = there.copy()
+    if not _has_noise(x):
+        for ends in (counted, counted[::-1]):
+            ends[: int(np.argmin(ends))] = False
+    return bool(counted.sum() > most)
+
+
+def _has_noise(x: Float[np.ndarray, " samples"]) -> bool:
+    """Whether differences change their sign from one to the next: of white noise three in four do,
+    of a signal that the samples resolve hardly one, but for rounding."""
+    change = np.diff(x, ORDER)
+    shown = np.abs(change) > ROUNDING * np.ptp(x)
+    both = shown[1:] & shown[:-1]
+    turns = change[1:] * change[:-1] < 0.0
+    return bool(turns[both].sum() > 0.5 * both.sum())
 
 
 def _coarse_step(x: Float[np.ndarray, " samples"], levels: Float[np.ndarray, " levels"]) -> float:

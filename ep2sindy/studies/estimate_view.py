@@ -13,7 +13,7 @@ from ep2sindy.report.document import Block, Section, Table, Text
 
 NOISE = (
     "Noise: standard deviation of what the model leaves of the samples. Memory: its correlation "
-    "from one sample to the next, 0 for white noise. Grows: share of its variance that grows with "
+    "from one sample to the next, 0 for white noise. Grows: how much of its variance grows with "
     "the square of the state. Kurtosis: 3 where it is normal, more with outliers."
 )
 
