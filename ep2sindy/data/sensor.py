@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,12 +27,16 @@ class Bounds:
     """Between what limits the truth of every sample lies, but for its noise.
 
     lower, upper: (samples, columns); both are the sample where it is a value. words: what was
-    found, by column.
+    found, by column. at: which samples are no values.
     """
 
     lower: Float[np.ndarray, "samples columns"]
     upper: Float[np.ndarray, "samples columns"]
     words: tuple[str, ...]
+
+    @cached_property
+    def at(self) -> Bool[np.ndarray, "samples columns"]:
+        return self.lower < self.upper
 
 
 def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]) -> Bounds | None:

@@ -74,20 +74,21 @@ class Discovery:
         )
 
     def __repr__(self) -> str:
-        said = [*self.remarks, *(a.message for a in self.ambiguities)]
-        notes = [f"note: {each}" for each in said[:MOST_NOTES]]
-        left = len(said) - len(notes)
+        notes = [f"note: {each}" for each in self._notes()[:MOST_NOTES]]
+        left = len(self._notes()) - len(notes)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
         head = [self._headline(), *([self.note] if self.note else [])]
         body = model_lines(self.model, n_lines=N_LINES - len(head) - len(tail))
         return one_screen([*head, *body, *tail])
 
     def _repr_html_(self) -> str:
-        said = [*self.remarks, *(a.message for a in self.ambiguities)]
-        notes = "".join(f"<li>{html.escape(each)}</li>" for each in said)
+        notes = "".join(f"<li>{html.escape(each)}</li>" for each in self._notes())
         lines = [self._headline(), *([self.note] if self.note else [])]
         head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
         return head + model_html(self.model) + (f"<ul>{notes}</ul>" if notes else "")
+
+    def _notes(self) -> list[str]:
+        return [*self.remarks, *(each.message for each in self.ambiguities)]
 
     def _headline(self) -> str:
         rule = self.model.provenance.get("selection", "a rule unknown")
@@ -126,7 +127,6 @@ def discover(
     check_kind("recipe", recipe, Recipe, "ep.Recipe(selection=ep.EBIC())")
     asked = Asked(relations_of(relations), terms or {})
     check_asked(asked, library, trajectories[0].state_names)
-    check_repeats(trajectories)
     watch = as_progress(progress)
     estimate, fronts = _searched(trajectories, library, recipe, asked, seed, watch)
     choice = choose(
@@ -190,5 +190,6 @@ def _searched(
     rng = np.random.default_rng(seed)
     if isinstance(recipe.search, Joint):
         return estimated(runs, library, recipe, asked, rng=rng, progress=progress)
+    check_repeats(runs)
     equations = recipe.searched(runs, library, asked, rng=rng, progress=progress)
     return None, {equation.front.equation: equation.front for equation in equations}

@@ -63,9 +63,9 @@ class Estimate:
     first.
     remarks: what the samples show that is not as assumed, in sentences: limits of sensors, noise
     that lasts, grows or has outliers, states that hang together.
-    kurtosis: (d,), of the noise, 3 where it is normal. growth: (d,), share of its variance that
-    grows with the state. delays_s: (d,), by which channels come late; `Joint(align=True)` brings
-    them together, and leaves out what that takes at the ends.
+    kurtosis: (d,), of the noise, 3 where it is normal, NaN where no sample is a value. growth:
+    (d,), share of its variance that grows with the state. delays_s: (d,), by which channels come
+    late; `Joint(align=True)` brings them together, and leaves out what that takes at the ends.
     """
 
     model: SparseModel

@@ -41,7 +41,8 @@ class Noise:
     (samples, d), the size at a sample in units of std: one, or growing with the state. memory:
     (d,), correlation from one sample to the next where noise lasts, else 0. unexplained: (d,), the
     same where the samples show no such noise: then it is the model's error. growth: (d,), share of
-    the variance that grows with the state. kurtosis: (d,), of normal noise 3; outliers: (d,), how
+    the variance that grows with the state. kurtosis: (d,), of normal noise 3, NaN where all
+    samples are limits; outliers: (d,), how
     many samples are off by five standard deviations of what most show. deviance: -2 log likelihood
     of the residuals.
     """
@@ -96,7 +97,7 @@ def noise_beside(problem: Problem, fit: Fit) -> Noise:
     logs = n * np.log(alike) + sum(np.log(np.square(s)).sum(axis=0) for s in shape)
     if limited.any():
         logs = np.where(limited, between, logs)
-    kurtosis, outliers = _tails(unit, memory)
+    kurtosis, outliers = _tails(problem, unit, memory)
     return Noise(
         std=std,
         shape=shape,
@@ -115,13 +116,15 @@ def _likeliest_std(
     """Where sensors have limits: the noise under which the samples are likeliest, and -2 log of
     their likelihood, beside that of values alone."""
     best, found = np.full(len(std), np.inf), std
+    n_values = np.sum(
+        [np.isfinite(record.values).sum(axis=0) for record in problem.records], axis=0
+    )
     for share in NOISE_SHARES:
         tried = np.maximum(share * std, FLOOR)
-        deviance = np.zeros(len(std))
+        deviance = n_values * (np.log(np.square(tried)) - 1.0)
         for record, path in zip(problem.records, fit.paths, strict=True):
-            squares = seen(record, path, np.tile(np.square(tried), (len(path), 1))).squares
-            values = record.n_values
-            deviance += squares.sum(axis=0) + values * (np.log(np.square(tried)) - 1.0)
+            variance = np.broadcast_to(np.square(tried), path.shape)
+            deviance = deviance + seen(record, path, variance).squares.sum(axis=0)
         found = np.where(deviance < best, tried, found)
         best = np.minimum(deviance, best)
     return found, best
@@ -133,7 +136,7 @@ def _pulls(
     """What is left of values; of limits, what the noise is thought to have been."""
     pulls = []
     for record, path in zip(problem.records, fit.paths, strict=True):
-        by_sample = seen(record, path, np.tile(np.square(std), (len(path), 1)))
+        by_sample = seen(record, path, np.broadcast_to(np.square(std), path.shape))
         pull = by_sample.residuals / by_sample.variance * np.square(std)
         pulls.append(np.where(np.isfinite(pull), pull, 0.0))
     return pulls
@@ -173,16 +176,22 @@ def _shapes(
 
 
 def _tails(
-    left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"]
+    problem: Problem,
+    left: Sequence[Float[np.ndarray, "samples d"]],
+    memory: Float[np.ndarray, " d"],
 ) -> tuple[Float[np.ndarray, " d"], Int[np.ndarray, " d"]]:
-    """Kurtosis of what is new in residuals from one sample to the next, and how many of them are
-    outliers."""
+    """Kurtosis of what is new in residuals of values from one sample to the next, and how many of
+    them are outliers."""
+    kurtosis, outliers = np.full(len(memory), np.nan), np.zeros(len(memory), dtype=np.int64)
+    values = [np.isfinite(record.values) for record in problem.records]
     new = np.concatenate([e[1:] - memory * e[:-1] for e in left])
-    squares = np.square(new)
-    kurtosis = np.square(squares).mean(axis=0) / np.maximum(np.square(squares.mean(axis=0)), TINY)
-    # The median of squares of a normal variable is 0.455 of its variance.
-    beyond = squares > OUTLYING**2 * np.median(squares, axis=0) / 0.455
-    return kurtosis, beyond.sum(axis=0)
+    known = np.concatenate([each[1:] & each[:-1] for each in values])
+    for k in np.flatnonzero(known.any(axis=0)):
+        squares = np.square(new[known[:, k], k])
+        kurtosis[k] = np.square(squares).mean() / max(np.square(squares.mean()), TINY)
+        # The median of squares of a normal variable is 0.455 of its variance.
+        outliers[k] = (squares > OUTLYING**2 * np.median(squares) / 0.455).sum()
+    return kurtosis, outliers
 
 
 def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:

@@ -43,8 +43,8 @@ def seen(
     residuals, variance = residuals.copy(), variance.copy()
     at = record.limits.at
     noise = np.sqrt(variance[at])
-    lower = (record.limits.lower - path[at]) / noise
-    upper = (record.limits.upper - path[at]) / noise
+    lower = (record.limits.lower - path)[at] / noise
+    upper = (record.limits.upper - path)[at] / noise
     pull, weight, squares[at] = between(lower, upper)
     residuals[at] = np.where(weight > TELLS, noise * pull / np.maximum(weight, TELLS), np.nan)
     variance[at] = np.square(noise) / np.maximum(weight, TELLS)

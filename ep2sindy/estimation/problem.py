@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.constraints.relations import Relation, constraint
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.data.sensor import bounds_of
+from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.kernels import sensitivity_stage, term_values
 from ep2sindy.library.library import Library
@@ -19,19 +19,6 @@ from ep2sindy.machine.progress import Advance, nothing
 
 # Where each Runge-Kutta stage stands in its step, and the share of its slope in the sum.
 STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Samples that are no values: between what they lie, but for their noise.
-
-    at: which. lower, upper: of those, in their order, scaled. words: why.
-    """
-
-    at: Bool[np.ndarray, "samples d"]
-    lower: Float[np.ndarray, " limited"]
-    upper: Float[np.ndarray, " limited"]
-    words: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +33,7 @@ class Record:
     times: Float[np.ndarray, " samples"]
     samples: Float[np.ndarray, "samples d"]
     inputs: Float[np.ndarray, "samples n_inputs"]
-    limits: Limits | None = None
+    limits: Bounds | None = None
 
     @property
     def values(self) -> Float[np.ndarray, "samples d"]:
@@ -59,17 +46,10 @@ class Record:
         self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
     ) -> Record:
         """Some samples alone, with others in their place."""
-        limits = self.limits
+        limits, by = self.limits, samples - self.samples[kept]
         if limits is not None:
-            lower, upper = self.samples.copy(), self.samples.copy()
-            lower[limits.at], upper[limits.at] = limits.lower, limits.upper
-            at, by = limits.at[kept], samples - self.samples[kept]
-            limits = Limits(at, (lower[kept] + by)[at], (upper[kept] + by)[at], limits.words)
+            limits = replace(limits, lower=limits.lower[kept] + by, upper=limits.upper[kept] + by)
         return Record(self.times[kept], samples, self.inputs[kept], limits)
-
-    @property
-    def n_values(self) -> Int[np.ndarray, " d"]:
-        return np.isfinite(self.values).sum(axis=0)
 
     @cached_property
     def steps(self) -> Float[np.ndarray, " steps"]:
@@ -235,8 +215,7 @@ class Problem:
     def _products_at(
         self, record: Record, states: Float[np.ndarray, "steps d"], share: float
     ) -> Float[np.ndarray, "steps products"]:
-        inputs = record.inputs_at(share)
-        return self._product_values(states, inputs)
+        return self._product_values(states, record.inputs_at(share))
 
     def _product_values(
         self, states: Float[np.ndarray, "n d"], inputs: Float[np.ndarray, "n n_inputs"]
@@ -314,9 +293,6 @@ def _record(run: Trajectory, size: np.ndarray, step_s: float) -> Record:
     )
 
 
-def _limits(run: Trajectory, size: np.ndarray) -> Limits | None:
+def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:
     found = bounds_of(run.states, run.state_names)
-    if found is None:
-        return None
-    at = found.lower < found.upper
-    return Limits(at, (found.lower / size)[at], (found.upper / size)[at], found.words)
+    return found and replace(found, lower=found.lower / size, upper=found.upper / size)

@@ -27,10 +27,10 @@ def remarks(problem: Problem, noise: Noise) -> tuple[str, ...]:
 
 
 def delay_words(problem: Problem, delays: Float[np.ndarray, " d"]) -> str:
-    """`z comes 3.33 ms late (1 sample)`, of every state that does."""
+    """`z comes 0.00333 s late (0.99 samples)`, of every state that does."""
     parts = [
         f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
-        f"({abs(delay):.2g} samples)"
+        f"({abs(delay):.2f} samples)"
         for state, delay in zip(problem.states, delays, strict=True)
         if delay
     ]
@@ -50,13 +50,10 @@ def _of_noise(problem: Problem, noise: Noise) -> list[str]:
     words = []
     error = np.sqrt(24.0 / problem.n_samples)
     for k, state in enumerate(problem.states):
-        if noise.std[k] <= FLOOR:
-            continue  # rounding and integration, no noise of samples
-        if noise.memory[k] or noise.unexplained[k]:
-            memory = max(noise.memory[k], noise.unexplained[k])
-            words.append(f"noise of {state} lasts: {memory:.2f} of it from sample to sample")
-        if problem.limited[k]:
-            continue  # what limits leave is no sample of the noise
+        if noise.std[k] <= FLOOR or noise.unexplained[k]:
+            continue  # rounding and integration, or the model's error, and no noise of samples
+        if noise.memory[k]:
+            words.append(f"noise of {state} lasts: {noise.memory[k]:.2f} from sample to sample")
         if noise.kurtosis[k] > max(HEAVY, 3.0 + STANDARD_ERRORS * error):
             words.append(
                 f"noise of {state} has {noise.outliers[k]} outliers beyond five standard "
@@ -70,8 +67,8 @@ def _of_noise(problem: Problem, noise: Noise) -> list[str]:
 def _of_collinear_states(problem: Problem, noise: Noise) -> list[str]:
     """States of which a sum varies no more than their noise."""
     d, n = len(problem.states), problem.n_samples
-    if d < 2:
-        return []
+    if d < 2 or noise.unexplained.any():
+        return []  # what is left is then the model's error, which may be as large as the states
     samples = np.concatenate([record.samples for record in problem.records])
     variance, directions = np.linalg.eigh(np.cov(samples / noise.std, rowvar=False))
     if variance[0] > 1.0 + COLLINEAR * np.sqrt(2.0 / n):

@@ -55,7 +55,7 @@ def noise_table(found: Estimate, data: Trajectory) -> pd.DataFrame:
                 "of the state's std": f"{100.0 * noise / spread:.2g} %",
                 "memory": f"{found.memory[k]:.2f}",
                 "grows": f"{100.0 * found.growth[k]:.3g} %",
-                "kurtosis": f"{found.kurtosis[k]:.3g}",
+                "kurtosis": f"{found.kurtosis[k]:.3g}".replace("nan", ""),
             }
         )
     return pd.DataFrame(rows)
