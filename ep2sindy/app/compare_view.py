@@ -14,7 +14,7 @@ from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
 from ep2sindy.report.picture import Drawn, read_png
-from ep2sindy.report.words import in_words, value_text
+from ep2sindy.report.results import in_words, value_text
 from ep2sindy.studies.shown import shown_equation
 
 NOTE = (

@@ -16,7 +16,7 @@ from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
 from ep2sindy.report.folder import freeze_layout
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import DPI, Drawn, drawn
-from ep2sindy.report.words import in_words, value_text
+from ep2sindy.report.results import in_words, value_text
 
 MOST_PANELS = 12
 CAPTION = "Headline figures of the jobs that came to their end."
