@@ -15,7 +15,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
 from ep2sindy.report.picture import Drawn, read_png
 from ep2sindy.report.results import in_words, value_text
-from ep2sindy.studies.shown import shown_equation
+from ep2sindy.studies.views import shown_equation
 
 NOTE = (
     "Apart: the 95 % intervals of two runs have no value in common; overlap: all have. A dash: "

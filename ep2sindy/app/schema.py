@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.app.build import PLAIN, Configured, instance_of, is_plain, step_of
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.studies.kinds import Deferred, Kind
 from ep2sindy.studies.source import FieldSource, Source, Step
+from ep2sindy.studies.study import Check, Deferred
 
 # Keys of conf/config.yaml that every run has.
 COMMON = ("experiment", "study", "seed", "output", "figures")
@@ -90,8 +90,8 @@ def value_of(kind: Any, node: Any, place: str) -> Any:
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         value = _plain(node)
-        if isinstance(parts[1], Kind) and not parts[1].fits(value):
-            raise ValueError(f"{place} must be {parts[1].says}: {value!r} came")
+        if isinstance(parts[1], Check) and not parts[1].test(value):
+            raise ValueError(f"{place} must be {parts[1].message}: {value!r} came")
         return value_of(parts[0], node, place)
     if kind is Any:
         return _plain(node)

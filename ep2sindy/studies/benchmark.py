@@ -19,7 +19,7 @@ from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.report.run import Run
 from ep2sindy.studies.benchmark_view import Outcome, published_cells
 from ep2sindy.studies.identified import first_realizations
-from ep2sindy.studies.kinds import Count, Deferred, Levels, Names
+from ep2sindy.studies.study import Count, Deferred, Levels, Names
 from ep2sindy.studies.variants import Variant, built_variants, merits
 from ep2sindy.synthetic.draws import check_systems, realization
 

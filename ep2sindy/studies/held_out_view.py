@@ -16,9 +16,10 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.held_out import Judged
-from ep2sindy.studies.shown import (
+from ep2sindy.studies.source import data_summary
+from ep2sindy.studies.views import (
     MARKS,
-    Shown,
+    PlotRange,
     coefficients,
     equation_sections,
     intervals,
@@ -27,7 +28,6 @@ from ep2sindy.studies.shown import (
     run_figures,
     trajectories,
 )
-from ep2sindy.studies.source import data_summary
 
 TITLE = "integrated over held-out time from its first sample (nrmse 1: no better than a constant)"
 INTERVALS = (
@@ -57,7 +57,7 @@ class Outcome:
     judged: Mapping[str, Judged]
     labels: Mapping[str, str]
     relations: Sequence[str]
-    shown: Shown
+    shown: PlotRange
     findings: Mapping[str, Any]
     more_tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     more_figures: Mapping[str, Captioned] = field(default_factory=dict)

@@ -11,12 +11,12 @@ import numpy as np
 
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
-from ep2sindy.studies.kinds import Kind
+from ep2sindy.studies.study import Check
 
 Terms = Mapping[str, Sequence[int | str]]  # by state; the constant, 1, may come as a number
 Relations = Annotated[
     Sequence[str],
-    Kind(
+    Check(
         "a list of relations, such as ['x: x*y == -1 * y: x*y']",
         lambda value: isinstance(value, list) and bool(value),
     ),

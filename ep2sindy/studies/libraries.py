@@ -16,13 +16,13 @@ from ep2sindy.machine.progress import counted
 from ep2sindy.report.run import Run
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.studies.functions import registered
-from ep2sindy.studies.kinds import Coefficients, PositiveOrAll, Share
 from ep2sindy.studies.libraries_view import Outcome
 from ep2sindy.studies.library_result import result_of
 from ep2sindy.studies.living import LivingSearch
-from ep2sindy.studies.shown import Shown
 from ep2sindy.studies.source import Source, zone_length_m
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, Share
 from ep2sindy.studies.term_roles import Compared
+from ep2sindy.studies.views import PlotRange
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Study:
     recipe: Recipe
     libraries: Mapping[str, LibraryCase]
     rollout_s: PositiveOrAll
-    figures: Shown
+    figures: PlotRange
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: Share = 0.25

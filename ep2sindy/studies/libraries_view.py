@@ -39,17 +39,17 @@ from ep2sindy.studies.living_view import (
     living_tables,
 )
 from ep2sindy.studies.records_view import records_sections, records_tables
-from ep2sindy.studies.shown import (
+from ep2sindy.studies.source import data_summary
+from ep2sindy.studies.term_roles import roles_section, roles_summary, roles_table
+from ep2sindy.studies.views import (
     INTEGRATED,
-    Shown,
+    PlotRange,
     interval_table,
     rollout_tables,
     run_figures,
     shown_equation,
     trajectories,
 )
-from ep2sindy.studies.source import data_summary
-from ep2sindy.studies.term_roles import roles_section, roles_summary, roles_table
 
 FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
 THESIS = "The same with the thesis's terms, fitted to these data."
@@ -65,7 +65,7 @@ class Outcome:
 
     data: Trajectory
     results: Mapping[str, LibraryResult]
-    shown: Shown
+    shown: PlotRange
     files: Sequence[str] = ()
 
     @property

@@ -19,7 +19,7 @@ from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.kalman import KalmanSmoother
-from ep2sindy.studies.kinds import Count
+from ep2sindy.studies.study import Count
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ep2sindy.report.document import (
     places,
 )
 from ep2sindy.studies.living import Living
-from ep2sindy.studies.shown import (
+from ep2sindy.studies.views import (
     coefficients,
     interval_table,
     intervals,

@@ -26,10 +26,10 @@ from ep2sindy.machine.own import own_source
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.machine.progress import Advance
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import A_LIST, Count, Names
 from ep2sindy.studies.pointwise_view import Outcome
 from ep2sindy.studies.simulated import say_simulation
 from ep2sindy.studies.source import FieldSource, say_field
+from ep2sindy.studies.study import A_LIST, Count, Names
 from ep2sindy.thruster.parameters import Thruster
 
 # What does not change the result of a point, and may differ when a broken run is taken up.

@@ -10,7 +10,6 @@ import xarray as xr
 
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Deferred, Kind, Positive, PositiveOrAll
 from ep2sindy.studies.simulate_scan import (
     FAILED,
     ScanOutcome,
@@ -21,6 +20,7 @@ from ep2sindy.studies.simulate_scan import (
 )
 from ep2sindy.studies.simulate_view import Outcome
 from ep2sindy.studies.simulated import is_simulation, say_simulation
+from ep2sindy.studies.study import Check, Deferred, Positive, PositiveOrAll
 from ep2sindy.studies.study import Outcome as AnyOutcome
 from ep2sindy.thruster.cache import write
 
@@ -34,7 +34,7 @@ def _is_scan(value: Any) -> bool:
 
 Scan = Annotated[
     Mapping[str, Sequence[Any]] | None,
-    Kind("like {operating_point.voltage: [250,300]}, each value once, or null", _is_scan),
+    Check("like {operating_point.voltage: [250,300]}, each value once, or null", _is_scan),
 ]
 
 

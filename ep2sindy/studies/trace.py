@@ -17,9 +17,9 @@ from ep2sindy.model.stability import share_reaching
 from ep2sindy.report.run import Run
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
 from ep2sindy.signals.trace import Trace, trace
-from ep2sindy.studies.kinds import Count, Deferred, Positive, Share
 from ep2sindy.studies.living import cycle_of
 from ep2sindy.studies.source import Source
+from ep2sindy.studies.study import Count, Deferred, Positive, Share
 from ep2sindy.studies.trace_judged import as_measured, fitted_samples
 from ep2sindy.studies.trace_view import Outcome
 

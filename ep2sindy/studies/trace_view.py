@@ -38,7 +38,9 @@ from ep2sindy.selection.rule import selected
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen
 from ep2sindy.signals.trace import Trace
-from ep2sindy.studies.shown import (
+from ep2sindy.studies.source import data_summary
+from ep2sindy.studies.trace_judged import paths_off
+from ep2sindy.studies.views import (
     coefficients,
     interval_table,
     intervals,
@@ -46,8 +48,6 @@ from ep2sindy.studies.shown import (
     rollout_tables,
     shown_equation,
 )
-from ep2sindy.studies.source import data_summary
-from ep2sindy.studies.trace_judged import paths_off
 
 CAPTIONS = {
     "free_run": "The model run freely from one sample (colour) over the record that it never saw "

@@ -11,7 +11,7 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Finding
 from ep2sindy.library.library import Library
-from ep2sindy.studies.kinds import Deferred
+from ep2sindy.studies.study import Deferred
 from ep2sindy.synthetic.systems import System
 
 

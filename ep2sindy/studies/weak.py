@@ -16,11 +16,12 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures, places
 from ep2sindy.report.run import Run
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.kinds import Coefficients, Count, Counts, Deferred, PositiveOrAll
 from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.shown import (
+from ep2sindy.studies.source import Source, data_summary
+from ep2sindy.studies.study import Coefficients, Count, Counts, Deferred, PositiveOrAll
+from ep2sindy.studies.views import (
     INTEGRATED,
-    Shown,
+    PlotRange,
     coefficients,
     equation_sections,
     intervals,
@@ -28,7 +29,6 @@ from ep2sindy.studies.shown import (
     rollout_tables,
     run_figures,
 )
-from ep2sindy.studies.source import Source, data_summary
 from ep2sindy.studies.weak_forms import Fitted, fit_settings, settings_of
 
 FIGURES = ("trajectories", "phase", "derivatives", "spectra")
@@ -55,7 +55,7 @@ class Study:
     n_windows: Count
     n_points: Counts
     rollout_s: PositiveOrAll
-    figures: Shown
+    figures: PlotRange
     thesis: Coefficients = field(default_factory=dict)
 
     def compute(self, run: Run) -> Outcome:

@@ -17,7 +17,7 @@ from ep2sindy.regression.rows import Formulation, Regression
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.front import Candidate, fit_support
-from ep2sindy.studies.kinds import Deferred
+from ep2sindy.studies.study import Deferred
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
@@ -33,6 +32,7 @@ from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap
 from ep2sindy.studies.parametric.trends import laws
 from ep2sindy.studies.parametric.view import Outcome, Panels
 from ep2sindy.studies.source import Source
+from ep2sindy.studies.study import Check, Count
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Trend:
 
 Cases = Annotated[
     Mapping[str, CaseSettings],
-    Kind(
+    Check(
         "like {free: {relations: [], quantities: {k: {coefficient: 'x: x'}}}}",
         lambda value: isinstance(value, dict) and bool(value),
     ),

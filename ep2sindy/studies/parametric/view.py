@@ -18,7 +18,7 @@ from ep2sindy.studies.parametric import summary, tables
 from ep2sindy.studies.parametric.all_points import JointResult
 from ep2sindy.studies.parametric.oscillation import point_label
 from ep2sindy.studies.parametric.points import REFINED, Fitted, PointResult, PointStudy
-from ep2sindy.studies.shown import coefficients
+from ep2sindy.studies.views import coefficients
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "

@@ -13,7 +13,6 @@ from ep2sindy.discovery.operating_points import OperatingRecord
 from ep2sindy.library.library import polynomial
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Count, Counts, Kind, Positive
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
@@ -21,6 +20,7 @@ from ep2sindy.studies.predict.branch import Branch, How, Searched, branch_of, gr
 from ep2sindy.studies.predict.view import Outcome, n_points
 from ep2sindy.studies.simulate_scan import compile_kernels
 from ep2sindy.studies.source import Source
+from ep2sindy.studies.study import Check, Count, Counts, Positive
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class SearchSettings:
 
 Points = Annotated[
     Sequence[Mapping[str, Any]],
-    Kind(
+    Check(
         "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], every combination being a point",
         lambda value: isinstance(value, list) and bool(value),
     ),
