@@ -44,14 +44,18 @@ LABELS = {
 
 
 class View(Flag):
-    """Where a metric appears: tables/*.csv, screen and page, summary.json, headline."""
+    """Where a metric appears: tables/*.csv, screen and page, summary.json, headline.
+
+    FILES: tables and summary. SHOWN: in them and on the screen. ALL: and in the headline.
+    """
 
     CSV = auto()
     SCREEN = auto()
     JSON = auto()
     HEADLINE = auto()
     FILES = CSV | JSON
-    ALL = CSV | SCREEN | JSON | HEADLINE
+    SHOWN = FILES | SCREEN
+    ALL = SHOWN | HEADLINE
 
 
 Record = TypeVar("Record")
