@@ -76,7 +76,8 @@ class LibraryResult:
         """The fronts as in the thesis's Tables I-III, and terms that the data cannot tell apart."""
         found = self.discovery
         fronts = [
-            ResultTable(_rows(self, state), _columns(self.label)).csv() for state in found.fronts
+            ResultTable(candidate_rows(found, state), _columns(self.label)).csv()
+            for state in found.fronts
         ]
         ambiguities = [(a.exact, " ".join(a.terms), a.message) for a in found.ambiguities]
         return {
@@ -163,8 +164,8 @@ def _inclusion(chosen: Candidate) -> dict[str, float]:
     return dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True))
 
 
-def _rows(result: LibraryResult, state: str) -> list[Row]:
-    front, scores = result.discovery.fronts[state], result.discovery.scores[state]
+def candidate_rows(found: Discovery, state: str) -> list[Row]:
+    front, scores = found.fronts[state], found.scores[state]
     chosen = selected(front, scores)
     return [
         Row(each, float(score), each is chosen, each.coef_by_term)
