@@ -18,7 +18,7 @@ from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
 from ep2sindy.studies.predict.branch import Branch, How, Searched, branch_of, grouped
 from ep2sindy.studies.predict.view import Outcome, n_points
-from ep2sindy.studies.simulate_scan import compile_kernels
+from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Check, Count, Counts, Positive
 
