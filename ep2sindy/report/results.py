@@ -103,11 +103,21 @@ class Metric(Generic[Record]):
             return {heading: self.cell(value)}
         return {heading.format(part): self.cell(each) for part, each in value.items()}
 
-    def of(self, part: Callable[[Outer], Record], key: str = "{}") -> Metric[Outer]:
-        """The same figure of a part of a larger record; key: its name there, `{}` the own one."""
+    def of(
+        self, part: Callable[[Outer], Record], key: str = "{}", view: View = View.ALL
+    ) -> Metric[Outer]:
+        """The same figure of a part of a larger record.
+
+        key: its name there, `{}` being the own one. view: where it appears, of those it did.
+        """
         made: Any = replace(self, key=key.format(self.key))  # the one field of a record's type
         column = key.format(self.column) if self.column else ""
-        return replace(made, column=column, value=lambda outer: self.value(part(outer)))
+        return replace(
+            made,
+            column=column,
+            view=self.view & view,
+            value=lambda outer: self.value(part(outer)),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,15 @@ from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import counted
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.run import Run
-from ep2sindy.studies.held_out import first_and_last, fit_and_judge
-from ep2sindy.studies.held_out_view import Outcome, judged_summary
-from ep2sindy.studies.known_terms import Relations, Terms, terms_of
+from ep2sindy.studies.fits import (
+    Outcome,
+    Relations,
+    Terms,
+    first_and_last,
+    fit_and_judge,
+    judged_summary,
+    terms_of,
+)
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Check, Share
 from ep2sindy.studies.views import PlotRange

@@ -26,10 +26,20 @@ from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.held_out import Judged, first_and_last, fit_and_judge, judge
-from ep2sindy.studies.held_out_view import COMPARED, Outcome, judged_summary, run_summary
+from ep2sindy.studies.fits import (
+    COMPARED,
+    Judged,
+    Outcome,
+    Relations,
+    Terms,
+    first_and_last,
+    fit_and_judge,
+    judge,
+    judged_summary,
+    run_summary,
+    terms_of,
+)
 from ep2sindy.studies.ils_draws import draws_table, spread_section, spread_summary
-from ep2sindy.studies.known_terms import Relations, Terms, terms_of
 from ep2sindy.studies.living import LivingSearch, two_periods
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Count, Counts, Share

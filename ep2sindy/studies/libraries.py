@@ -27,7 +27,7 @@ from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.held_out import first_and_last
+from ep2sindy.studies.fits import first_and_last
 from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Source, data_summary, zone_length_m

@@ -14,7 +14,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
-from ep2sindy.studies.known_terms import Terms, terms_of
+from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
 from ep2sindy.studies.parametric.oscillation import point_label

@@ -13,7 +13,7 @@ from ep2sindy.discovery.operating_points import OperatingRecord
 from ep2sindy.library.library import polynomial
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
-from ep2sindy.studies.known_terms import Terms, terms_of
+from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
 from ep2sindy.studies.parametric.oscillation import PointData, point_label
 from ep2sindy.studies.predict.branch import Branch, How, Searched, branch_of, grouped
