@@ -19,10 +19,10 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.machine.parallel import Loky
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Regression
+from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, fit_support, fit_supports, front_order
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso, Search

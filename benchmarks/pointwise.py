@@ -32,9 +32,9 @@ from ep2sindy.discovery.blocks import blocks_of
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
-from ep2sindy.machine.parallel import Serial
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Regression
+from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.knees import Knee

@@ -14,8 +14,8 @@ from sklearn.metrics import adjusted_rand_score
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import Regimes, regimes
-from ep2sindy.machine.parallel import Loky
 from ep2sindy.regression.differential import Differential
+from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC

@@ -40,7 +40,7 @@ REFERENCE = {
         "discovery.operating_points", "discovery.coefficient_law", "discovery.control_law",
         "studies.parametric",
     ],
-    "Grids": ["discovery.pointwise", "discovery.blocks", "discovery.regimes", "machine"],
+    "Grids": ["discovery.pointwise", "discovery.blocks", "discovery.regimes", "runtime", "trust"],
     "Thruster": ["thruster.parameters", "thruster.axial", "thruster"],
     "PySINDy": ["studies.pysindy_variants"],
 }  # fmt: skip

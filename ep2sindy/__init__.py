@@ -74,11 +74,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.library.library import named_terms as named_terms
     from ep2sindy.library.library import polynomial as polynomial
     from ep2sindy.library.units import Clock as Clock
-    from ep2sindy.machine.own import for_configs as for_configs
-    from ep2sindy.machine.parallel import Dask as Dask
-    from ep2sindy.machine.parallel import Loky as Loky
-    from ep2sindy.machine.parallel import Serial as Serial
-    from ep2sindy.machine.progress import Progress as Progress
     from ep2sindy.model.free_run import FreeRun as FreeRun
     from ep2sindy.model.free_run import free_run as free_run
     from ep2sindy.model.likeness import Bounds as Bounds
@@ -115,6 +110,10 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.regression.test_functions import Bumps as Bumps
     from ep2sindy.regression.weak import Weak as Weak
     from ep2sindy.regression.weighted_weak import WeightedWeak as WeightedWeak
+    from ep2sindy.runtime.parallel import Dask as Dask
+    from ep2sindy.runtime.parallel import Loky as Loky
+    from ep2sindy.runtime.parallel import Serial as Serial
+    from ep2sindy.runtime.progress import Progress as Progress
     from ep2sindy.search.bootstraps import Bootstraps as Bootstraps
     from ep2sindy.search.bootstraps import pooled_supports as pooled_supports
     from ep2sindy.search.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
@@ -209,6 +208,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall
     from ep2sindy.thruster.walls import SheathWall as SheathWall
     from ep2sindy.thruster.walls import wall_material as wall_material
+    from ep2sindy.trust.user_code import for_configs as for_configs
 
     __version__: str
 
@@ -244,9 +244,9 @@ _FACE = {
     "library.equations": "equation_text",
     "library.functions": "register_function",
     "library.library": "Library polynomial named_terms",
-    "machine.own": "for_configs",
-    "machine.parallel": "Serial Loky Dask",
-    "machine.progress": "Progress",
+    "trust.user_code": "for_configs",
+    "runtime.parallel": "Serial Loky Dask",
+    "runtime.progress": "Progress",
     "library.units": "Clock",
     "model.free_run": "FreeRun free_run",
     "model.likeness": "Bounds Verdict",

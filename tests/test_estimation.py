@@ -18,7 +18,7 @@ from ep2sindy.estimation.likelihood import Fit, Gram, Level, fitted, gram, squar
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import Problem, scaled_problem
 from ep2sindy.estimation.supports import alternatives, best_support, priced, term_prices
-from ep2sindy.machine import memory
+from ep2sindy.trust import memory
 
 
 @pytest.fixture

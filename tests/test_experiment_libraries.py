@@ -11,8 +11,8 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
-from ep2sindy.machine.files import write_json
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed

@@ -16,7 +16,7 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
-from ep2sindy.machine.files import WriteError
+from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies.parametric import study as parametric
 from ep2sindy.studies.parametric.opening import point_sources
 from ep2sindy.studies.simulate import Study

@@ -12,13 +12,13 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library, named_terms, polynomial
-from ep2sindy.machine.parallel import Serial
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Formulation, Regression
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
 from ep2sindy.selection.knees import Knee

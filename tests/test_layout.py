@@ -11,7 +11,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 # From the ground up: a room may import only from itself and from those before it.
 ROOMS = [
-    "machine",
+    "trust",
+    "runtime",
     "library",
     "data",
     "signals",
@@ -49,7 +50,16 @@ HEAVY = {
     "h5py": (),
     "tensorboard": (),
     "pandas": ("data", "thruster", "synthetic", "discovery", "figures", "report", "studies", "app"),
-    "xarray": ("data", "thruster", "synthetic", "discovery", "figures", "studies", "app"),
+    "xarray": (
+        "trust.checksum",
+        "data",
+        "thruster",
+        "synthetic",
+        "discovery",
+        "figures",
+        "studies",
+        "app",
+    ),
 }
 # Functions over 50 lines, waiting to be shortened: none should be here for long.
 
@@ -154,7 +164,7 @@ def test_heavy_packages_load_only_where_they_are_needed(package: str) -> None:
 
 def test_the_package_has_few_entries() -> None:
     entries = [p.name for p in PACKAGE.iterdir() if p.name != "__pycache__"]
-    assert len(entries) <= 20, sorted(entries)
+    assert len(entries) <= 21, sorted(entries)
 
 
 def test_every_room_is_on_the_list() -> None:

@@ -15,9 +15,9 @@ import xarray as xr
 import ep2sindy as ep
 from ep2sindy.app.runner import started_run, study_class, write
 from ep2sindy.app.schema import study_of
-from ep2sindy.machine.progress import SILENT, Bars, Told, as_progress, counted
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import SILENT, Bars, Told, as_progress, counted
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore
 from tests import programs

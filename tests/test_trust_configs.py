@@ -32,7 +32,7 @@ REFUSED = [
     "functools.partial", "importlib.import_module", "hydra.utils.instantiate", "shutil.rmtree",
     "ep2sindy.write_field", "ep2sindy.SparseModel.load", "ep2sindy.SparseModel",
     "ep2sindy.discover", "ep2sindy.register_function", "ep2sindy.for_configs",
-    "ep2sindy.machine.files.write_text", "ep2sindy.app.build.call_of",
+    "ep2sindy.runtime.files.write_text", "ep2sindy.app.build.call_of",
     "ep2sindy.studies.functions._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
     "ep2sindy._MODULES", "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
 ]  # fmt: skip

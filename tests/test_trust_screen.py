@@ -18,11 +18,11 @@ from ep2sindy.app import program
 from ep2sindy.app.inspection import commands, config_text
 from ep2sindy.app.sweep import RECORDS, index_text
 from ep2sindy.data.inspection import inspect
-from ep2sindy.machine import progress
-from ep2sindy.machine.files import write_json
-from ep2sindy.machine.screen import in_line, one_screen, plain, say
 from ep2sindy.report.document import Section, Table, Text
 from ep2sindy.report.screen import Screen
+from ep2sindy.runtime import progress
+from ep2sindy.runtime.files import write_json
+from ep2sindy.runtime.screen import in_line, one_screen, plain, say
 from ep2sindy.studies.source import say_data
 from ep2sindy.thruster import cache
 from tests.test_trust_folder import CSV

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from ep2sindy.app.compare_view import compared, figures_of
 from ep2sindy.app.read_run import read_run
-from ep2sindy.machine.files import write_text
-from ep2sindy.machine.screen import say
 from ep2sindy.report.page import TEMPLATES, page_html
 from ep2sindy.report.screen import Screen
+from ep2sindy.runtime.files import write_text
+from ep2sindy.runtime.screen import say
 
 ABOUT = """Compares runs: settings that differ, headline figures, equations with their intervals.
 A run is the folder that it printed last, such as outputs/breathing/2025-01-31_101500."""

@@ -15,8 +15,8 @@ from ep2sindy.data.conversion import KNOWN_UNITS
 from ep2sindy.data.inspection import Inspection, check_alike, inspect
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import files_of
-from ep2sindy.machine.files import write_text
-from ep2sindy.machine.screen import in_line, say
+from ep2sindy.runtime.files import write_text
+from ep2sindy.runtime.screen import in_line, say
 
 ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks like time, z and r,
 and what is missing for which experiment. Several files, or a pattern in quotes, are several

@@ -31,10 +31,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ep2sindy.app.typed_only import check_places, checked_loader, resolved
-from ep2sindy.machine.interruption import end_as_interrupted
-from ep2sindy.machine.own import PACKAGE, isolated_children
-from ep2sindy.machine.screen import plain, say
-from ep2sindy.machine.threads import start_on_one_thread
+from ep2sindy.runtime.screen import plain, say
+from ep2sindy.runtime.threads import start_on_one_thread
+from ep2sindy.trust.interruption import end_as_interrupted
+from ep2sindy.trust.user_code import PACKAGE, isolated_children
 
 USUAL_WARNING = warnings.formatwarning
 

@@ -15,9 +15,9 @@ from yaml import YAMLError
 
 from ep2sindy.app.yaml_files import check_yaml
 from ep2sindy.library.units import Clock
-from ep2sindy.machine.files import read_json
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
+from ep2sindy.runtime.files import read_json
 
 # What a page is made of.
 SUMMARY = {"experiment": str, "seed": int, "headline": dict, "warnings": list, "data": dict}

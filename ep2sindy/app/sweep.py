@@ -15,8 +15,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from ep2sindy.machine.files import read_json, write_json, write_text
-from ep2sindy.machine.screen import in_line, say
+from ep2sindy.runtime.files import read_json, write_json, write_text
+from ep2sindy.runtime.screen import in_line, say
 
 RECORDS = "jobs"
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.machine.files import write_text
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
 from ep2sindy.report.folder import freeze_layout
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import DPI, Drawn, drawn
 from ep2sindy.report.words import in_words, value_text
+from ep2sindy.runtime.files import write_text
 
 MOST_PANELS = 12
 CAPTION = "Headline figures of the jobs that came to their end."

@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy
-from ep2sindy.machine.own import is_for_configs, own_module
+from ep2sindy.trust.user_code import is_for_configs, load_user_module
 
 # Names of the package's face.
 _NAMES = """
@@ -63,7 +63,7 @@ def _own(name: str, place: str) -> Callable[..., Any]:
     """What a user has marked; only a file below the current folder is imported."""
     module, _, last = name.rpartition(".")
     try:
-        target = getattr(own_module(module), last)
+        target = getattr(load_user_module(module), last)
     except (ModuleNotFoundError, AttributeError) as error:
         raise ValueError(
             f"{place} must name a _target_ of ep2sindy that is for configs, such as "

@@ -14,7 +14,7 @@ from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.recognition import Recognised, recognised
-from ep2sindy.machine.screen import WIDTH, html_table, in_line, one_screen, text_table
+from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
 
 # What the experiments need beside time; those that take any variables are not here.
 NEEDS: Mapping[str, tuple[str, ...]] = {

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import SPACE
-from ep2sindy.machine.files import WriteError, replacing, sweep
+from ep2sindy.runtime.files import WriteError, replacing, sweep
 
 
 @dataclass(frozen=True)

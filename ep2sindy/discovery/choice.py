@@ -13,8 +13,8 @@ from ep2sindy.constraints.relations import Relation, constraint
 from ep2sindy.constraints.support import binding
 from ep2sindy.discovery.last_fit import assemble_model, last_fit
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, support_of
 from ep2sindy.selection.rule import Selection, SystemSelection, selected

@@ -22,13 +22,13 @@ from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.progress import Progress, as_progress
-from ep2sindy.machine.screen import N_LINES, one_screen
-from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows
 from ep2sindy.regression.rows import Regression
+from ep2sindy.runtime.progress import Progress, as_progress
+from ep2sindy.runtime.screen import N_LINES, one_screen
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.rule import SystemSelection
 

@@ -12,8 +12,8 @@ from ep2sindy.discovery.recipe import Asked, Recipe
 from ep2sindy.estimation.estimate import Estimate, Weighed, estimate
 from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.rows import Regression
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront, fit_supports
 
 

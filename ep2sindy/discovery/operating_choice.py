@@ -21,9 +21,9 @@ from ep2sindy.discovery.operating_points import OperatingRecord, point_text
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Serial, Workers
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.differential import Differential
+from ep2sindy.runtime.parallel import Serial, Workers
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.searches import BestSubset
 
 CLOSE = 0.05  # of its bound: a deviation that is no reason for another term

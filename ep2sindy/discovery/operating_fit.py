@@ -19,8 +19,6 @@ from ep2sindy.discovery.operating_points import (
     values_of,
 )
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.parallel import Serial, Workers
-from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds, deviation
 from ep2sindy.model.model import SparseModel
@@ -30,6 +28,8 @@ from ep2sindy.refinement.tied import TiedRefinement, refine_tied
 from ep2sindy.refinement.weighted_law import Basis, information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.runtime.parallel import Serial, Workers
+from ep2sindy.runtime.progress import Progress, as_progress
 
 MOST = 10.0  # deviations count no more, however far a run is off, or where there is none
 

@@ -19,9 +19,9 @@ from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.machine.files import read_json, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
+from ep2sindy.runtime.files import read_json, write_text
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 

@@ -18,8 +18,8 @@ from ep2sindy.discovery.choice import choose
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
-from ep2sindy.machine.parallel import Workers
-from ep2sindy.machine.progress import Advance, Progress, as_progress
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.runtime.progress import Advance, Progress, as_progress
 
 NO_FIT = "no_fit"
 

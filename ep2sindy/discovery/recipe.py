@@ -14,9 +14,9 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.estimate import Estimate, estimate
 from ep2sindy.estimation.joint import Joint
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, resamples
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset, Search

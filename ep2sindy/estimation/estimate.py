@@ -19,8 +19,8 @@ from ep2sindy.estimation.remarks import delay_words, late_words, remarks
 from ep2sindy.estimation.size import check_size
 from ep2sindy.estimation.supports import priced, supports_by_size
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import Progress, as_progress, counted
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.progress import Progress, as_progress, counted
 
 MOST_RIVALS = 5
 LEAST_ODDS = 1e-3  # of a rival that is worth a word

@@ -15,7 +15,7 @@ from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.kernels import sensitivity_stage, term_values
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import Advance, nothing
+from ep2sindy.runtime.progress import Advance, nothing
 
 # Where each Runge-Kutta stage stands in its step, and the share of its slope in the sum.
 STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))

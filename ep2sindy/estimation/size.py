@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.machine.memory import check_memory
+from ep2sindy.trust.memory import check_memory
 
 NUMBERS = 3.5  # held at once for each pair of coefficients, and for each coefficient and state
 

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.constraints.relations import Constraint
-from ep2sindy.machine.progress import Advance, nothing
-from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import closed
 from ep2sindy.refinement.ode import ODE, held, unconstrained
 from ep2sindy.refinement.problem import Method, Problem
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import WindowBatch
+from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.runtime.threads import one_thread
 
 
 @dataclass(frozen=True, eq=False)

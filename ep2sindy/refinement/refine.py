@@ -13,9 +13,6 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.machine.progress import Advance, Progress, as_progress, counted
-from ep2sindy.machine.screen import N_LINES, one_screen
-from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import Verdict, judge
@@ -23,6 +20,9 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import ODE, unconstrained
 from ep2sindy.refinement.problem import Fit, Iteration, Method, Problem, recorder
 from ep2sindy.refinement.windows import WindowBatch, cut_windows, dominant_window
+from ep2sindy.runtime.progress import Advance, Progress, as_progress, counted
+from ep2sindy.runtime.screen import N_LINES, one_screen
+from ep2sindy.runtime.threads import one_thread
 
 
 @dataclass(frozen=True, eq=False)

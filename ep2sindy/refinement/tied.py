@@ -10,8 +10,6 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.machine.progress import Progress, as_progress
-from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import (
     FLAT,
@@ -30,6 +28,8 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.tie import Tie, TiedState, finer_tied, fit_tied
 from ep2sindy.refinement.weighted_law import Basis, weighted_law
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
+from ep2sindy.runtime.progress import Progress, as_progress
+from ep2sindy.runtime.threads import one_thread
 
 
 @dataclass(frozen=True, eq=False)

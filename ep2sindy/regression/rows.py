@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, read_only
 from ep2sindy.library.library import Library
-from ep2sindy.machine.memory import check_memory
+from ep2sindy.trust.memory import check_memory
 
 ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the cache
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.machine.progress import Advance, nothing
 from ep2sindy.regression.ambiguity import largest_support, usable_terms
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.regression.resampling import moving_block_counts
 from ep2sindy.regression.rows import Grams, Regression
+from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.search.searches import Search
 
 

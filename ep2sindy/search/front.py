@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.equations import equation_html, equation_text
-from ep2sindy.machine.screen import html_table, one_screen, text_table
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.regression.rows import Regression
+from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.search.bootstraps import Supports
 
 

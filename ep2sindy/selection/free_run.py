@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.likeness import Bounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.refinement.many import refine_together
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, joint_scores
 from ep2sindy.selection.folds import Fold, folds_of

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront
 
 # What no noise-free fit can fall below, as a share of the target's squares: beneath it a

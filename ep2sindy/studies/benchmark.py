@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.benchmark_view import Outcome, published_cells
 from ep2sindy.studies.identified import first_realizations
 from ep2sindy.studies.kinds import Count, Deferred, Levels, Names

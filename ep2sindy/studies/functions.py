@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 
 from ep2sindy.library.functions import function_names
-from ep2sindy.machine.own import own_module
+from ep2sindy.trust.user_code import load_user_module
 
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
@@ -25,7 +25,7 @@ def _registered(text: str) -> str:
         return text
     module, name = found["module"], found["name"]
     try:
-        own_module(module)
+        load_user_module(module)
     except ImportError as error:
         raise ValueError(
             f"functions may name one of your own as MODULE.NAME: {text!r} came, and {error}; the "

@@ -12,8 +12,8 @@ import xarray as xr
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.progress import counted
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import counted
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.studies.functions import registered
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll, Share

@@ -13,9 +13,9 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.last_fit import assemble_model
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.studies.held_out import first_and_last
 from ep2sindy.studies.living import Living, LivingSearch, living_model

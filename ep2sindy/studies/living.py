@@ -10,11 +10,11 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds, Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle

@@ -21,16 +21,16 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import regimes
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
-from ep2sindy.machine.files import fingerprint
-from ep2sindy.machine.own import own_source
-from ep2sindy.machine.parallel import Workers
-from ep2sindy.machine.progress import Advance
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.files import fingerprint
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.runtime.progress import Advance
 from ep2sindy.studies.kinds import A_LIST, Count, Names
 from ep2sindy.studies.pointwise_view import Outcome
 from ep2sindy.studies.simulated import say_simulation
 from ep2sindy.studies.source import FieldSource, say_field
 from ep2sindy.thruster.parameters import Thruster
+from ep2sindy.trust.user_code import own_source
 
 # What does not change the result of a point, and may differ when a broken run is taken up.
 AFTERWARDS = {"output", "parallel", "max_regimes", "keep", "outline", "experiment", "study"}

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import xarray as xr
 
-from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.kinds import Deferred, Kind, Positive, PositiveOrAll
 from ep2sindy.studies.simulate_scan import (
     FAILED,

@@ -14,9 +14,9 @@ from typing import Any
 import pandas as pd
 
 from ep2sindy.figures.stability import curves_figure, stability_figure
-from ep2sindy.machine.files import WriteError
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Section, Table, Text, pictures, places
+from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.simulated import doubts, is_simulation
 

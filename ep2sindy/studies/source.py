@@ -16,8 +16,8 @@ from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.machine.screen import in_line
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.screen import in_line
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.simulated import check_recorded, say_simulation

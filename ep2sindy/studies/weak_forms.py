@@ -10,12 +10,12 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.last_fit import assemble_model, reweighted
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.rows import Formulation, Regression
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.studies.kinds import Deferred
 

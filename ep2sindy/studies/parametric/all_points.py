@@ -10,7 +10,7 @@ import numpy as np
 from ep2sindy.discovery.coefficient_law import TiedFit, tied_fit
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.studies.parametric.oscillation import PointData, point_label

@@ -15,13 +15,13 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Workers
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Regression
+from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.parametric.oscillation import (
     OSCILLATING,

@@ -12,8 +12,8 @@ import numpy as np
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.all_points import searched_jointly

@@ -21,9 +21,9 @@ from ep2sindy.discovery.operating_points import (
     measured_left_out,
 )
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Workers
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.refinement.tied import TiedRefinement
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.runtime.progress import SILENT, Progress
 
 MOST_PARAMETERS = 2  # of a map that can be drawn
 

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 from ep2sindy.discovery.operating_fit import Windows
 from ep2sindy.discovery.operating_points import OperatingRecord
 from ep2sindy.library.library import polynomial
-from ep2sindy.machine.parallel import Workers
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.kinds import Count, Counts, Kind, Positive
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used

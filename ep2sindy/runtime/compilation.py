@@ -8,8 +8,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from ep2sindy.machine.own import PACKAGE, away_from
-from ep2sindy.machine.screen import say
+from ep2sindy.runtime.screen import say
+from ep2sindy.trust.user_code import PACKAGE, away_from
 
 SETTINGS = ".numba_config.yaml"  # of the current folder, which may be anybody's
 

@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-SEAL, MADE_OF = "checksum", "kept_for"
+CHECKSUM, MADE_OF = "checksum", "kept_for"
 
 
-def sealed(field: xr.Dataset, parameters: str) -> xr.Dataset:
+def with_checksum(field: xr.Dataset, parameters: str) -> xr.Dataset:
     """A result with what it was made of, and the checksum of all that it holds."""
     marked = field.assign_attrs({MADE_OF: parameters})
-    return marked.assign_attrs({SEAL: checksum(marked)})
+    return marked.assign_attrs({CHECKSUM: checksum(marked)})
 
 
-def unsealed(stored: xr.Dataset, parameters: str) -> xr.Dataset:
-    """The result as it was sealed; raises ValueError where it is another, or has changed."""
+def verified(stored: xr.Dataset, parameters: str) -> xr.Dataset:
+    """The result as it was kept; raises ValueError where it is another, or has changed."""
     if stored.attrs.get(MADE_OF) != parameters:
         raise ValueError("it is of other parameters")
-    if stored.attrs.get(SEAL) != checksum(stored):
+    if stored.attrs.get(CHECKSUM) != checksum(stored):
         raise ValueError("its checksum does not fit: it has changed since it was written")
-    attributes = {name: v for name, v in stored.attrs.items() if name not in (SEAL, MADE_OF)}
+    attributes = {name: v for name, v in stored.attrs.items() if name not in (CHECKSUM, MADE_OF)}
     return stored.drop_attrs(deep=False).assign_attrs(attributes)
 
 
@@ -37,7 +37,7 @@ def checksum(field: xr.Dataset) -> str:
         digest.update(f"{name} {variable.dims} {values.dtype.str} {values.shape}".encode())
         digest.update(values.tobytes())
         digest.update(_text(variable.attrs))
-    digest.update(_text({name: v for name, v in field.attrs.items() if name != SEAL}))
+    digest.update(_text({name: v for name, v in field.attrs.items() if name != CHECKSUM}))
     return digest.hexdigest()
 
 

@@ -11,8 +11,8 @@ from functools import cache, lru_cache
 from pathlib import Path
 from threading import Lock
 
-from ep2sindy.data.readers.limits import size_of
-from ep2sindy.machine.own import isolated
+from ep2sindy.trust.limits import size_of
+from ep2sindy.trust.user_code import isolated
 
 PATIENCE_S = 20.0  # and a second per 10 MB: slower than any disk
 SPEED = 1e7  # bytes per s
@@ -80,7 +80,7 @@ def _answers(prober: subprocess.Popen, patience_s: float) -> bool:
 @cache
 def _prober(process: int) -> subprocess.Popen:
     """One for each process of ours: a fork must not share its parent's."""
-    command, environment = isolated("ep2sindy.data.readers.probe")
+    command, environment = isolated("ep2sindy.trust.probe")
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,

@@ -17,9 +17,9 @@ from typing import Any, Protocol, runtime_checkable
 import cloudpickle
 from joblib import Parallel, delayed, effective_n_jobs
 
-from ep2sindy.machine.interruption import end_with
-from ep2sindy.machine.own import isolated_children, own_packages
-from ep2sindy.machine.threads import one_thread
+from ep2sindy.runtime.threads import one_thread
+from ep2sindy.trust.interruption import end_with
+from ep2sindy.trust.user_code import isolated_children, own_packages
 
 # Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
 AHEAD = 2

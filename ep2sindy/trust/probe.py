@@ -1,6 +1,6 @@
 """The process that looks through a file first, for libraries in C may die of a damaged one.
 
-Run as `python -m ep2sindy.data.readers.probe`: a path and the name of its reader come in as JSON,
+Run as `python -m ep2sindy.trust.probe`: a path and the name of its reader come in as JSON,
 one line for each file, and "" or what is wrong with the file goes out. It ends when its input does.
 """
 
@@ -13,7 +13,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from ep2sindy.data.readers.limits import DEPTH, N_NAMES, check_declared
+from ep2sindy.trust.limits import DEPTH, N_NAMES, check_declared
 
 SLAB = 2**24  # values read at once
 READ_THROUGH = 2**30  # bytes of an array that are all read; of a longer one its ends

@@ -83,7 +83,7 @@ def is_for_configs(value: object) -> bool:
     return getattr(value, MARK, None) is value
 
 
-def own_module(name: str) -> ModuleType:
+def load_user_module(name: str) -> ModuleType:
     """The module of a file below the current folder, by its dotted name.
 
     Modules of a folder may import each other by its name, `from studies.tools import crop`.

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
-from ep2sindy.machine.screen import in_line
+from ep2sindy.runtime.screen import in_line
 
 Piece = TypeVar("Piece")
 Advance = Callable[[int], None]
