@@ -43,10 +43,12 @@ def leave_folder() -> None:
 
 def isolated(module: str) -> tuple[list[str], dict[str, str]]:
     """Command and environment of a process that runs a module of the package, and that imports
-    nothing of the current folder."""
+    nothing of the current folder, unless it is a checkout of the package."""
     here = Path.cwd()
-    paths = [path for path in sys.path if path and Path(path).resolve() != here]
-    known = os.pathsep.join([*paths, str(PACKAGE.parent)])
+    places = [path for path in sys.path if path]
+    if here != PACKAGE.parent:  # else another checkout that is installed would be found before it
+        places = [path for path in places if Path(path).resolve() != here]
+    known = os.pathsep.join([*places, str(PACKAGE.parent)])
     return [sys.executable, "-P", "-m", module], {**os.environ, SAFE: "1", "PYTHONPATH": known}
 
 
