@@ -13,13 +13,11 @@ from omegaconf import OmegaConf
 from test_face import targets
 
 import ep2sindy as ep
-from ep2sindy.app import yaml_files
-from ep2sindy.app.build import call_of
-from ep2sindy.app.defaults import defaults_of, plain
+from ep2sindy.app import safety
+from ep2sindy.app.build import call_of, defaults_of, plain
 from ep2sindy.app.runner import run_config, study_class
+from ep2sindy.app.safety import CheckedLoader, check_places, check_references, resolved
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
-from ep2sindy.app.typed_only import CheckedLoader, check_places, resolved
-from ep2sindy.app.yaml_files import check_references
 from ep2sindy.studies.functions import registered
 from tests.programs import ended
 
@@ -225,7 +223,7 @@ def test_references_that_double_are_refused_before_they_are_written_out(
 
 
 def test_a_long_list_is_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yaml_files, "MOST_CHARACTERS", 1000)
+    monkeypatch.setattr(safety, "MOST_CHARACTERS", 1000)
     check_references({"a": [1.5] * 10_000, "b": "${a}", "c": {"d": "${b}", "e": "${.d}"}})
 
 

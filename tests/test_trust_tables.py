@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.app.read_run import read_run
+from ep2sindy.app.compare import read_run
 from ep2sindy.data.readers import csv
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.readers.source import leaves
