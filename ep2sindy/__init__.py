@@ -134,7 +134,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.selection.knees import Knee as Knee
     from ep2sindy.selection.knees import LogKnee as LogKnee
     from ep2sindy.selection.refined import RefinedScore as RefinedScore
-    from ep2sindy.selection.resampled import Stability as Stability
     from ep2sindy.selection.rule import selected as selected
     from ep2sindy.signals.attractor import Cycle as Cycle
     from ep2sindy.signals.attractor import find_cycle as find_cycle
@@ -277,7 +276,6 @@ _FACE = {
     "selection.free_run": "FreeRunScore",
     "selection.knees": "Knee LogKnee",
     "selection.refined": "RefinedScore",
-    "selection.resampled": "Stability",
     "selection.rule": "selected",
     "signals.attractor": "Cycle find_cycle",
     "signals.embedding": "LogRate Rate Delays Embedded embed",

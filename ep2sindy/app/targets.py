@@ -25,7 +25,6 @@ Recipe Differential Weak WeightedWeak Bumps Boxes RandomSplit BlockSplit
 KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing
 AdaptiveLasso STLSQ BestSubset Joint Bootstraps
 AICc BIC EBIC Evidence FreeRunScore Bounds Knee LogKnee RefinedScore
-Stability
 Serial Loky Dask
 GradientDescent MultipleShooting NelderMead SingleShooting RungeKutta HermiteSimpson
 Refining Quantity TimeBootstrap Windows
