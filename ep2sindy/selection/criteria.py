@@ -41,24 +41,6 @@ class AICc:
 
 
 @dataclass(frozen=True)
-class BIC:
-    """Schwarz's criterion: which model is most likely, all being equally likely before.
-
-    Assumes what `AICc` does of the residuals. There are many more models of middle size than
-    small ones, so with a library of any size it keeps too many terms.
-    Source: Schwarz 1978, doi:10.1214/aos/1176344136.
-    """
-
-    label: ClassVar[str] = "BIC"
-
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [_criterion(front, self._penalty) for front in fronts]
-
-    def _penalty(self, candidate: Candidate, n_rows: float) -> float:
-        return candidate.n_terms * log(n_rows)
-
-
-@dataclass(frozen=True)
 class EBIC:
     """The extended criterion: sizes are equally likely before, not models.
 
@@ -68,13 +50,15 @@ class EBIC:
     Assumes what `AICc` does of the residuals. coarsening: no model is exact, and with n rows any
     discrepancy becomes significant; the likelihood is raised to the power 1 / (1 + n/coarsening),
     so that evidence stops growing at about that many rows. None: trust the residuals to the end.
+    With gamma=0 and coarsening=None it is Schwarz's criterion, BIC: which model is most likely,
+    all being equally likely before. There are many more models of middle size than small ones, so
+    with a library of any size BIC keeps too many terms.
     Source: Chen & Chen 2008, doi:10.1093/biomet/asn034; Miller & Dunson 2019,
-    doi:10.1080/01621459.2018.1469995.
+    doi:10.1080/01621459.2018.1469995; Schwarz 1978, doi:10.1214/aos/1176344136.
     """
 
     gamma: float = 1.0
     coarsening: float | None = 60.0
-    label: ClassVar[str] = "EBIC"
 
     def __post_init__(self) -> None:
         if not self.gamma >= 0.0:
@@ -84,6 +68,10 @@ class EBIC:
                 f"coarsening counts rows, and must be above 1: {self.coarsening} came; None "
                 "trusts the residuals to the end"
             )
+
+    @property
+    def label(self) -> str:
+        return "BIC" if self.gamma == 0.0 and self.coarsening is None else "EBIC"
 
     def shared_by(self, n_points: int) -> EBIC:
         """The rule at one of n points that share a support: together they pay its count once."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -21,41 +20,37 @@ class Knee:
     the library (the thesis's Eq. 9), or for "max_terms" the largest candidate's plus one (what
     the thesis's Tables II and III were made with). Assumes that a term worth having raises R2 by
     about one step of n_terms / n_norm: any other is dropped, by construction.
-    """
-
-    n_norm: str = "library"
-    label: ClassVar[str] = "d_pareto"
-
-    def __post_init__(self) -> None:
-        if self.n_norm not in ("library", "max_terms"):
-            raise ValueError(f"n_norm must be 'library' or 'max_terms': {self.n_norm!r} came")
-
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [np.hypot(f.errors, f.sizes / _norm_of_sizes(f, self.n_norm)) for f in fronts]
-
-
-@dataclass(frozen=True)
-class LogKnee:
-    """The knee of the logarithm of the error, so that a small term of an exact law counts.
-
+    scale: "log" takes the logarithm of the error, so that a small term of an exact law counts:
     score = sqrt(((log e - log e_min) / (log e_max - log e_min))^2 + (n_terms / n_norm)^2).
-    Assumes that errors span orders of magnitude: the largest fall sets the scale, and a true
+    That assumes that errors span orders of magnitude: the largest fall sets the scale, and a true
     term that lowers the error by less than one step of it is dropped.
     """
 
     n_norm: str = "library"
-    label: ClassVar[str] = "d_log"
+    scale: str = "linear"
 
     def __post_init__(self) -> None:
-        Knee(self.n_norm)
+        if self.n_norm not in ("library", "max_terms"):
+            raise ValueError(f"n_norm must be 'library' or 'max_terms': {self.n_norm!r} came")
+        if self.scale not in ("linear", "log"):
+            raise ValueError(f"scale must be 'linear' or 'log': {self.scale!r} came")
+
+    @property
+    def label(self) -> str:
+        return "d_log" if self.scale == "log" else "d_pareto"
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        found = []
-        for front in fronts:
-            height = np.log(np.maximum(front.errors, FLOOR))
-            height = (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
-            found.append(np.hypot(height, front.sizes / _norm_of_sizes(front, self.n_norm)))
-        return found
+        return [
+            np.hypot(self._height(front), front.sizes / _norm_of_sizes(front, self.n_norm))
+            for front in fronts
+        ]
+
+    def _height(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
+        """Errors, or their logarithms from 0 to 1."""
+        if self.scale == "linear":
+            return front.errors
+        height = np.log(np.maximum(front.errors, FLOOR))
+        return (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
 
 
 def _norm_of_sizes(front: ParetoFront, n_norm: str) -> float:

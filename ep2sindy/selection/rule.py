@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -29,7 +29,8 @@ class Selection(Protocol):
     label: what the score is called in tables.
     """
 
-    label: ClassVar[str]
+    @property
+    def label(self) -> str: ...
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]: ...
 
