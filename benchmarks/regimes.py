@@ -18,8 +18,7 @@ from ep2sindy.machine.parallel import Loky
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
 

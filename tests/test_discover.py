@@ -12,9 +12,8 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
-from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.selection.knees import Knee
 from ep2sindy.synthetic.systems import lotka_volterra
 
 # Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.

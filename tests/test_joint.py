@@ -20,8 +20,7 @@ from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
-from ep2sindy.selection.criteria import EBIC, AICc, log_supports
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.synthetic.systems import lotka_volterra

@@ -8,8 +8,7 @@ from ep2sindy.regression.rows import Regression
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.criteria import EBIC, AICc, log_supports
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection, selected
 from ep2sindy.synthetic.systems import lorenz
 
