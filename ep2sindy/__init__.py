@@ -118,7 +118,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.search.bootstraps import Bootstraps as Bootstraps
     from ep2sindy.search.bootstraps import pooled_supports as pooled_supports
     from ep2sindy.search.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
-    from ep2sindy.search.estimators import STLSQRegressor as STLSQRegressor
     from ep2sindy.search.front import Candidate as Candidate
     from ep2sindy.search.front import ParetoFront as ParetoFront
     from ep2sindy.search.front import fit_support as fit_support
@@ -266,7 +265,7 @@ _FACE = {
     "regression.weak": "Weak",
     "regression.weighted_weak": "WeightedWeak",
     "search.bootstraps": "Bootstraps pooled_supports",
-    "search.estimators": "AdaptiveLassoRegressor STLSQRegressor",
+    "search.estimators": "AdaptiveLassoRegressor",
     "search.front": "Candidate ParetoFront fit_support pareto_front",
     "search.searches": "AdaptiveLasso STLSQ BestSubset",
     "selection.criteria": "AICc EBIC Evidence Knee",
