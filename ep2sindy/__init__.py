@@ -117,7 +117,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.search.bootstraps import Bootstraps as Bootstraps
     from ep2sindy.search.bootstraps import pooled_supports as pooled_supports
     from ep2sindy.search.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
-    from ep2sindy.search.estimators import STLSQRegressor as STLSQRegressor
     from ep2sindy.search.front import Candidate as Candidate
     from ep2sindy.search.front import ParetoFront as ParetoFront
     from ep2sindy.search.front import fit_support as fit_support
@@ -125,17 +124,12 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.search.searches import STLSQ as STLSQ
     from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso
     from ep2sindy.search.searches import BestSubset as BestSubset
-    from ep2sindy.selection.criteria import BIC as BIC
     from ep2sindy.selection.criteria import EBIC as EBIC
     from ep2sindy.selection.criteria import AICc as AICc
-    from ep2sindy.selection.evidence import Evidence as Evidence
+    from ep2sindy.selection.criteria import Evidence as Evidence
+    from ep2sindy.selection.criteria import Knee as Knee
     from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore
-    from ep2sindy.selection.integral import IntegralScore as IntegralScore
-    from ep2sindy.selection.knees import Knee as Knee
-    from ep2sindy.selection.knees import LogKnee as LogKnee
     from ep2sindy.selection.refined import RefinedScore as RefinedScore
-    from ep2sindy.selection.resampled import CrossValidation as CrossValidation
-    from ep2sindy.selection.resampled import Stability as Stability
     from ep2sindy.selection.rule import selected as selected
     from ep2sindy.signals.attractor import Cycle as Cycle
     from ep2sindy.signals.attractor import find_cycle as find_cycle
@@ -271,16 +265,12 @@ _FACE = {
     "regression.weak": "Weak",
     "regression.weighted_weak": "WeightedWeak",
     "search.bootstraps": "Bootstraps pooled_supports",
-    "search.estimators": "AdaptiveLassoRegressor STLSQRegressor",
+    "search.estimators": "AdaptiveLassoRegressor",
     "search.front": "Candidate ParetoFront fit_support pareto_front",
     "search.searches": "AdaptiveLasso STLSQ BestSubset",
-    "selection.criteria": "AICc BIC EBIC",
-    "selection.evidence": "Evidence",
+    "selection.criteria": "AICc EBIC Evidence Knee",
     "selection.free_run": "FreeRunScore",
-    "selection.integral": "IntegralScore",
-    "selection.knees": "Knee LogKnee",
     "selection.refined": "RefinedScore",
-    "selection.resampled": "Stability CrossValidation",
     "selection.rule": "selected",
     "signals.attractor": "Cycle find_cycle",
     "signals.embedding": "LogRate Rate Delays Embedded embed",

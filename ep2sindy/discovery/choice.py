@@ -16,8 +16,14 @@ from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront
-from ep2sindy.selection.combinations import admissible, combinations, support_of
-from ep2sindy.selection.rule import Selection, SystemSelection, selected
+from ep2sindy.selection.rule import (
+    Selection,
+    SystemSelection,
+    admissible,
+    combinations,
+    selected,
+    support_of,
+)
 
 MOST_COMBINATIONS = 1_000_000  # that relations between equations may have to be checked on
 
