@@ -28,8 +28,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.timing import cpu_s
 from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.blocks import blocks_of
-from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
 from ep2sindy.machine.parallel import Serial

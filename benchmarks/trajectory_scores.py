@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.machine.parallel import Loky
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset

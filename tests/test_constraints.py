@@ -14,7 +14,7 @@ from ep2sindy.constraints.relations import (
     relations_from_matrix,
 )
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.discovery.choice import reweighted
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.differential import Differential

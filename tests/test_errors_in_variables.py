@@ -5,15 +5,14 @@ import pytest
 
 from benchmarks.intervals import held
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import reweighted
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.last_fit import reweighted
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, fit_support, pareto_front

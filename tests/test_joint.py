@@ -17,8 +17,7 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Formulation, Regression
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
 from ep2sindy.selection.knees import Knee

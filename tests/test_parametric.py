@@ -14,10 +14,10 @@ from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.resampling import moving_block_counts
 from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
+from ep2sindy.search.bootstraps import moving_block_counts
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.knees import Knee
 from ep2sindy.signals.smoothers import NoSmoothing

@@ -10,8 +10,7 @@ from ep2sindy.regression.rows import Regression
 from ep2sindy.regression.sampling import even_grid, is_even, one_about_each, stretches
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra, van_der_pol
 

@@ -9,18 +9,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Relation
-from ep2sindy.constraints.support import relations_of
+from ep2sindy.constraints.relations import Relation, relations_of
 from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choose
+from ep2sindy.discovery.choice import Choice, choose, judged, misfit_of
 from ep2sindy.discovery.estimated import estimated
-from ep2sindy.discovery.last_fit import judged, misfit_of
 from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.estimation.joint import Joint
+from ep2sindy.estimation.solver import Joint
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.machine.screen import N_LINES, one_screen

@@ -10,7 +10,7 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Asked, Recipe
 from ep2sindy.estimation.estimate import Estimate, Weighed, estimate
-from ep2sindy.estimation.joint import Joint
+from ep2sindy.estimation.solver import Joint
 from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.rows import Regression

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
-from ep2sindy.discovery.last_fit import assemble_model, last_fit
+from ep2sindy.discovery.choice import assemble_model, last_fit
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import Progress, as_progress, counted
@@ -18,7 +18,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
 from ep2sindy.regression.rows import Regression
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.front import ParetoFront, errors_of, fit_supports, front_order
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC

@@ -8,8 +8,7 @@ from math import prod
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Relation
-from ep2sindy.constraints.support import binding
+from ep2sindy.constraints.relations import Relation, binding
 from ep2sindy.model.many import MAX_ERROR
 from ep2sindy.search.front import ParetoFront
 

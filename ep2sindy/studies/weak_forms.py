@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.last_fit import assemble_model, reweighted
+from ep2sindy.discovery.choice import assemble_model, reweighted
 from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
