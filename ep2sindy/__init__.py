@@ -108,7 +108,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.refinement.windows import WindowBatch as WindowBatch
     from ep2sindy.refinement.windows import cut_windows as cut_windows
     from ep2sindy.regression.differential import Differential as Differential
-    from ep2sindy.regression.rows import Regression as Regression
+    from ep2sindy.regression.rows import RegressionRows as RegressionRows
     from ep2sindy.regression.splits import BlockSplit as BlockSplit
     from ep2sindy.regression.splits import RandomSplit as RandomSplit
     from ep2sindy.regression.test_functions import Boxes as Boxes
@@ -264,7 +264,7 @@ _FACE = {
     "refinement.tied": "TiedRefinement refine_tied",
     "refinement.windows": "WindowBatch cut_windows",
     "regression.differential": "Differential",
-    "regression.rows": "Regression",
+    "regression.rows": "RegressionRows",
     "regression.splits": "RandomSplit BlockSplit",
     "regression.test_functions": "Boxes Bumps",
     "regression.weak": "Weak WeightedWeak",

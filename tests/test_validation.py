@@ -9,7 +9,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.many import MAX_ERROR, DrivenWindows, Ensemble
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, ParetoFront, fit_support, pareto_front
@@ -43,10 +43,10 @@ def candidate(
     )
 
 
-def rows_of(runs: Sequence[Trajectory], library: Library) -> Regression:
+def rows_of(runs: Sequence[Trajectory], library: Library) -> RegressionRows:
     """A regression that only its trajectories matter of."""
     values = np.concatenate([run.columns(library.variables) for run in runs])
-    return Regression(
+    return RegressionRows(
         theta=library.evaluate(values),
         target=np.concatenate([run.states for run in runs]),
         library=library,
@@ -138,7 +138,7 @@ def independent_rows(*, noise: float, n_rows: int = 300, scale: float = 1.0) -> 
     library = named_terms(list("abcd"), list("abcd"))
     theta = rng.standard_normal((n_rows, 4))
     target = theta @ [2.0, -1.0, 0.0, 0.0] + noise * rng.standard_normal(n_rows)
-    problem = Regression(
+    problem = RegressionRows(
         theta=theta * scale,
         target=target[:, None],
         library=library,

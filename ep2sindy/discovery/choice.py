@@ -20,7 +20,7 @@ from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import whitened_rows
@@ -202,7 +202,7 @@ def assemble_model(
     )
 
 
-def reweighted(problem: Regression, candidate: Candidate, *, n_steps: int = 8) -> Candidate:
+def reweighted(problem: RegressionRows, candidate: Candidate, *, n_steps: int = 8) -> Candidate:
     """Fit a candidate's terms again, with weights and corrected samples, and say how well.
 
     Returns it with new coefficients, their covariance, in SI, and chi-squared; its scores stay.

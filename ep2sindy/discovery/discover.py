@@ -26,7 +26,7 @@ from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.rule import SystemSelection
 
@@ -165,7 +165,7 @@ def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
 
 
 def _findings(
-    problems: Sequence[Regression], recipe: Recipe, asked: Asked
+    problems: Sequence[RegressionRows], recipe: Recipe, asked: Asked
 ) -> tuple[Ambiguity, ...]:
     """What is to be said of the rows, each once; those of a joint search hold nothing down."""
     found: list[Ambiguity] = []

@@ -17,7 +17,7 @@ from ep2sindy.data.domain import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import usable_terms
-from ep2sindy.regression.rows import NoisyRows, Regression
+from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, Windows
@@ -70,7 +70,7 @@ class Weak:
         library: Library,
         *,
         rng: np.random.Generator,
-    ) -> tuple[Regression, ...]:
+    ) -> tuple[RegressionRows, ...]:
         """One regression per state, since every state has windows of its own.
 
         Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
@@ -89,7 +89,7 @@ class Weak:
         segment = np.arange(run.n_samples) * n_segments // run.n_samples
         names = tuple(dict.fromkeys([*library.variables, *run.state_names]))
         at_hand, estimate = self._smoothed(run, names, library)
-        with np.errstate(over="ignore"):  # Regression names a term that is not finite
+        with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
             terms = library.evaluate(at_hand[:, : len(library.variables)])
         return _Sampled(
             run=run,
@@ -131,13 +131,13 @@ class Weak:
         runs: Sequence[_Sampled],
         library: Library,
         trajectories: Sequence[Trajectory],
-    ) -> Regression:
+    ) -> RegressionRows:
         name = runs[0].run.state_names[state]
         parts = [run.rows(state) for run in runs]
         test = np.concatenate([part.test for part in parts])
         mean, slope = _stacked(p.mean for p in parts), _stacked(p.slope for p in parts)
         n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
-        return Regression(
+        return RegressionRows(
             theta=mean @ np.concatenate([run.terms for run in runs]),
             target=(slope @ np.concatenate([run.run.states[:, state] for run in runs]))[:, None],
             library=library,
@@ -249,12 +249,12 @@ class WeightedWeak:
 
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
-    ) -> tuple[Regression, ...]:
+    ) -> tuple[RegressionRows, ...]:
         """One regression per state, as `Weak.assemble` gives it, with white rows."""
         problems = self.weak.assemble(trajectories, library, rng=rng)
         return tuple(self._weighted(problem) for problem in problems)
 
-    def _weighted(self, problem: Regression) -> Regression:
+    def _weighted(self, problem: RegressionRows) -> RegressionRows:
         if problem.test.any():
             raise ValueError(
                 "weighted rows cannot be held out: set weak.split.test_fraction to 0, or use Weak"

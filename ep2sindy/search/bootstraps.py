@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.machine.progress import Advance, nothing
 from ep2sindy.regression.ambiguity import largest_support, usable_terms
 from ep2sindy.regression.gram_fits import solve_masks
-from ep2sindy.regression.rows import Grams, Regression
+from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.search.searches import Search
 
 
@@ -50,7 +50,7 @@ class Bootstraps:
             raise ValueError(f"block must be a whole number, one or more: {self.block!r} came")
 
     def draw(
-        self, problem: Regression, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
+        self, problem: RegressionRows, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
     ) -> tuple[Grams, Bool[np.ndarray, "draws terms"]]:
         """Gram matrices and kept terms of every bootstrap, out of the terms that may be used."""
         if self.n == 0:
@@ -149,7 +149,7 @@ class Resamples:
 
 
 def resamples(
-    problem: Regression, bootstraps: Bootstraps, *, rng: np.random.Generator
+    problem: RegressionRows, bootstraps: Bootstraps, *, rng: np.random.Generator
 ) -> Resamples:
     """Draw bootstraps of the training rows, once for all equations.
 
@@ -177,7 +177,7 @@ def resamples(
 
 
 def pooled_supports(
-    problem: Regression,
+    problem: RegressionRows,
     search: Search,
     bootstraps: Bootstraps,
     *,

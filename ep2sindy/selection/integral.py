@@ -120,7 +120,7 @@ def records_of(fronts: Sequence[ParetoFront]) -> Records:
     if not runs:
         raise ValueError(
             "to integrate, the rows must know their trajectories: none came with the regression; "
-            "pass them as Regression(trajectories=...)"
+            "pass them as RegressionRows(trajectories=...)"
         )
     equations = [front.equation for front in fronts]
     if sorted(equations) != sorted(runs[0].state_names):
