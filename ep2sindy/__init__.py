@@ -131,12 +131,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.selection.criteria import AICc as AICc
     from ep2sindy.selection.evidence import Evidence as Evidence
     from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore
-    from ep2sindy.selection.integral import IntegralScore as IntegralScore
     from ep2sindy.selection.knees import Knee as Knee
     from ep2sindy.selection.knees import LogKnee as LogKnee
     from ep2sindy.selection.refined import RefinedScore as RefinedScore
-    from ep2sindy.selection.resampled import CrossValidation as CrossValidation
-    from ep2sindy.selection.resampled import Stability as Stability
     from ep2sindy.selection.rule import selected as selected
     from ep2sindy.signals.attractor import Cycle as Cycle
     from ep2sindy.signals.attractor import find_cycle as find_cycle
@@ -275,10 +272,8 @@ _FACE = {
     "selection.criteria": "AICc BIC EBIC",
     "selection.evidence": "Evidence",
     "selection.free_run": "FreeRunScore",
-    "selection.integral": "IntegralScore",
     "selection.knees": "Knee LogKnee",
     "selection.refined": "RefinedScore",
-    "selection.resampled": "Stability CrossValidation",
     "selection.rule": "selected",
     "signals.attractor": "Cycle find_cycle",
     "signals.embedding": "LogRate Rate Delays Embedded embed",

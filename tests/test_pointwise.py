@@ -21,7 +21,7 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.integral import IntegralScore
+from ep2sindy.selection.refined import RefinedScore
 
 T = np.linspace(0.0, 2.0, 201)
 Z, R = np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.035, 0.04, 0.05])
@@ -308,7 +308,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         pointwise(field.assign(x=field["x"].isel(time=0, drop=True)), searching(), workers=Serial())
 
 
-def test_rules_that_integrate_all_equations_serve_every_point() -> None:
+def test_rules_that_refine_all_equations_serve_every_point() -> None:
     field = parabolas(Z[:1], R[:1])
-    result = pointwise(field, searching(selection=IntegralScore()), workers=Serial())
+    result = pointwise(field, searching(selection=RefinedScore()), workers=Serial())
     assert result["n_terms"].item() == 2

@@ -24,8 +24,7 @@ Zone ZoneAverage GridPoint LogRate Rate Delays
 Recipe Differential Weak WeightedWeak Bumps Boxes RandomSplit BlockSplit
 KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing
 AdaptiveLasso STLSQ BestSubset Joint Bootstraps
-AICc BIC EBIC Evidence FreeRunScore Bounds IntegralScore Knee LogKnee RefinedScore
-Stability CrossValidation
+AICc BIC EBIC Evidence FreeRunScore Bounds Knee LogKnee RefinedScore
 Serial Loky Dask
 GradientDescent MultipleShooting NelderMead SingleShooting RungeKutta HermiteSimpson
 Refining Quantity TimeBootstrap Windows

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.constraints.relations import Relation, binding
-from ep2sindy.model.many import MAX_ERROR
 from ep2sindy.search.front import ParetoFront
+from ep2sindy.selection.rule import MAX_ERROR
 
 
 def combinations(

@@ -18,6 +18,9 @@ from ep2sindy.search.front import Candidate, ParetoFront
 # criterion would select terms that explain the discretisation.
 FLOOR = 1e-6
 
+# Error of a system at most, in variances: one that always gives the mean has 1.
+MAX_ERROR = 10.0
+
 
 @runtime_checkable
 class Selection(Protocol):

@@ -77,9 +77,7 @@ def paths_over(
         else:
             if n_samples < LEAST_RUN * per_period:  # inputs end with the record
                 first, n_samples = 0, run.n_samples
-            windows = DrivenWindows.of(
-                run, x, ensemble.states, ensemble.inputs, np.array([first]), n_samples - 1
-            )
+            windows = DrivenWindows.of(run, x, ensemble.inputs, np.array([first]), n_samples - 1)
             t = run.t[first : first + n_samples]
         paths = ensemble.paths(windows, centre=centre, spread=spread)
         for k in range(paths.shape[1]):
