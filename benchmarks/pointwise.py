@@ -36,7 +36,7 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s"}

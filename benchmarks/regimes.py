@@ -18,15 +18,14 @@ from ep2sindy.machine.parallel import Loky
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.knees import Knee, LogKnee
+from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {
     "ebic": EBIC(),
-    "log_knee": LogKnee(),
+    "log_knee": Knee(scale="log"),
     "knee": Knee(),
 }
 

@@ -126,13 +126,11 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.search.searches import STLSQ as STLSQ
     from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso
     from ep2sindy.search.searches import BestSubset as BestSubset
-    from ep2sindy.selection.criteria import BIC as BIC
     from ep2sindy.selection.criteria import EBIC as EBIC
     from ep2sindy.selection.criteria import AICc as AICc
-    from ep2sindy.selection.evidence import Evidence as Evidence
+    from ep2sindy.selection.criteria import Evidence as Evidence
+    from ep2sindy.selection.criteria import Knee as Knee
     from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore
-    from ep2sindy.selection.knees import Knee as Knee
-    from ep2sindy.selection.knees import LogKnee as LogKnee
     from ep2sindy.selection.refined import RefinedScore as RefinedScore
     from ep2sindy.selection.rule import selected as selected
     from ep2sindy.signals.attractor import Cycle as Cycle
@@ -269,10 +267,8 @@ _FACE = {
     "search.estimators": "AdaptiveLassoRegressor STLSQRegressor",
     "search.front": "Candidate ParetoFront fit_support pareto_front",
     "search.searches": "AdaptiveLasso STLSQ BestSubset",
-    "selection.criteria": "AICc BIC EBIC",
-    "selection.evidence": "Evidence",
+    "selection.criteria": "AICc EBIC Evidence Knee",
     "selection.free_run": "FreeRunScore",
-    "selection.knees": "Knee LogKnee",
     "selection.refined": "RefinedScore",
     "selection.rule": "selected",
     "signals.attractor": "Cycle find_cycle",

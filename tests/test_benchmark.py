@@ -14,7 +14,7 @@ from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies.benchmark import Study, cells
 from ep2sindy.studies.variants import Variant, merits
 from ep2sindy.synthetic.draws import realization

@@ -16,7 +16,7 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, pareto_front
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.knees import LogKnee
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.selection.rule import selected
 from ep2sindy.synthetic.systems import lotka_volterra
 
@@ -73,7 +73,7 @@ def named(found: Corrected, library: Library) -> list[Candidate]:
     fronts = [pareto_front(rows, each) for each in supports]
     return [
         selected(front, score)
-        for front, score in zip(fronts, LogKnee().scores(fronts), strict=True)
+        for front, score in zip(fronts, Knee(scale="log").scores(fronts), strict=True)
     ]
 
 

@@ -19,8 +19,7 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
-from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.synthetic.systems import lotka_volterra
@@ -33,6 +32,7 @@ METHOD = Recipe(
 )
 BEST = BestSubset()
 NAMES = ["a", "b", "c", "d", "e", "f"]
+BIC = EBIC(gamma=0.0, coarsening=None)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def searched(
 
 @pytest.mark.parametrize(
     ("formulation", "selection"),
-    [(Differential(), Knee()), (WeightedWeak(), EBIC()), (Weak(), BIC())],
+    [(Differential(), Knee()), (WeightedWeak(), EBIC()), (Weak(), BIC)],
     ids=lambda value: type(value).__name__,
 )
 def test_one_point_gives_what_discover_does(formulation: Formulation, selection: Selection) -> None:
@@ -171,9 +171,9 @@ def test_a_term_that_some_points_cannot_show_is_found() -> None:
 def test_terms_taken_in_by_chance_at_single_points_are_dropped() -> None:
     truth = {"a": 1.0, "b": -0.6, "c": 0.4}
     rows = {f"P{k}": rows_of(truth, seed=k, noise=0.5, n_rows=30) for k in range(8)}
-    alone = [searched({p: r}, selection=BIC()).chosen["y"] for p, r in rows.items()]
+    alone = [searched({p: r}, selection=BIC).chosen["y"] for p, r in rows.items()]
     assert sum(set(terms) - set(truth) != set() for terms in alone) >= 2
-    assert searched(rows, selection=BIC()).chosen["y"] == ("a", "b", "c")
+    assert searched(rows, selection=BIC).chosen["y"] == ("a", "b", "c")
 
 
 def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -> None:
@@ -188,13 +188,13 @@ def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -
 def test_joint_errors_are_geometric_means_that_fall_with_size() -> None:
     truth = {"a": 1.0, "b": -0.6}
     rows = {f"P{k}": rows_of(truth, seed=k, noise=0.1 * 10.0**k) for k in range(3)}
-    front = searched(rows, selection=BIC()).fronts["y"]
+    front = searched(rows, selection=BIC).fronts["y"]
     assert np.all(np.diff(front.errors) < 0)
     at_points = np.array([each.errors for each in front.points.values()])
     assert front.errors == pytest.approx(np.prod(at_points, axis=0) ** (1 / 3), rel=1e-12)
 
 
-@pytest.mark.parametrize("selection", [AICc(), BIC(), EBIC()], ids=lambda s: s.label)
+@pytest.mark.parametrize("selection", [AICc(), BIC, EBIC()], ids=lambda s: s.label)
 def test_units_and_amplitude_of_one_point_change_nothing(selection: Selection) -> None:
     truth = {"a": 1.0, "b": -0.6, "c": 0.1}
     rows = {f"P{k}": rows_of(truth, seed=k, noise=0.5) for k in range(4)}

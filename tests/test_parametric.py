@@ -19,7 +19,7 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import moving_block_counts
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.smoothers import NoSmoothing
 from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.oscillation import PointData, oscillation

@@ -18,7 +18,8 @@ from ep2sindy.selection.rule import selected
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)
 SEARCHES = [ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset(max_terms=4)]
-RULES = [ep.AICc(), ep.BIC(), ep.EBIC(), ep.Knee(), ep.LogKnee()]
+BIC = ep.EBIC(gamma=0.0, coarsening=None)
+RULES = [ep.AICc(), BIC, ep.EBIC(), ep.Knee(), ep.Knee(scale="log")]
 NAMES = ["a", "b", "c", "d", "e"]
 SIZES = st.sampled_from([1e-18, 1e-3, 1.0, 7.0, 1e19])
 COEF = st.sampled_from([-3.0, -0.5, 0.7, 2.0])

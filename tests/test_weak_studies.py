@@ -18,7 +18,7 @@ from ep2sindy.regression.test_functions import Boxes, Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies import frontier as frontiers
 from ep2sindy.studies import weak_windows
 from ep2sindy.studies.weak_forms import Setting, boxes_grid, fit_settings, fitted_terms

@@ -24,7 +24,7 @@ Zone ZoneAverage GridPoint LogRate Rate Delays
 Recipe Differential Weak WeightedWeak Bumps Boxes RandomSplit BlockSplit
 KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing
 AdaptiveLasso STLSQ BestSubset Joint Bootstraps
-AICc BIC EBIC Evidence FreeRunScore Bounds Knee LogKnee RefinedScore
+AICc EBIC Evidence FreeRunScore Bounds Knee RefinedScore
 Serial Loky Dask
 GradientDescent MultipleShooting NelderMead SingleShooting RungeKutta HermiteSimpson
 Refining Quantity TimeBootstrap Windows

@@ -25,8 +25,14 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.search.front import Candidate, ParetoFront
-from ep2sindy.selection.combinations import admissible, combinations, support_of
-from ep2sindy.selection.rule import Selection, SystemSelection, selected
+from ep2sindy.selection.rule import (
+    Selection,
+    SystemSelection,
+    admissible,
+    combinations,
+    selected,
+    support_of,
+)
 
 MOST_COMBINATIONS = 1_000_000  # that relations between equations may have to be checked on
 

@@ -19,8 +19,7 @@ from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, resamples
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset, Search
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.evidence import Evidence
+from ep2sindy.selection.criteria import EBIC, Evidence
 from ep2sindy.selection.rule import Selection, SystemSelection, selected
 
 

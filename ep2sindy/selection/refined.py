@@ -17,10 +17,16 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.many import follow_together, refine_together
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
 from ep2sindy.search.front import ParetoFront
-from ep2sindy.selection.combinations import admissible, combinations, joint_scores, smallest
-from ep2sindy.selection.integral import records_of
-from ep2sindy.selection.rule import FLOOR, MAX_ERROR, Decision
-from ep2sindy.selection.systems import budget, system_of
+from ep2sindy.selection.rule import (
+    FLOOR,
+    MAX_ERROR,
+    Decision,
+    admissible,
+    combinations,
+    joint_scores,
+    smallest,
+)
+from ep2sindy.selection.systems import budget, records_of, system_of
 
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
 LEAST_PAIRS = 3
