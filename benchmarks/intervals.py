@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.discovery.choice import reweighted
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Loky

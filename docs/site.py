@@ -21,7 +21,7 @@ import ep2sindy
 # Page of the reference -> the rooms (or modules) whose names in the face it shows.
 REFERENCE = {
     "Discover": [
-        "discovery.discover", "discovery.recipe", "estimation.joint", "estimation",
+        "discovery.discover", "discovery.recipe", "estimation.solver", "estimation",
         "discovery.shared_support",
     ],
     "Data": [
@@ -40,7 +40,7 @@ REFERENCE = {
         "discovery.operating_points", "discovery.coefficient_law", "discovery.control_law",
         "studies.parametric",
     ],
-    "Grids": ["discovery.pointwise", "discovery.blocks", "discovery.regimes", "runtime", "trust"],
+    "Grids": ["discovery.pointwise", "discovery.regimes", "machine"],
     "Thruster": ["thruster.parameters", "thruster.axial", "thruster"],
     "PySINDy": ["studies.pysindy_variants"],
 }  # fmt: skip

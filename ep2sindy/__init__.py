@@ -40,7 +40,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.data.zones import ZoneAverage as ZoneAverage
     from ep2sindy.data.zones import point as point
     from ep2sindy.data.zones import zone_average as zone_average
-    from ep2sindy.discovery.blocks import Kept as Kept
     from ep2sindy.discovery.coefficient_law import TiedFit as TiedFit
     from ep2sindy.discovery.coefficient_law import tied_fit as tied_fit
     from ep2sindy.discovery.control_law import ControlLaw as ControlLaw
@@ -57,6 +56,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.operating_map import law_map as law_map
     from ep2sindy.discovery.operating_points import OperatingRecord as OperatingRecord
     from ep2sindy.discovery.operating_points import branches_of as branches_of
+    from ep2sindy.discovery.pointwise import Kept as Kept
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
     from ep2sindy.discovery.pointwise import pointwise as pointwise
     from ep2sindy.discovery.recipe import Recipe as Recipe
@@ -66,8 +66,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.shared_support import discover_jointly as discover_jointly
     from ep2sindy.estimation.estimate import Estimate as Estimate
     from ep2sindy.estimation.estimate import estimate as estimate
-    from ep2sindy.estimation.joint import Joint as Joint
-    from ep2sindy.estimation.size import SlowSearch as SlowSearch
+    from ep2sindy.estimation.problem import SlowSearch as SlowSearch
+    from ep2sindy.estimation.solver import Joint as Joint
     from ep2sindy.library.equations import equation_text as equation_text
     from ep2sindy.library.functions import register_function as register_function
     from ep2sindy.library.library import Library as Library
@@ -103,13 +103,13 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.refinement.windows import WindowBatch as WindowBatch
     from ep2sindy.refinement.windows import cut_windows as cut_windows
     from ep2sindy.regression.differential import Differential as Differential
-    from ep2sindy.regression.rows import Regression as Regression
+    from ep2sindy.regression.rows import RegressionRows as RegressionRows
     from ep2sindy.regression.splits import BlockSplit as BlockSplit
     from ep2sindy.regression.splits import RandomSplit as RandomSplit
     from ep2sindy.regression.test_functions import Boxes as Boxes
     from ep2sindy.regression.test_functions import Bumps as Bumps
     from ep2sindy.regression.weak import Weak as Weak
-    from ep2sindy.regression.weighted_weak import WeightedWeak as WeightedWeak
+    from ep2sindy.regression.weak import WeightedWeak as WeightedWeak
     from ep2sindy.runtime.parallel import Dask as Dask
     from ep2sindy.runtime.parallel import Loky as Loky
     from ep2sindy.runtime.parallel import Serial as Serial
@@ -220,7 +220,6 @@ _FACE = {
     "data.quantities": "DoubtfulUnit",
     "data.trajectory": "Trajectory",
     "data.zones": "ZoneAverage GridPoint zone_average point",
-    "discovery.blocks": "Kept",
     "discovery.coefficient_law": "TiedFit tied_fit",
     "discovery.control_law": "ControlLaw control_law",
     "discovery.discover": "Discovery discover",
@@ -228,13 +227,13 @@ _FACE = {
     "discovery.operating_law": "OperatingLaw",
     "discovery.operating_map": "MapPoint law_map",
     "discovery.operating_points": "OperatingRecord branches_of",
-    "discovery.pointwise": "PointSearch pointwise",
+    "discovery.pointwise": "Kept PointSearch pointwise",
     "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",
     "discovery.shared_support": "JointDiscovery discover_jointly",
     "estimation.estimate": "Estimate estimate",
-    "estimation.joint": "Joint",
-    "estimation.size": "SlowSearch",
+    "estimation.solver": "Joint",
+    "estimation.problem": "SlowSearch",
     "library.equations": "equation_text",
     "library.functions": "register_function",
     "library.library": "Library polynomial named_terms",
@@ -259,11 +258,10 @@ _FACE = {
     "refinement.tied": "TiedRefinement refine_tied",
     "refinement.windows": "WindowBatch cut_windows",
     "regression.differential": "Differential",
-    "regression.rows": "Regression",
+    "regression.rows": "RegressionRows",
     "regression.splits": "RandomSplit BlockSplit",
     "regression.test_functions": "Boxes Bumps",
-    "regression.weak": "Weak",
-    "regression.weighted_weak": "WeightedWeak",
+    "regression.weak": "Weak WeightedWeak",
     "search.bootstraps": "Bootstraps pooled_supports",
     "search.estimators": "AdaptiveLassoRegressor",
     "search.front": "Candidate ParetoFront fit_support pareto_front",

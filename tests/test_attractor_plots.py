@@ -9,7 +9,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.attractors import attractor_figure
 from ep2sindy.figures.frames import OFF_SCALE
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.studies.identified import FirstRealizations, first_realizations
 from ep2sindy.studies.variants import Variant

@@ -12,7 +12,7 @@ from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.correction import Corrected, refine_with_correction
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, pareto_front
 from ep2sindy.search.searches import BestSubset
@@ -59,7 +59,7 @@ class Fixed(nn.Module):
 def named(found: Corrected, library: Library) -> list[Candidate]:
     """What the learned term is, equation by equation, at the fitted states."""
     states = found.trajectories.reshape(-1, len(found.model.states))
-    rows = Regression(
+    rows = RegressionRows(
         theta=library.evaluate(states),
         target=found.learned(states),
         library=library,

@@ -13,11 +13,10 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
@@ -40,11 +39,11 @@ BIC = EBIC(gamma=0.0, coarsening=None)
 class Given:
     """Rows made by a test, found by the label of their trajectory."""
 
-    rows: Mapping[str, Regression]
+    rows: Mapping[str, RegressionRows]
 
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
-    ) -> tuple[Regression, ...]:
+    ) -> tuple[RegressionRows, ...]:
         return (self.rows[trajectories[0].label],)
 
 
@@ -55,14 +54,14 @@ def rows_of(
     noise: float = 0.0,
     n_rows: int = 60,
     silent: Sequence[str] = (),
-) -> Regression:
+) -> RegressionRows:
     """Rows of six unrelated terms and a target that some of them make up; silent ones are zero."""
     rng = np.random.default_rng(seed)
     theta = rng.normal(size=(n_rows, 6))
     theta[:, [NAMES.index(name) for name in silent]] = 0.0
     error = noise * rng.normal(size=n_rows)
     truth = np.array([coef.get(name, 0.0) for name in NAMES])
-    return Regression(
+    return RegressionRows(
         theta=theta,
         target=(theta @ truth + error)[:, None],
         library=named_terms(NAMES, NAMES),
@@ -73,7 +72,7 @@ def rows_of(
 
 
 def searched(
-    rows: Mapping[str, Regression], *, selection: Selection, search: Search = BEST
+    rows: Mapping[str, RegressionRows], *, selection: Selection, search: Search = BEST
 ) -> JointDiscovery:
     def label(point: str) -> Trajectory:
         ramp = np.arange(3.0)
@@ -243,7 +242,7 @@ def test_the_count_of_supports_is_paid_once() -> None:
     assert full.scores["y"] == pytest.approx(plain.scores["y"] + 1.4 * counts, rel=1e-12)
 
 
-def law_rows(noise: float, *, seed: int = 0, bend: float = 0.0) -> dict[str, Regression]:
+def law_rows(noise: float, *, seed: int = 0, bend: float = 0.0) -> dict[str, RegressionRows]:
     """a follows 2 - 3 p, b follows p + bend p^2 over four points."""
     return {
         f"p={p}": rows_of(

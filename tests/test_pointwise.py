@@ -10,9 +10,8 @@ import pytest
 import xarray as xr
 
 from ep2sindy.data.zones import point
-from ep2sindy.discovery.blocks import Kept, blocks_of
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.differential import Differential

@@ -11,7 +11,7 @@ from ep2sindy.refinement.many import Together, follow_together, refine_together
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.refined import RefinedScore, _refined
@@ -30,7 +30,7 @@ def fronts_of(
 ) -> list[ParetoFront]:
     """One front per equation, of given candidates after the empty one."""
     values = np.concatenate([run.columns(library.variables) for run in runs])
-    problem = Regression(
+    problem = RegressionRows(
         theta=library.evaluate(values),
         target=np.concatenate([run.states for run in runs]),
         library=library,

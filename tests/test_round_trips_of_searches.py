@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sklearn.base import clone
 
 import ep2sindy as ep
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import Search
@@ -33,9 +33,9 @@ class Rows:
     target: np.ndarray
     coef: np.ndarray
 
-    def problem(self, sizes: np.ndarray | float = 1.0, size: float = 1.0) -> Regression:
+    def problem(self, sizes: np.ndarray | float = 1.0, size: float = 1.0) -> RegressionRows:
         """In other units: columns and target times these."""
-        return Regression(
+        return RegressionRows(
             theta=self.theta * sizes,
             target=(self.target * size)[:, None],
             library=ep.named_terms(NAMES, NAMES),
@@ -56,12 +56,12 @@ def rows(draw: st.DrawFn, noise: float = 0.0) -> Rows:
     return Rows(theta, target + noise * target.std() * rng.normal(size=60), coef)
 
 
-def front_of(problem: Regression, search: Search) -> ParetoFront:
+def front_of(problem: RegressionRows, search: Search) -> ParetoFront:
     (found,) = pooled_supports(problem, search, Bootstraps(n=0), rng=np.random.default_rng(0))
     return pareto_front(problem, found)
 
 
-def chosen(problem: Regression, search: Search, rule: Any) -> dict[str, float]:
+def chosen(problem: RegressionRows, search: Search, rule: Any) -> dict[str, float]:
     front = front_of(problem, search)
     (scores,) = rule.scores([front])
     assert scores.shape == (len(front.candidates),)
@@ -103,7 +103,7 @@ def test_the_order_of_rows_and_terms_leaves_the_choice_of_a_rule(
     problem = noisy.problem()
     turned = list(range(60))
     chance.shuffle(turned)
-    other = Regression(
+    other = RegressionRows(
         theta=problem.theta[turned][:, order],
         target=problem.target[turned],
         library=ep.named_terms(NAMES, [NAMES[k] for k in order]),

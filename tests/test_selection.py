@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset
@@ -32,7 +32,7 @@ def front_of(errors: list[float], n_library: int) -> ParetoFront:
         for k, error in enumerate(errors)
     ]
     names = [f"t{i}" for i in range(n_library)]
-    rows = Regression(
+    rows = RegressionRows(
         theta=np.eye(n_library),
         target=np.ones((n_library, 1)),
         library=named_terms(names, names),
@@ -110,7 +110,7 @@ def noisy_front(n_rows: int = 200, *, seed: int = 0, scale: float = 1.0) -> Pare
     theta = rng.normal(size=(n_rows, 6))
     target = theta[:, :2] @ [1.5, -0.8] + 0.5 * rng.normal(size=n_rows)
     names = [f"t{i}" for i in range(6)]
-    problem = Regression(
+    problem = RegressionRows(
         theta=theta,
         target=scale * target[:, None],
         library=named_terms(names, names),
@@ -121,7 +121,7 @@ def noisy_front(n_rows: int = 200, *, seed: int = 0, scale: float = 1.0) -> Pare
     return fronts_from(problem)[0]
 
 
-def fronts_from(problem: Regression) -> list[ParetoFront]:
+def fronts_from(problem: RegressionRows) -> list[ParetoFront]:
     rng = np.random.default_rng(0)
     pooled = pooled_supports(problem, BestSubset(max_terms=6), Bootstraps(n=0), rng=rng)
     return [pareto_front(problem, supports) for supports in pooled]
@@ -186,7 +186,7 @@ def exact_fronts() -> list[ParetoFront]:
     """Of the Lorenz system, with the true derivative in place of a numerical one."""
     system = lorenz()
     run = system.trajectory()
-    problem = Regression(
+    problem = RegressionRows(
         theta=system.model.library.evaluate(run.states),
         target=system.model.derivative(run.states, np.empty((run.n_samples, 0))),
         library=system.model.library,

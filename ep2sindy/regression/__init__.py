@@ -1,1 +1,1 @@
-"""Regression: rows of terms and targets, in each form that the data can be brought to."""
+"""RegressionRows: rows of terms and targets, in each form that the data can be brought to."""

@@ -50,7 +50,7 @@ class NoisyRows:
 
 
 @dataclass(frozen=True, eq=False)
-class Regression:
+class RegressionRows:
     """Rows of library terms and targets, in SI units, ready for a search.
 
     theta: (rows, terms). target: (rows, equations).
@@ -212,4 +212,4 @@ class Formulation(Protocol):
         library: Library,
         *,
         rng: np.random.Generator,
-    ) -> tuple[Regression, ...]: ...
+    ) -> tuple[RegressionRows, ...]: ...

@@ -10,8 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Relation
-from ep2sindy.constraints.support import binding
+from ep2sindy.constraints.relations import Relation, binding
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Constraint, Relation, constraint
-from ep2sindy.constraints.support import binding
+from ep2sindy.constraints.relations import Constraint, Relation, binding, constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting

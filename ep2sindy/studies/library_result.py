@@ -9,8 +9,8 @@ from itertools import compress
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import assemble_model
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.last_fit import assemble_model
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in

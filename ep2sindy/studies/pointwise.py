@@ -15,8 +15,7 @@ import xarray as xr
 
 import ep2sindy
 from ep2sindy.data.netcdf import write_netcdf
-from ep2sindy.discovery.blocks import Kept, blocks_of
-from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.pointwise import Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import regimes
 from ep2sindy.library.library import Library, named_terms

@@ -20,7 +20,7 @@ from ep2sindy.model.scores import r2
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.parametric.oscillation import (
@@ -190,7 +190,7 @@ def _point_result(point: PointData, study: PointStudy, *, rng: np.random.Generat
 
 def _least_squares(
     run: Trajectory,
-    problems: Sequence[Regression],
+    problems: Sequence[RegressionRows],
     case: Case,
     study: PointStudy,
     period_s: float,
@@ -224,7 +224,7 @@ def _least_squares(
 
 def _refined(
     run: Trajectory,
-    problems: Sequence[Regression],
+    problems: Sequence[RegressionRows],
     case: Case,
     study: PointStudy,
     period_s: float,
@@ -261,7 +261,7 @@ def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -
     return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))
 
 
-def _r2(problems: Sequence[Regression], model: SparseModel) -> dict[str, float]:
+def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
     """Of the derivative, by state, on training rows as they are."""
     found = {}
     for problem in problems:

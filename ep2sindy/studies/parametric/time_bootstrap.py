@@ -12,8 +12,8 @@ from ep2sindy.constraints.fit import WeightedEquation, weighted_equations
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.scales import column_norms
 from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.resampling import moving_block_counts
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.search.bootstraps import moving_block_counts
 
 MIN_BLOCKS = 5  # in a record: fewer draws of blocks than these differ too little from another
 
@@ -34,7 +34,7 @@ class TimeBootstrap:
 
 
 def resampled_coefficients(
-    problems: Sequence[Regression],
+    problems: Sequence[RegressionRows],
     constraint: Constraint,
     model: SparseModel,
     *,

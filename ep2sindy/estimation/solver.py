@@ -8,11 +8,10 @@ from math import inf, log
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed, polished
+from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed, polished, smoothed_start
 from ep2sindy.estimation.lateness import PAYS, moved, suspected, with_delays
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
 from ep2sindy.estimation.problem import Problem
-from ep2sindy.estimation.start import smoothed_start
 from ep2sindy.estimation.supports import term_prices
 
 SAMPLES_PER_TERM = 5  # of the library: fewer do not tell which
