@@ -17,9 +17,9 @@ from itertools import product
 import numpy as np
 
 import ep2sindy as ep
-from ep2sindy.discovery.operating_fit import LeftOut, OperatingFit, left_out, operating_fit
-from ep2sindy.discovery.operating_map import Fate, law_map
-from ep2sindy.discovery.operating_points import (
+from ep2sindy.operating.fit import LeftOut, OperatingFit, left_out, operating_fit
+from ep2sindy.operating.map import Fate, law_map
+from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
     measured_left_out,

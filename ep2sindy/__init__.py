@@ -41,22 +41,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.data.zones import point as point
     from ep2sindy.data.zones import zone_average as zone_average
     from ep2sindy.discovery.blocks import Kept as Kept
-    from ep2sindy.discovery.coefficient_law import TiedFit as TiedFit
-    from ep2sindy.discovery.coefficient_law import tied_fit as tied_fit
-    from ep2sindy.discovery.control_law import ControlLaw as ControlLaw
-    from ep2sindy.discovery.control_law import control_law as control_law
     from ep2sindy.discovery.discover import Discovery as Discovery
     from ep2sindy.discovery.discover import discover as discover
-    from ep2sindy.discovery.operating_fit import LeftOut as LeftOut
-    from ep2sindy.discovery.operating_fit import OperatingFit as OperatingFit
-    from ep2sindy.discovery.operating_fit import Windows as Windows
-    from ep2sindy.discovery.operating_fit import left_out as left_out
-    from ep2sindy.discovery.operating_fit import operating_fit as operating_fit
-    from ep2sindy.discovery.operating_law import OperatingLaw as OperatingLaw
-    from ep2sindy.discovery.operating_map import MapPoint as MapPoint
-    from ep2sindy.discovery.operating_map import law_map as law_map
-    from ep2sindy.discovery.operating_points import OperatingRecord as OperatingRecord
-    from ep2sindy.discovery.operating_points import branches_of as branches_of
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
     from ep2sindy.discovery.pointwise import pointwise as pointwise
     from ep2sindy.discovery.recipe import Recipe as Recipe
@@ -90,6 +76,23 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.model.stability import LimitCycle as LimitCycle
     from ep2sindy.model.stability import limit_cycle as limit_cycle
     from ep2sindy.model.stability import share_reaching as share_reaching
+    from ep2sindy.operating.fit import LeftOut as LeftOut
+    from ep2sindy.operating.fit import OperatingFit as OperatingFit
+    from ep2sindy.operating.fit import Windows as Windows
+    from ep2sindy.operating.fit import left_out as left_out
+    from ep2sindy.operating.fit import operating_fit as operating_fit
+    from ep2sindy.operating.law import OperatingLaw as OperatingLaw
+    from ep2sindy.operating.law import TiedFit as TiedFit
+    from ep2sindy.operating.law import tied_fit as tied_fit
+    from ep2sindy.operating.map import MapPoint as MapPoint
+    from ep2sindy.operating.map import law_map as law_map
+    from ep2sindy.operating.point_fits import Refining as Refining
+    from ep2sindy.operating.point_fits import TimeBootstrap as TimeBootstrap
+    from ep2sindy.operating.quantities import Quantity as Quantity
+    from ep2sindy.operating.quantity_law import ControlLaw as ControlLaw
+    from ep2sindy.operating.quantity_law import control_law as control_law
+    from ep2sindy.operating.records import OperatingRecord as OperatingRecord
+    from ep2sindy.operating.records import branches_of as branches_of
     from ep2sindy.refinement.correction import Corrected as Corrected
     from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
     from ep2sindy.refinement.methods.gradient_descent import GradientDescent as GradientDescent
@@ -153,9 +156,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.signals.spectrum import power_spectrum as power_spectrum
     from ep2sindy.signals.trace import Trace as Trace
     from ep2sindy.signals.trace import trace as trace
-    from ep2sindy.studies.parametric.points import Refining as Refining
-    from ep2sindy.studies.parametric.quantities import Quantity as Quantity
-    from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap as TimeBootstrap
     from ep2sindy.studies.pysindy_variants import PySINDyEnsemble as PySINDyEnsemble
     from ep2sindy.studies.pysindy_variants import PySINDySmoothing as PySINDySmoothing
     from ep2sindy.studies.pysindy_variants import PySINDySsr as PySINDySsr
@@ -227,13 +227,12 @@ _FACE = {
     "data.trajectory": "Trajectory",
     "data.zones": "ZoneAverage GridPoint zone_average point",
     "discovery.blocks": "Kept",
-    "discovery.coefficient_law": "TiedFit tied_fit",
-    "discovery.control_law": "ControlLaw control_law",
     "discovery.discover": "Discovery discover",
-    "discovery.operating_fit": "LeftOut OperatingFit Windows left_out operating_fit",
-    "discovery.operating_law": "OperatingLaw",
-    "discovery.operating_map": "MapPoint law_map",
-    "discovery.operating_points": "OperatingRecord branches_of",
+    "operating.fit": "LeftOut OperatingFit Windows left_out operating_fit",
+    "operating.law": "OperatingLaw TiedFit tied_fit",
+    "operating.map": "MapPoint law_map",
+    "operating.quantity_law": "ControlLaw control_law",
+    "operating.records": "OperatingRecord branches_of",
     "discovery.pointwise": "PointSearch pointwise",
     "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",
@@ -289,9 +288,8 @@ _FACE = {
     "signals.smoothers": "SavitzkyGolay NoSmoothing",
     "signals.spectrum": "power_spectrum dominant_frequency",
     "signals.trace": "Trace trace",
-    "studies.parametric.points": "Refining",
-    "studies.parametric.quantities": "Quantity",
-    "studies.parametric.time_bootstrap": "TimeBootstrap",
+    "operating.quantities": "Quantity",
+    "operating.point_fits": "Refining TimeBootstrap",
     "studies.pysindy_variants": (
         "PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm PySINDySmoothing"
     ),

@@ -9,10 +9,10 @@ from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
-from ep2sindy.discovery.operating_law import OperatingLaw
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.studies.predict.branch import map_points
+from ep2sindy.operating.choice import map_points
+from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.studies.predict.study import Study, expanded
 from tests import programs
 

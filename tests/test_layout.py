@@ -25,6 +25,7 @@ ROOMS = [
     "refinement",
     "selection",
     "discovery",
+    "operating",
     "figures",
     "report",
     "studies",
@@ -38,8 +39,9 @@ HEAVY = {
         "selection.refined",
         "selection.free_run",
         "selection.systems",
-        "discovery.operating_choice",
-        "discovery.operating_fit",
+        "operating.choice",
+        "operating.fit",
+        "operating.point_fits",
         "studies.predict",
         "studies.parametric",
     ),
@@ -48,8 +50,27 @@ HEAVY = {
     "matplotlib": ("figures", "report", "studies", "app"),
     "h5py": (),
     "tensorboard": (),
-    "pandas": ("data", "thruster", "synthetic", "discovery", "figures", "report", "studies", "app"),
-    "xarray": ("data", "thruster", "synthetic", "discovery", "figures", "studies", "app"),
+    "pandas": (
+        "data",
+        "thruster",
+        "synthetic",
+        "discovery",
+        "operating",
+        "figures",
+        "report",
+        "studies",
+        "app",
+    ),
+    "xarray": (
+        "data",
+        "thruster",
+        "synthetic",
+        "discovery",
+        "operating",
+        "figures",
+        "studies",
+        "app",
+    ),
 }
 # Functions over 50 lines, waiting to be shortened: none should be here for long.
 
@@ -154,7 +175,7 @@ def test_heavy_packages_load_only_where_they_are_needed(package: str) -> None:
 
 def test_the_package_has_few_entries() -> None:
     entries = [p.name for p in PACKAGE.iterdir() if p.name != "__pycache__"]
-    assert len(entries) <= 20, sorted(entries)
+    assert len(entries) <= 22, sorted(entries)
 
 
 def test_every_room_is_on_the_list() -> None:

@@ -13,6 +13,25 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.operating.point_fits import (
+    Case,
+    PointStudy,
+    Refining,
+    TimeBootstrap,
+    parametric_study,
+    resampled_coefficients,
+    searched_jointly,
+)
+from ep2sindy.operating.quantities import (
+    Estimate,
+    Fitted,
+    PointResult,
+    Quantity,
+    drawn_estimates,
+    propagated_estimates,
+)
+from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
+from ep2sindy.operating.records import PointData
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.resampling import moving_block_counts
 from ep2sindy.regression.rows import Regression
@@ -20,25 +39,8 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.knees import Knee
+from ep2sindy.signals.oscillation import oscillation
 from ep2sindy.signals.smoothers import NoSmoothing
-from ep2sindy.studies.parametric.all_points import searched_jointly
-from ep2sindy.studies.parametric.oscillation import PointData, oscillation
-from ep2sindy.studies.parametric.points import (
-    Case,
-    Fitted,
-    PointResult,
-    PointStudy,
-    Refining,
-    parametric_study,
-)
-from ep2sindy.studies.parametric.quantities import (
-    Estimate,
-    Quantity,
-    drawn_estimates,
-    propagated_estimates,
-)
-from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap, resampled_coefficients
-from ep2sindy.studies.parametric.trends import laws, power_law_r2, trends
 
 LIBRARY = named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])
 TERMS = {"x": ["x*u", "x*y*R"], "y": ["1", "x*y*R"]}

@@ -8,9 +8,10 @@ from typing import Any
 
 from ep2sindy.data.quantities import unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError
+from ep2sindy.operating.records import PointData, naming, point_label
 from ep2sindy.report.run import Run
+from ep2sindy.signals.oscillation import STEADY
 from ep2sindy.studies.kinds import Deferred
-from ep2sindy.studies.parametric.oscillation import STEADY, PointData, naming, point_label
 from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
 from ep2sindy.studies.source import Source
 

@@ -13,24 +13,23 @@ from ep2sindy.constraints.relations import constraint
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Workers
+from ep2sindy.operating.point_fits import (
+    Case,
+    PointStudy,
+    Refining,
+    TimeBootstrap,
+    parametric_study,
+    searched_jointly,
+)
+from ep2sindy.operating.quantities import PointResult, Quantity
+from ep2sindy.operating.quantity_law import laws
+from ep2sindy.operating.records import point_label
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.parametric.all_points import searched_jointly
 from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
-from ep2sindy.studies.parametric.oscillation import point_label
-from ep2sindy.studies.parametric.points import (
-    Case,
-    PointResult,
-    PointStudy,
-    Refining,
-    parametric_study,
-)
-from ep2sindy.studies.parametric.quantities import Quantity
 from ep2sindy.studies.parametric.summary import live
 from ep2sindy.studies.parametric.tables import published_table
-from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap
-from ep2sindy.studies.parametric.trends import laws
 from ep2sindy.studies.parametric.view import Outcome, Panels
 from ep2sindy.studies.source import Source
 

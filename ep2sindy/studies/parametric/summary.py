@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ep2sindy.discovery.control_law import ControlLaw
-from ep2sindy.studies.parametric.all_points import JointResult
-from ep2sindy.studies.parametric.points import REFINED, Case, Fitted, PointResult
+from ep2sindy.operating.point_fits import Case, JointResult
+from ep2sindy.operating.quantities import REFINED, Fitted, PointResult
+from ep2sindy.operating.quantity_law import ControlLaw
 
 Laws = Mapping[str, Mapping[str, ControlLaw]]  # fit -> quantity -> law
 

@@ -7,12 +7,11 @@ from typing import Any
 
 import pandas as pd
 
-from ep2sindy.discovery.control_law import ControlLaw
 from ep2sindy.figures.trends import rows_at
 from ep2sindy.library.equations import equation_text
-from ep2sindy.studies.parametric.all_points import JointResult
-from ep2sindy.studies.parametric.points import Fitted, PointResult
-from ep2sindy.studies.parametric.trends import exponent, trends
+from ep2sindy.operating.point_fits import JointResult
+from ep2sindy.operating.quantities import Fitted, PointResult
+from ep2sindy.operating.quantity_law import ControlLaw, exponent, trends
 
 
 def published_table(

@@ -13,11 +13,11 @@ import pandas as pd
 from ep2sindy.figures.trends import rows_at, trends_figure
 from ep2sindy.library.units import SECONDS
 from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.point_fits import JointResult, PointStudy
+from ep2sindy.operating.quantities import REFINED, Fitted, PointResult
+from ep2sindy.operating.records import point_label
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.studies.parametric import summary, tables
-from ep2sindy.studies.parametric.all_points import JointResult
-from ep2sindy.studies.parametric.oscillation import point_label
-from ep2sindy.studies.parametric.points import REFINED, Fitted, PointResult, PointStudy
 from ep2sindy.studies.shown import coefficients
 
 INTERVALS = (

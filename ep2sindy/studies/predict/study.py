@@ -8,16 +8,15 @@ from functools import partial
 from itertools import product
 from typing import Annotated, Any
 
-from ep2sindy.discovery.operating_fit import Windows
-from ep2sindy.discovery.operating_points import OperatingRecord
 from ep2sindy.library.library import polynomial
 from ep2sindy.machine.parallel import Workers
+from ep2sindy.operating.choice import Branch, How, Searched, branch_of, grouped
+from ep2sindy.operating.fit import Windows
+from ep2sindy.operating.records import OperatingRecord, PointData, point_label
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Counts, Kind, Positive
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.parametric.opening import PointSource, point_sources, say_used
-from ep2sindy.studies.parametric.oscillation import PointData, point_label
-from ep2sindy.studies.predict.branch import Branch, How, Searched, branch_of, grouped
 from ep2sindy.studies.predict.view import Outcome, n_points
 from ep2sindy.studies.simulate_scan import compile_kernels
 from ep2sindy.studies.source import Source

@@ -9,12 +9,11 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from ep2sindy.discovery.operating_choice import Tried
-from ep2sindy.discovery.operating_fit import LeftOut
-from ep2sindy.discovery.operating_map import Fate, MapPoint
-from ep2sindy.discovery.operating_points import OperatingRecord
-from ep2sindy.studies.parametric.oscillation import OSCILLATING, point_label
-from ep2sindy.studies.predict.branch import Branch
+from ep2sindy.operating.choice import Branch, Tried
+from ep2sindy.operating.fit import LeftOut
+from ep2sindy.operating.map import Fate, MapPoint
+from ep2sindy.operating.records import OperatingRecord, point_label
+from ep2sindy.signals.oscillation import OSCILLATING
 
 Parameters = Mapping[str, float]
 

@@ -11,11 +11,12 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.discovery.operating_points import OperatingRecord, values_of
 from ep2sindy.figures.operating import frequency_scale, laws_figure, left_out_figure
 from ep2sindy.figures.operating_map import line_figure, map_figure
 from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.choice import Branch
+from ep2sindy.operating.records import OperatingRecord, point_label, values_of
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -26,9 +27,8 @@ from ep2sindy.report.document import (
     Text,
     places,
 )
-from ep2sindy.studies.parametric.oscillation import OSCILLATING, point_label
+from ep2sindy.signals.oscillation import OSCILLATING
 from ep2sindy.studies.predict import tables
-from ep2sindy.studies.predict.branch import Branch
 from ep2sindy.studies.predict.words import ALSO, CAPTIONS, INTERVALS, LEFT_OUT, TRIED
 
 

@@ -1,8 +1,9 @@
-"""Records of operating points: which of them oscillate on which cycle."""
+"""Operating points: where a record was taken, what it holds, and which cycle it is on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.oscillation import OSCILLATING
 
 LEAST_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
 
@@ -169,3 +171,44 @@ def _off_plane(
         left = target - columns @ coef
         weights = 1.0 / np.sqrt(np.maximum(np.abs(left), 1e-6))
     return left
+
+
+@dataclass(frozen=True, eq=False)
+class PointData:
+    """One operating point. trajectory: None where the source says that nothing oscillates.
+
+    status: what the source says of it; "oscillating" is looked into, all else believed.
+    notes: what is amiss with its data. used: which they are, in words.
+    """
+
+    parameters: Mapping[str, float]
+    trajectory: Trajectory | None
+    status: str = OSCILLATING
+    notes: Sequence[str] = ()
+    used: str = ""
+
+    def __post_init__(self) -> None:
+        if self.trajectory is None and self.status == OSCILLATING:
+            raise ValueError(f"{point_label(self.parameters)} oscillates: it needs its trajectory")
+
+
+def point_label(parameters: Mapping[str, float]) -> str:
+    """`V_D_V=300, mdot_mg_s=5`."""
+    return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
+
+
+@contextmanager
+def naming(parameters: Mapping[str, float]) -> Iterator[None]:
+    """What cannot work at an operating point is said with its name before it."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise ValueError(f"operating point {point_label(parameters)}: {error}") from error
+
+
+def check_points(points: Sequence[PointData], variables: Sequence[str]) -> None:
+    """Raise ValueError, naming the point, unless all have the same states, variables and units."""
+    known = [(point, point.trajectory) for point in points if point.trajectory is not None]
+    for point, run in known:
+        with naming(point.parameters):
+            check_agreement([known[0][1], run], variables)

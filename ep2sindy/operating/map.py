@@ -11,10 +11,10 @@ from jaxtyping import Bool, Complex, Float
 from scipy.optimize import root
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.discovery.operating_law import OperatingLaw
-from ep2sindy.discovery.operating_points import OperatingRecord, values_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import Stability, limit_cycle
+from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.records import OperatingRecord, values_of
 
 # Growth per period below which a fixed point counts as one that rests: e-fold in a hundred periods.
 NEUTRAL = 0.01

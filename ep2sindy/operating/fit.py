@@ -11,19 +11,19 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
-from ep2sindy.discovery.operating_law import OperatingLaw, in_hull
-from ep2sindy.discovery.operating_points import (
-    OperatingRecord,
-    check_records,
-    point_text,
-    values_of,
-)
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Serial, Workers
 from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds, deviation
 from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.law import OperatingLaw, in_hull
+from ep2sindy.operating.records import (
+    OperatingRecord,
+    check_records,
+    point_text,
+    values_of,
+)
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many
 from ep2sindy.refinement.tied import TiedRefinement, refine_tied

@@ -3,48 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.fit import constrained_fit
+from ep2sindy.constraints.fit import WeightedEquation, constrained_fit, weighted_equations
 from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.scales import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Workers
+from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.refine import refine
-from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.rows import Regression
-from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.parametric.oscillation import (
-    OSCILLATING,
-    PointData,
-    check_points,
-    naming,
-    oscillation,
-    spread,
-)
-from ep2sindy.studies.parametric.quantities import (
-    Estimate,
+from ep2sindy.operating.law import TiedFit, tied_fit
+from ep2sindy.operating.quantities import (
+    FITTED,
+    REFINED,
+    SEARCHED,
+    Fitted,
+    PointResult,
     Quantity,
     drawn_estimates,
     propagated_estimates,
 )
-from ep2sindy.studies.parametric.time_bootstrap import (
-    TimeBootstrap,
-    coefficients_of,
-    resampled_coefficients,
-)
+from ep2sindy.operating.records import PointData, check_points, naming, point_label
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.refine import refine
+from ep2sindy.refinement.windows import MIN_SAMPLES
+from ep2sindy.regression.resampling import moving_block_counts
+from ep2sindy.regression.rows import Regression
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.signals.oscillation import OSCILLATING, oscillation, spread
+from ep2sindy.signals.spectrum import dominant_frequency
 
-FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
-REFINED = "_refined"  # ends the name of a case's refinement
+MIN_BLOCKS = 5  # in a record: fewer draws of blocks than these differ too little from another
 
 
 @dataclass(frozen=True)
@@ -96,46 +95,6 @@ class PointStudy:
     def fits(self) -> dict[str, Case]:
         """By name all fits of a point: every case, and its refinement."""
         return {name + end: case for name, case in self.cases.items() for end in ("", REFINED)}
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A model of one operating point.
-
-    status: fitted, by least squares; searched; or what became of a refinement.
-    r2: by state, of the derivative, on training rows. loss: of a refinement, else NaN.
-    draws: by quantity, (draws,), what the intervals of least squares were taken from.
-    The model's covariance is that of the draws, or of the refinement.
-    """
-
-    model: SparseModel
-    status: str
-    r2: Mapping[str, float]
-    loss: float = float("nan")
-    estimates: Mapping[str, Estimate] = field(default_factory=dict)
-    draws: Mapping[str, Float[np.ndarray, " draws"]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class PointResult:
-    """What one operating point gave; without fits unless its status is "oscillating".
-
-    f_Hz: dominant frequency of the first state. spread: by state, standard deviation over mean.
-    fits: by case, and by case + "_refined". searched: what the search chose.
-    """
-
-    parameters: Mapping[str, float]
-    status: str
-    n_samples: int = 0
-    dt_s: float = float("nan")
-    f_Hz: float = float("nan")
-    spread: Mapping[str, float] = field(default_factory=dict)
-    fits: Mapping[str, Fitted] = field(default_factory=dict)
-    searched: Fitted | None = None
-
-    def usable(self, fit: str) -> bool:
-        """Whether a fit was made here and came to its end."""
-        return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
 
 
 def parametric_study(
@@ -271,3 +230,154 @@ def _r2(problems: Sequence[Regression], model: SparseModel) -> dict[str, float]:
             truth = problem.target[rows, number]
             found[state] = float(r2(truth=truth, prediction=predicted[None])[0])
     return found
+
+
+@dataclass(frozen=True)
+class TimeBootstrap:
+    """Intervals of least squares: draws of blocks that last `periods` of the oscillation."""
+
+    n_draws: int
+    periods: float
+
+    def __post_init__(self) -> None:
+        if self.n_draws < 40 or self.periods <= 0.0:
+            raise ValueError(
+                "a 95 % interval needs 40 draws or more, and blocks some length: "
+                f"n_draws={self.n_draws}, periods={self.periods} came"
+            )
+
+
+def resampled_coefficients(
+    problems: Sequence[Regression],
+    constraint: Constraint,
+    model: SparseModel,
+    *,
+    block: int,
+    n_draws: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "draws coefs"]:
+    """Coefficients of `constrained_fit` on training rows redrawn in blocks of time, in SI.
+
+    A draw counts groups of rows, for all equations alike; each equation keeps the weight that it
+    has on all rows, and rows whose noise is followed stay whitened as under `model`.
+    model: of `constrained_fit` on these problems. block: groups that are drawn side by side.
+    Returns one column per coefficient of the constraint. Draws are moved so that their mean is
+    the fit: blocks seldom reach the ends of the record, which would shift them.
+    Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
+    Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for
+    Dependent Data, 2.5, for the centre.
+    """
+    if len(problems[0].trajectories) > 1:
+        raise ValueError(
+            "a bootstrap over time needs one trajectory, or blocks would cross from one to the "
+            f"next: {len(problems[0].trajectories)} came"
+        )
+    equations = weighted_equations(problems, constraint)
+    coef = coefficients_of(model, constraint)
+    rows = [_free_rows(equation, constraint, coef) for equation in equations]
+    groups = [e.problem.groups[~e.problem.test] for e in equations]
+    numbers = np.unique(np.concatenate(groups))
+    _check_blocks(len(numbers), block)
+    scale = column_norms(np.concatenate(rows))
+    sums = np.zeros((len(numbers), len(scale), len(scale)))
+    for own, group in zip(rows, groups, strict=True):
+        unit = own / scale
+        np.add.at(sums, np.searchsorted(numbers, group), unit[:, :, None] * unit[:, None, :])
+    counts = np.array(
+        [
+            moving_block_counts(len(numbers), n_drawn=len(numbers), block=block, rng=rng)
+            for _ in range(n_draws)
+        ],
+        dtype=np.float64,
+    )
+    grams = np.tensordot(counts, sums, axes=1)
+    z = np.linalg.solve(grams[:, :-1, :-1], grams[:, :-1, -1:])[:, :, 0]
+    z *= scale[-1] / scale[:-1]
+    return (z - z.mean(axis=0) + coef[constraint.free]) @ constraint.C.T + constraint.d
+
+
+def _check_blocks(n_groups: int, block: int) -> None:
+    if n_groups < MIN_BLOCKS * block:
+        raise ValueError(
+            f"a bootstrap over time needs {MIN_BLOCKS} blocks or more: blocks of {block} were "
+            f"asked of {n_groups} groups of rows; use fewer periods per block "
+            "(bootstrap.periods), or a longer record"
+        )
+
+
+def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
+    """In the order of the constraint's."""
+    index, states = model.library.index, model.states.index
+    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
+
+
+def _free_rows(
+    equation: WeightedEquation, constraint: Constraint, coef: Float[np.ndarray, " coefs"]
+) -> Float[np.ndarray, "rows columns"]:
+    """One equation's rows by free coefficient, the target last; residuals of variance 1."""
+    at = equation.at
+    theta, target = equation.rows(coef[at])
+    return np.column_stack([theta @ constraint.C[at], target - theta @ constraint.d[at]])
+
+
+@dataclass(frozen=True, eq=False)
+class JointResult:
+    """What one search over all points that oscillate found.
+
+    fitted: the support with coefficients of its own at every point, None at the others. tied: its
+    coefficients as polynomials of the parameters; None where the points do not suffice, for the
+    reason in `why_not_tied`.
+    """
+
+    found: JointDiscovery
+    fitted: Sequence[Fitted | None]
+    tied: TiedFit | None
+    why_not_tied: str = ""
+
+
+def searched_jointly(
+    points: Sequence[PointData],
+    results: Sequence[PointResult],
+    study: PointStudy,
+    law: Library,
+    *,
+    rng: np.random.Generator,
+    progress: Progress = SILENT,
+) -> JointResult | None:
+    """Search all points that oscillate at once; None for fewer than two of them.
+
+    law: terms that coefficients are tied by, over the parameters of the points.
+    None, too, for a search that cannot weigh several points: only BestSubset does.
+    """
+    used = {
+        point_label(point.parameters): point
+        for point, result in zip(points, results, strict=True)
+        if result.fits and point.trajectory is not None
+    }
+    if len(used) < 2 or not isinstance(study.recipe.search, BestSubset):
+        return None
+    found = discover_jointly(
+        {label: [point.trajectory] for label, point in used.items() if point.trajectory},
+        study.searched,
+        replace(study.recipe, bootstraps=Bootstraps(n=0)),
+        seed=rng,
+        progress=progress,
+    )
+    tied, reason = None, ""
+    try:
+        parameters = {label: point.parameters for label, point in used.items()}
+        with progress.stage(None, "", "coefficients tied by a law"):
+            tied = tied_fit(found, law, parameters=parameters)
+    except ValueError as error:
+        reason = str(error)
+    labels = [point_label(point.parameters) for point in points]
+    fitted = [_fitted(found, label) if label in used else None for label in labels]
+    return JointResult(found, fitted, tied, reason)
+
+
+def _fitted(found: JointDiscovery, label: str) -> Fitted:
+    scores = {
+        state: front.points[label].candidates[front.supports.index(found.chosen[state])].r2_train
+        for state, front in found.fronts.items()
+    }
+    return Fitted(model=found.models[label], status=SEARCHED, r2=scores)

@@ -1,15 +1,11 @@
-"""Operating points: where a record was taken, and whether it holds an oscillation."""
+"""Whether a record holds an oscillation, or why it says nothing of one."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 OSCILLATING, STEADY = "oscillating", "steady"
@@ -19,39 +15,6 @@ LEAST_PERIODS = 4.0  # in the record: fewer may be a drift
 # The spectrum's peak, 5 % or two bins to either side, must hold a fifth of the power: white noise
 # has a tenth there at most, the thruster's breathing two thirds.
 PEAK_WIDTH, LEAST_PEAK = 0.05, 0.2
-
-
-@dataclass(frozen=True, eq=False)
-class PointData:
-    """One operating point. trajectory: None where the source says that nothing oscillates.
-
-    status: what the source says of it; "oscillating" is looked into, all else believed.
-    notes: what is amiss with its data. used: which they are, in words.
-    """
-
-    parameters: Mapping[str, float]
-    trajectory: Trajectory | None
-    status: str = OSCILLATING
-    notes: Sequence[str] = ()
-    used: str = ""
-
-    def __post_init__(self) -> None:
-        if self.trajectory is None and self.status == OSCILLATING:
-            raise ValueError(f"{point_label(self.parameters)} oscillates: it needs its trajectory")
-
-
-def point_label(parameters: Mapping[str, float]) -> str:
-    """`V_D_V=300, mdot_mg_s=5`."""
-    return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
-
-
-@contextmanager
-def naming(parameters: Mapping[str, float]) -> Iterator[None]:
-    """What cannot work at an operating point is said with its name before it."""
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        raise ValueError(f"operating point {point_label(parameters)}: {error}") from error
 
 
 def oscillation(run: Trajectory) -> str:
@@ -78,11 +41,3 @@ def oscillation(run: Trajectory) -> str:
 def spread(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarray, " n_states"]:
     """Standard deviation of every state over the size of its mean."""
     return states.std(axis=0) / np.maximum(np.abs(states.mean(axis=0)), np.finfo(float).tiny)
-
-
-def check_points(points: Sequence[PointData], variables: Sequence[str]) -> None:
-    """Raise ValueError, naming the point, unless all have the same states, variables and units."""
-    known = [(point, point.trajectory) for point in points if point.trajectory is not None]
-    for point, run in known:
-        with naming(point.parameters):
-            check_agreement([known[0][1], run], variables)
