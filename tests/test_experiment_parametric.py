@@ -16,8 +16,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.quantity_law import control_law
 from ep2sindy.report.page import page_html
-from ep2sindy.studies.parametric.study import Study
-from ep2sindy.studies.parametric.view import Outcome, with_error
+from ep2sindy.studies.parametric import Outcome, Study, with_error
 from tests import programs
 
 ESTIMATES = {
