@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Serial, Workers
+from ep2sindy.machine.parallel import Serial, Workers, collect
 from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.operating.fit import (
     LeftOut,
@@ -30,13 +30,13 @@ from ep2sindy.operating.records import (
     branches_of,
     check_records,
     measured_left_out,
-    point_text,
 )
 from ep2sindy.refinement.tied import TiedRefinement
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.searches import BestSubset
 
 MOST_PARAMETERS = 2  # of a map that can be drawn
+N_TOGETHER = 24  # points of a map that are computed as one piece: the records travel with each
 CLOSE = 0.05  # of its bound: a deviation that is no reason for another term
 
 
@@ -73,7 +73,7 @@ def candidate_structures(
     One search over all records: a term is in or out everywhere. Rows are those of the derivative.
     """
     recipe = Recipe(formulation=Differential(), search=BestSubset(max_terms=max_terms))
-    runs = {point_text(record.parameters): [record.run] for record in records}
+    runs = {record.label: [record.run] for record in records}
     found = discover_jointly(runs, library, recipe, progress=progress)
     sizes = {
         state: [support for support in front.supports if len(support) >= 2]
@@ -100,12 +100,9 @@ def tried(
     one = partial(
         _tried, records=records, library=library, degrees=degrees, windows=windows, seed=seed
     )
-    done = {}
-    with progress.stage(len(structures), "structure", "laws at points left out") as advance:
-        for number, trials in (workers or Serial()).run(one, structures):
-            done[number] = trials
-            advance(1)
-    found = [each for k in range(len(structures)) for each in done[k]]
+    stage = progress.stage(len(structures), "structure", "laws at points left out")
+    by_structure = collect(workers or Serial(), one, structures, stage)
+    found = [trial for trials in by_structure for trial in trials]
     if not found:
         n = len(records)
         raise ValueError(
@@ -284,18 +281,7 @@ def _followed(
     workers: Workers,
     progress: Progress,
 ) -> list[MapPoint]:
-    """In pieces: the records travel with each."""
-    pieces = list(_pieces(points, 24))
-    done = {}
-    with progress.stage(len(points), "point", "map of the law") as advance:
-        for number, piece in workers.run(partial(law_map, law, records), pieces):
-            done[number] = piece
-            advance(len(piece))
-    return [point for k in range(len(pieces)) for point in done[k]]
-
-
-def _pieces(
-    points: Sequence[Mapping[str, float]], size: int
-) -> Iterator[Sequence[Mapping[str, float]]]:
-    for first in range(0, len(points), size):
-        yield points[first : first + size]
+    pieces = [points[first : first + N_TOGETHER] for first in range(0, len(points), N_TOGETHER)]
+    stage = progress.stage(len(points), "point", "map of the law")
+    maps = collect(workers, partial(law_map, law, records), pieces, stage, size=len)
+    return [point for piece in maps for point in piece]

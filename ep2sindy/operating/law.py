@@ -26,6 +26,7 @@ from ep2sindy.machine.files import read_json, write_text
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
+from ep2sindy.operating.records import point_label
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.rule import FLOOR
@@ -104,7 +105,7 @@ class OperatingLaw:
         values = self._values(parameters)
         if not extrapolate and not self._holds(values):
             raise ValueError(
-                f"{_text(parameters)} lies outside the points that this law was fitted to, "
+                f"{point_label(parameters)} lies outside the points that this law was fitted to, "
                 f"{self._ranges()}: pass extrapolate=True to read it off the law all the same"
             )
         functions = self.functions.evaluate(values[None])[0]
@@ -116,7 +117,7 @@ class OperatingLaw:
             spread = np.kron(np.eye(len(self.coefficients)), functions)
             order = [k for k in np.lexsort(np.transpose(places)) if coef[places[k]] != 0.0]
             covariance = (spread @ self.covariance @ spread.T)[np.ix_(order, order)]
-        provenance = {**self.provenance, "point": _text(parameters)}
+        provenance = {**self.provenance, "point": point_label(parameters)}
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
 
     def is_inside(self, parameters: Mapping[str, float]) -> bool:
@@ -234,12 +235,6 @@ def in_hull(
     columns = np.vstack([((points - value) / scale).T, np.ones(len(points))])
     target = np.append(np.zeros(points.shape[1]), 1.0)
     return float(nnls(columns, target)[1]) <= INSIDE
-
-
-def _text(parameters: Mapping[str, float] | Sequence[float]) -> str:
-    if not isinstance(parameters, Mapping):
-        return ", ".join(f"{value:g}" for value in parameters)
-    return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
 
 
 @dataclass(frozen=True, eq=False)

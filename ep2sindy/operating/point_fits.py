@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,7 +17,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Workers
+from ep2sindy.machine.parallel import Workers, collect
 from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
@@ -32,7 +32,7 @@ from ep2sindy.operating.quantities import (
     drawn_estimates,
     propagated_estimates,
 )
-from ep2sindy.operating.records import PointData, check_points, naming, point_label
+from ep2sindy.operating.records import OperatingRecord, check_alike, naming
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
@@ -40,7 +40,7 @@ from ep2sindy.regression.resampling import moving_block_counts
 from ep2sindy.regression.rows import Regression
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.signals.oscillation import OSCILLATING, oscillation, spread
+from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency
 
 MIN_BLOCKS = 5  # in a record: fewer draws of blocks than these differ too little from another
@@ -97,43 +97,54 @@ class PointStudy:
         return {name + end: case for name, case in self.cases.items() for end in ("", REFINED)}
 
 
-def parametric_study(
-    points: Sequence[PointData], study: PointStudy, *, workers: Workers, rng: np.random.Generator
-) -> Iterator[tuple[int, PointResult]]:
+def fit_points(
+    points: Sequence[OperatingRecord],
+    study: PointStudy,
+    *,
+    workers: Workers,
+    rng: np.random.Generator,
+    tell: Callable[[int, PointResult], None] = lambda number, result: None,
+    progress: Progress = SILENT,
+) -> list[PointResult]:
     """Every point on its own samples: all cases fitted and refined, and terms searched for.
 
-    Yields (number of the point, result) in any order; a result depends on its data and its place
-    in the list, not on the workers or on what the other points are.
+    A result depends on its data and its place in the list, not on the workers or on what the other
+    points are. tell: is given the number of a point and its result as it comes.
     Raises ValueError, naming the point, where one lacks a state or a variable, differs in its
     unit, or is too short a record.
     """
     variables = [*study.library.variables, *study.searched.variables]
-    check_points(points, list(dict.fromkeys(variables)))
-    pieces = zip(points, rng.spawn(len(points)), strict=True)
-    yield from workers.run(partial(_fitted_point, study=study), pieces)
+    check_alike(points, list(dict.fromkeys(variables)))
+    pieces = list(zip(points, rng.spawn(len(points)), strict=True))
+    stage = progress.stage(len(points), "point fitted")
+    return collect(workers, partial(_fitted_point, study=study), pieces, stage, tell=tell)
 
 
 def _fitted_point(
-    piece: tuple[PointData, np.random.Generator], *, study: PointStudy
+    piece: tuple[OperatingRecord, np.random.Generator], *, study: PointStudy
 ) -> PointResult:
     point, rng = piece
     with naming(point.parameters):
         return _point_result(point, study, rng=rng)
 
 
-def _point_result(point: PointData, study: PointStudy, *, rng: np.random.Generator) -> PointResult:
+def _point_result(
+    point: OperatingRecord, study: PointStudy, *, rng: np.random.Generator
+) -> PointResult:
     run = point.trajectory
     if run is None:
         return PointResult(point.parameters, point.status)
     result = PointResult(
         parameters=point.parameters,
-        status=oscillation(run) if point.status == OSCILLATING else point.status,
+        status=oscillation(run.t, run.states)
+        if point.status == Oscillation.OSCILLATING
+        else point.status,
         n_samples=run.n_samples,
         dt_s=run.dt_s,
         f_Hz=dominant_frequency(run.t, run.states[:, 0]),
-        spread=dict(zip(run.state_names, spread(run.states).tolist(), strict=True)),
+        spread=dict(zip(run.state_names, relative_spread(run.states).tolist(), strict=True)),
     )
-    if result.status != OSCILLATING:
+    if result.status != Oscillation.OSCILLATING:
         return result
     period_s = 1.0 / result.f_Hz
     rows, *streams, last = rng.spawn(2 * len(study.cases) + 2)
@@ -336,7 +347,7 @@ class JointResult:
 
 
 def searched_jointly(
-    points: Sequence[PointData],
+    points: Sequence[OperatingRecord],
     results: Sequence[PointResult],
     study: PointStudy,
     law: Library,
@@ -350,7 +361,7 @@ def searched_jointly(
     None, too, for a search that cannot weigh several points: only BestSubset does.
     """
     used = {
-        point_label(point.parameters): point
+        point.label: point
         for point, result in zip(points, results, strict=True)
         if result.fits and point.trajectory is not None
     }
@@ -370,7 +381,7 @@ def searched_jointly(
             tied = tied_fit(found, law, parameters=parameters)
     except ValueError as error:
         reason = str(error)
-    labels = [point_label(point.parameters) for point in points]
+    labels = [point.label for point in points]
     fitted = [_fitted(found, label) if label in used else None for label in labels]
     return JointResult(found, fitted, tied, reason)
 

@@ -1,43 +1,110 @@
-"""Whether a record holds an oscillation, or why it says nothing of one."""
+"""Whether a record oscillates: one measure, and the bounds that each use sets.
+
+Two related questions have measures of their own. `attractor.find_cycle` asks whether a record
+repeats one waveform, which chaos does not though it oscillates; `operating.map` asks what a model
+does that runs from a start, and has a fixed point and the stability of its cycle to judge by.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import StrEnum
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.signals.spectrum import peak, power_spectrum
 
-OSCILLATING, STEADY = "oscillating", "steady"
-LEAST_SPREAD = 0.01  # of every state, in means, in the second half of the record
-LEAST_SHARE = 0.5  # of the first half's standard deviation that is left in the second
-LEAST_PERIODS = 4.0  # in the record: fewer may be a drift
-# The spectrum's peak, 5 % or two bins to either side, must hold a fifth of the power: white noise
-# has a tenth there at most, the thruster's breathing two thirds.
-PEAK_WIDTH, LEAST_PEAK = 0.05, 0.2
+PEAK_WIDTH = 0.05  # of the frequency, or two bins if these are more, to either side of a peak
+
+DIED_OUT = 0.1  # of a record's spread: what varies less in the second half has died out
 
 
-def oscillation(run: Trajectory) -> str:
-    """`oscillating`, or why a record says nothing of an oscillation.
+class Oscillation(StrEnum):
+    """What a record does, as tables and summaries have it; `oscillating`, or why it says nothing.
 
-    steady: a state varies by under 1 % of its mean in the second half. decaying: by under half of
-    what it did in the first. no dominant frequency: the first state has no peak in its spectrum,
-    or the record is under four of its periods.
+    steady: it hardly varies. decaying: it varied much more before. no dominant frequency: its
+    spectrum has no peak, or it is too short. transit: it oscillates, faster than what is looked
+    for. no period: it oscillates without repeating a waveform. diverged: it broke off.
     """
-    first, second = np.array_split(run.states, 2)
-    if (spread(second) < LEAST_SPREAD).any():
-        return STEADY
-    if (second.std(axis=0) < LEAST_SHARE * first.std(axis=0)).any():
-        return "decaying"
-    frequency, power = power_spectrum(run.t, run.states[:, 0])
-    peak = dominant_frequency(run.t, run.states[:, 0])
-    near = np.abs(frequency - peak) <= max(PEAK_WIDTH * peak, 2.0 * frequency[1])
-    short = peak * (run.t[-1] - run.t[0]) < LEAST_PERIODS
-    if short or power[near].sum() < LEAST_PEAK * power.sum():
-        return "no dominant frequency"
-    return OSCILLATING
+
+    OSCILLATING = "oscillating"
+    STEADY = "steady"
+    DECAYING = "decaying"
+    NO_FREQUENCY = "no dominant frequency"
+    TRANSIT = "transit"
+    NO_PERIOD = "no period"
+    DIVERGED = "diverged"
 
 
-def spread(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarray, " n_states"]:
+@dataclass(frozen=True)
+class OscillationBounds:
+    """What counts as an oscillation.
+
+    The record is cut into `n_blocks` of time, and the last is looked at. spread: least standard
+    deviation of every state, in means. lasting: least share of the first block's standard deviation
+    that is left. min_periods: of the whole record. min_peak: share of the first state's power at
+    its dominant frequency. max_Hz: highest dominant frequency.
+    """
+
+    spread: float
+    lasting: float
+    n_blocks: int = 2
+    min_periods: float = 0.0
+    min_peak: float = 0.0
+    max_Hz: float = np.inf
+
+
+# Any record. Fewer than four periods may be a drift. White noise has a tenth of its power near the
+# highest peak at most, the thruster's breathing two thirds.
+RECORDED = OscillationBounds(spread=0.01, lasting=0.5, min_periods=4.0, min_peak=0.2)
+# A simulated current after its transient: without noise, so that a peak needs no proof, but some
+# sets of parameters oscillate for long and die in the end.
+SIMULATED = OscillationBounds(spread=0.02, lasting=0.7, n_blocks=4)
+
+
+def oscillation(
+    t: Float[np.ndarray, " samples"],
+    states: Float[np.ndarray, "samples n_states"],
+    bounds: OscillationBounds = RECORDED,
+) -> Oscillation:
+    """Say whether a record oscillates; the first bound that it does not keep is the answer."""
+    blocks = np.array_split(states, bounds.n_blocks)
+    if (relative_spread(blocks[-1]) < bounds.spread).any():
+        return Oscillation.STEADY
+    if has_decayed(blocks[-1], blocks[0], bounds.lasting).any():
+        return Oscillation.DECAYING
+    frequency, power = power_spectrum(t, states[:, 0])
+    peak_Hz = peak(frequency, power)
+    if peak_Hz * (t[-1] - t[0]) < bounds.min_periods:
+        return Oscillation.NO_FREQUENCY
+    if bounds.min_peak > 0.0:
+        near = np.abs(frequency - peak_Hz) <= max(PEAK_WIDTH * peak_Hz, 2.0 * frequency[1])
+        if power[near].sum() < bounds.min_peak * power.sum():
+            return Oscillation.NO_FREQUENCY
+    return Oscillation.TRANSIT if peak_Hz > bounds.max_Hz else Oscillation.OSCILLATING
+
+
+def relative_spread(
+    states: Float[np.ndarray, "samples n_states"],
+) -> Float[np.ndarray, " n_states"]:
     """Standard deviation of every state over the size of its mean."""
     return states.std(axis=0) / np.maximum(np.abs(states.mean(axis=0)), np.finfo(float).tiny)
+
+
+def has_decayed(
+    states: Float[np.ndarray, "samples n_states"],
+    earlier: Float[np.ndarray, "_ n_states"],
+    share: float,
+) -> Bool[np.ndarray, " n_states"]:
+    """Whether every state varies by less than a share of what it did earlier, or elsewhere."""
+    below: np.ndarray = states.std(axis=0) < share * earlier.std(axis=0)
+    return below
+
+
+def relative_amplitude(
+    mean: Float[np.ndarray, " n_states"], std: Float[np.ndarray, " n_states"]
+) -> float:
+    """Root mean square over the states of standard deviation over the size of the mean."""
+    return float(np.sqrt(np.square(std / zero_to_one(np.abs(mean))).mean()))

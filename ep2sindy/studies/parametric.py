@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Annotated, Any
@@ -24,7 +24,7 @@ from ep2sindy.operating.point_fits import (
     PointStudy,
     Refining,
     TimeBootstrap,
-    parametric_study,
+    fit_points,
     searched_jointly,
 )
 from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
@@ -35,7 +35,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.shown import coefficients
-from ep2sindy.studies.source import PointSource, Source, point_sources, say_used
+from ep2sindy.studies.source import Source, open_points, point_sources
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
@@ -165,15 +165,16 @@ class Study:
         published = published_table(self.thesis or {}, names)
         sources = point_sources(self.source, self.parameters, self.points)
         inputs = self.source.inputs([how.library, how.searched])
-        opening = self.parallel.run(partial(PointSource.open, inputs=inputs), sources)
-        points = _in_order(opening, len(sources), "opened", run)
-        say_used(run, points)
-        for point in points:
-            for note in point.notes:
-                run.warn(f"{point_label(point.parameters)}: {note}")
+        points = open_points(sources, inputs, workers=self.parallel, run=run)
         alone, together = np.random.default_rng(run.seed).spawn(2)
-        fitted = parametric_study(points, how, workers=self.parallel, rng=alone)
-        results = _in_order(_tell(fitted, run), len(points), "fitted", run)
+
+        def tell(number: int, result: PointResult) -> None:
+            """To TensorBoard; a step is the number of a point in the config."""
+            run.board.scalars(live(result), step=number)
+
+        results = fit_points(
+            points, how, workers=self.parallel, rng=alone, tell=tell, progress=run.watch
+        )
         return Outcome(
             study=how,
             results=results,
@@ -197,24 +198,6 @@ class Study:
             searched=self.library.library(),
             recipe=self.recipe,
         )
-
-
-def _in_order(numbered: Iterable[tuple[int, Any]], total: int, verb: str, run: Run) -> list[Any]:
-    found = {}
-    with run.progress(total, f"point {verb}") as came:
-        for number, result in numbered:
-            found[number] = result
-            came(1)
-    return [found[number] for number in range(total)]
-
-
-def _tell(
-    numbered: Iterable[tuple[int, PointResult]], run: Run
-) -> Iterator[tuple[int, PointResult]]:
-    """Every result to TensorBoard as it comes; a step is the number of a point in the config."""
-    for number, result in numbered:
-        run.board.scalars(live(result), step=number)
-        yield number, result
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import Branch, How, Searched, Tried, branch_of, grouped
 from ep2sindy.operating.fit import LeftOut, Windows
 from ep2sindy.operating.map import Fate, MapPoint
-from ep2sindy.operating.records import OperatingRecord, PointData, point_label, values_of
+from ep2sindy.operating.records import OperatingRecord, point_label, values_of
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -34,11 +34,11 @@ from ep2sindy.report.document import (
     places,
 )
 from ep2sindy.report.run import Run
-from ep2sindy.signals.oscillation import OSCILLATING
+from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.kinds import Count, Counts, Kind, Positive
 from ep2sindy.studies.known_terms import Terms, terms_of
 from ep2sindy.studies.simulate_scan import compile_kernels
-from ep2sindy.studies.source import PointSource, Source, point_sources, say_used
+from ep2sindy.studies.source import Source, open_points, point_sources
 
 INTERVALS = (
     "In SI units, and the parameters in theirs. ±: half the 95 % interval, from a sandwich with "
@@ -140,7 +140,7 @@ class Study:
         sources = point_sources(self.source, self.parameters, given)
         with run.progress(None, "", "kernels, compiled once"):
             compile_kernels([source.source.data for source in sources])
-        opened = self._opened(sources, run)
+        opened = open_points(sources, (), workers=self.parallel, run=run)
         records, statuses = _records(opened, run)
         if not records:
             raise ValueError("a law needs operating points that oscillate: none of these does")
@@ -180,15 +180,6 @@ class Study:
                 )
         windows = Windows(self.windows.n_windows, self.windows.periods)
         return How(library, structure, searched, self.degrees, windows, self.map_points, seed)
-
-    def _opened(self, sources: Sequence[PointSource], run: Run) -> list[PointData]:
-        found = {}
-        with run.progress(len(sources), "point") as came:
-            opening = self.parallel.run(partial(PointSource.open, inputs=()), sources)
-            for number, point in opening:
-                found[number] = point
-                came(1)
-        return [found[number] for number in range(len(sources))]
 
 
 def expanded(
@@ -230,21 +221,19 @@ def _check_enough(points: Sequence[Mapping[str, float]], degree: int) -> None:
         )
 
 
-def _records(opened: Sequence[PointData], run: Run) -> tuple[list[OperatingRecord], dict[str, str]]:
+def _records(
+    opened: Sequence[OperatingRecord], run: Run
+) -> tuple[list[OperatingRecord], dict[str, str]]:
     """Records that hold enough periods, and the status of every point by its label."""
     records, statuses = [], {}
-    say_used(run, opened)
     for point in opened:
-        label = point_label(point.parameters)
-        for note in point.notes:
-            run.warn(f"{label}: {note}")
-        statuses[label] = point.status
+        statuses[point.label] = point.status
         if point.trajectory is None:
             continue
         try:
             records.append(OperatingRecord.of(point.parameters, point.trajectory))
         except ValueError as error:
-            statuses[label] = "no period"
+            statuses[point.label] = Oscillation.NO_PERIOD
             run.warn(str(error))
     return records, statuses
 
@@ -332,7 +321,7 @@ class Outcome:
         for point in self.points:
             groups.setdefault(self.statuses[point_label(point)], []).append(point)
         lines = [
-            f"{len(points)} {status}{'' if status == OSCILLATING else self._at(points)}"
+            f"{len(points)} {status}{'' if status == Oscillation.OSCILLATING else self._at(points)}"
             for status, points in groups.items()
         ]
         if len(self.members) > 1:
@@ -380,7 +369,7 @@ class Outcome:
         text = (
             f"{len(law.coefficients)} coefficients of {len(law.functions)} functions each, "
             f"{law.coef.size} numbers, from {len(law.points)} records; {found.status}, loss "
-            f"{found.loss.mean():.3g} of a constant's. At {point_label(middle.parameters)}:"
+            f"{found.loss.mean():.3g} of a constant's. At {middle.label}:"
         )
         blocks = [Text(text), *equations, Table(pd.DataFrame(shown), note=INTERVALS)]
         return Section(f"Law{self._cycle(name)}", [*blocks, Picture(f"laws_{name}")])
@@ -511,7 +500,7 @@ def points_table(
     members: Mapping[str, Sequence[Parameters]],
 ) -> pd.DataFrame:
     """One row per operating point: what its record is, and on which cycle."""
-    known = {point_label(record.parameters): record for record in records}
+    known = {record.label: record for record in records}
     cycle = {point_label(p): name for name, group in members.items() for p in group}
     rows = []
     for point in points:
@@ -575,7 +564,7 @@ def left_out_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
 def _left_out_row(each: LeftOut, branches: Mapping[str, Branch], own: str) -> dict[str, Any]:
     run, record = each.run, each.record
     f_kHz = 1e-3 * record.cycle.frequency_Hz
-    label = point_label(record.parameters)
+    label = record.label
     also = [
         name
         for name, branch in branches.items()
@@ -655,6 +644,6 @@ def agreement(
         for point in branch.at_points:
             label = point_label(point.parameters)
             says[label] = says[label] or point.fate is Fate.OSCILLATES
-    quiet = [label for label, status in statuses.items() if status != OSCILLATING]
-    right = [says[label] == (statuses[label] == OSCILLATING) for label in statuses]
+    quiet = [label for label, status in statuses.items() if status != Oscillation.OSCILLATING]
+    right = [says[label] == (statuses[label] == Oscillation.OSCILLATING) for label in statuses]
     return sum(right), len(right), sum(not says[label] for label in quiet), len(quiet)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
@@ -16,10 +17,11 @@ from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.machine.parallel import Workers, collect
 from ep2sindy.machine.screen import in_line
-from ep2sindy.operating.records import PointData, naming, point_label
+from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
-from ep2sindy.signals.oscillation import STEADY
+from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.simulated import (
@@ -31,7 +33,9 @@ from ep2sindy.studies.simulated import (
 )
 
 Step = Callable[[xr.Dataset], xr.Dataset]
-WITHOUT_BREATHING = (STEADY, "decaying", "diverged", "transit")  # what a simulation says of itself
+WITHOUT_BREATHING = (  # what a simulation says of itself
+    Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +198,7 @@ class PointSource:
     def label(self) -> str:
         return point_label(self.parameters)
 
-    def open(self, inputs: Sequence[str]) -> PointData:
+    def open(self, inputs: Sequence[str]) -> OperatingRecord:
         """Open or simulate it; what does not breathe comes without trajectory.
 
         A state that stays exactly where it is makes a point steady: no trajectory may hold it.
@@ -203,17 +207,17 @@ class PointSource:
             try:
                 field = self.source.field()
                 if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
-                    return PointData(self.parameters, None, status)
+                    return OperatingRecord(self.parameters, None, status)
                 sampling = self.source.trajectory
                 run = sampling.trajectory(field, inputs=inputs, label=self.label)
                 notes = amiss(field.attrs) if is_simulation(field.attrs) else unit_doubts(field)
                 words = [field.attrs.get("file", ""), sampling.place(field)]
                 used = "; ".join(word for word in words if word)
-                return PointData(self.parameters, run, notes=notes, used=used)
+                return OperatingRecord(self.parameters, run, notes=notes, used=used)
             except DivergedError:
-                return PointData(self.parameters, None, "diverged")
+                return OperatingRecord(self.parameters, None, Oscillation.DIVERGED)
             except ConstantStateError:
-                return PointData(self.parameters, None, STEADY)
+                return OperatingRecord(self.parameters, None, Oscillation.STEADY)
 
 
 def point_sources(
@@ -246,9 +250,22 @@ def point_sources(
     return found
 
 
-def say_used(run: Run, points: Sequence[PointData]) -> None:
+def open_points(
+    sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, run: Run
+) -> list[OperatingRecord]:
+    """Open or simulate all points, and say which data they are and what is amiss with them."""
+    stage = run.progress(len(sources), "point opened")
+    points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
+    _say_used(run, points)
+    for point in points:
+        for note in point.notes:
+            run.warn(f"{point.label}: {note}")
+    return points
+
+
+def _say_used(run: Run, points: Sequence[OperatingRecord]) -> None:
     """Which data: in one line where all points are averaged alike, else one each."""
-    used = {point_label(point.parameters): point.used for point in points if point.used}
+    used = {point.label: point.used for point in points if point.used}
     if len({*used.values()}) == 1:
         run.say(f"data: {next(iter(used.values()))}")
         return
