@@ -16,9 +16,9 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.coefficient_law import tied_fit
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.operating.law import tied_fit
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak

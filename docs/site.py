@@ -36,9 +36,7 @@ REFERENCE = {
     "Refinement": ["refinement"],
     "Signals": ["signals"],
     "Operating points": [
-        "discovery.operating_fit", "discovery.operating_law", "discovery.operating_map",
-        "discovery.operating_points", "discovery.coefficient_law", "discovery.control_law",
-        "studies.parametric",
+        "operating.fit", "operating.law", "operating.map", "operating.records", "operating",
     ],
     "Grids": ["discovery.pointwise", "discovery.regimes", "machine"],
     "Thruster": ["thruster.parameters", "thruster.axial", "thruster"],

@@ -40,22 +40,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.data.zones import ZoneAverage as ZoneAverage
     from ep2sindy.data.zones import point as point
     from ep2sindy.data.zones import zone_average as zone_average
-    from ep2sindy.discovery.coefficient_law import TiedFit as TiedFit
-    from ep2sindy.discovery.coefficient_law import tied_fit as tied_fit
-    from ep2sindy.discovery.control_law import ControlLaw as ControlLaw
-    from ep2sindy.discovery.control_law import control_law as control_law
     from ep2sindy.discovery.discover import Discovery as Discovery
     from ep2sindy.discovery.discover import discover as discover
-    from ep2sindy.discovery.operating_fit import LeftOut as LeftOut
-    from ep2sindy.discovery.operating_fit import OperatingFit as OperatingFit
-    from ep2sindy.discovery.operating_fit import Windows as Windows
-    from ep2sindy.discovery.operating_fit import left_out as left_out
-    from ep2sindy.discovery.operating_fit import operating_fit as operating_fit
-    from ep2sindy.discovery.operating_law import OperatingLaw as OperatingLaw
-    from ep2sindy.discovery.operating_map import MapPoint as MapPoint
-    from ep2sindy.discovery.operating_map import law_map as law_map
-    from ep2sindy.discovery.operating_points import OperatingRecord as OperatingRecord
-    from ep2sindy.discovery.operating_points import branches_of as branches_of
     from ep2sindy.discovery.pointwise import Kept as Kept
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
     from ep2sindy.discovery.pointwise import pointwise as pointwise
@@ -85,6 +71,23 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.model.stability import LimitCycle as LimitCycle
     from ep2sindy.model.stability import limit_cycle as limit_cycle
     from ep2sindy.model.stability import share_reaching as share_reaching
+    from ep2sindy.operating.fit import LeftOut as LeftOut
+    from ep2sindy.operating.fit import OperatingFit as OperatingFit
+    from ep2sindy.operating.fit import Windows as Windows
+    from ep2sindy.operating.fit import left_out as left_out
+    from ep2sindy.operating.fit import operating_fit as operating_fit
+    from ep2sindy.operating.law import OperatingLaw as OperatingLaw
+    from ep2sindy.operating.law import TiedFit as TiedFit
+    from ep2sindy.operating.law import tied_fit as tied_fit
+    from ep2sindy.operating.map import MapPoint as MapPoint
+    from ep2sindy.operating.map import law_map as law_map
+    from ep2sindy.operating.point_fits import Refining as Refining
+    from ep2sindy.operating.point_fits import TimeBootstrap as TimeBootstrap
+    from ep2sindy.operating.quantities import Quantity as Quantity
+    from ep2sindy.operating.quantity_law import ControlLaw as ControlLaw
+    from ep2sindy.operating.quantity_law import control_law as control_law
+    from ep2sindy.operating.records import OperatingRecord as OperatingRecord
+    from ep2sindy.operating.records import branches_of as branches_of
     from ep2sindy.refinement.correction import Corrected as Corrected
     from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
     from ep2sindy.refinement.methods.gradient_descent import GradientDescent as GradientDescent
@@ -146,9 +149,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.signals.spectrum import power_spectrum as power_spectrum
     from ep2sindy.signals.trace import Trace as Trace
     from ep2sindy.signals.trace import trace as trace
-    from ep2sindy.studies.parametric.points import Refining as Refining
-    from ep2sindy.studies.parametric.quantities import Quantity as Quantity
-    from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap as TimeBootstrap
     from ep2sindy.studies.pysindy_variants import PySINDyEnsemble as PySINDyEnsemble
     from ep2sindy.studies.pysindy_variants import PySINDySmoothing as PySINDySmoothing
     from ep2sindy.studies.pysindy_variants import PySINDySsr as PySINDySsr
@@ -209,37 +209,28 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
 # Module -> its names that users and configs see. Configs name `ep2sindy.EBIC`, never a module.
 _FACE = {
     "constraints.fit": "constrained_fit",
-    "constraints.relations": "Relation Constraint constraint relations_from_matrix",
+    "constraints.relations": "Constraint Relation constraint relations_from_matrix",
     "data.extent": "Zone",
     "data.gaps": "MissingSamples",
     "data.in_time": "crop decimate delay derivative detrend interpolate low_pass resample",
     "data.inspection": "Inspection inspect",
     "data.mapping": "Variable",
-    "data.open": "open_field write_field read_field",
-    "data.prepare": "derive radial_from_middle keep_where",
+    "data.open": "open_field read_field write_field",
+    "data.prepare": "derive keep_where radial_from_middle",
     "data.quantities": "DoubtfulUnit",
     "data.trajectory": "Trajectory",
-    "data.zones": "ZoneAverage GridPoint zone_average point",
-    "discovery.coefficient_law": "TiedFit tied_fit",
-    "discovery.control_law": "ControlLaw control_law",
+    "data.zones": "GridPoint ZoneAverage point zone_average",
     "discovery.discover": "Discovery discover",
-    "discovery.operating_fit": "LeftOut OperatingFit Windows left_out operating_fit",
-    "discovery.operating_law": "OperatingLaw",
-    "discovery.operating_map": "MapPoint law_map",
-    "discovery.operating_points": "OperatingRecord branches_of",
     "discovery.pointwise": "Kept PointSearch pointwise",
     "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",
     "discovery.shared_support": "JointDiscovery discover_jointly",
     "estimation.estimate": "Estimate estimate",
-    "estimation.solver": "Joint",
     "estimation.problem": "SlowSearch",
+    "estimation.solver": "Joint",
     "library.equations": "equation_text",
     "library.functions": "register_function",
-    "library.library": "Library polynomial named_terms",
-    "trust.user_code": "for_configs",
-    "runtime.parallel": "Serial Loky Dask",
-    "runtime.progress": "Progress",
+    "library.library": "Library named_terms polynomial",
     "library.units": "Clock",
     "model.free_run": "FreeRun free_run",
     "model.likeness": "Bounds Verdict",
@@ -247,44 +238,50 @@ _FACE = {
     "model.rollout": "Rollout",
     "model.scores": "r2",
     "model.stability": "LimitCycle limit_cycle share_reaching",
+    "operating.fit": "LeftOut OperatingFit Windows left_out operating_fit",
+    "operating.law": "OperatingLaw TiedFit tied_fit",
+    "operating.map": "MapPoint law_map",
+    "operating.point_fits": "Refining TimeBootstrap",
+    "operating.quantities": "Quantity",
+    "operating.quantity_law": "ControlLaw control_law",
+    "operating.records": "OperatingRecord branches_of",
     "refinement.correction": "Corrected refine_with_correction",
     "refinement.methods.gradient_descent": "GradientDescent",
     "refinement.methods.multiple_shooting": "MultipleShooting",
     "refinement.methods.nelder_mead": "NelderMead",
     "refinement.methods.single_shooting": "SingleShooting",
     "refinement.ode": "ODE",
-    "refinement.refine": "Refinement refine refine_many loss_against_window",
-    "refinement.steps": "RungeKutta HermiteSimpson",
+    "refinement.refine": "Refinement loss_against_window refine refine_many",
+    "refinement.steps": "HermiteSimpson RungeKutta",
     "refinement.tied": "TiedRefinement refine_tied",
     "refinement.windows": "WindowBatch cut_windows",
     "regression.differential": "Differential",
     "regression.rows": "RegressionRows",
-    "regression.splits": "RandomSplit BlockSplit",
+    "regression.splits": "BlockSplit RandomSplit",
     "regression.test_functions": "Boxes Bumps",
     "regression.weak": "Weak WeightedWeak",
+    "runtime.parallel": "Dask Loky Serial",
+    "runtime.progress": "Progress",
     "search.bootstraps": "Bootstraps pooled_supports",
     "search.estimators": "AdaptiveLassoRegressor",
     "search.front": "Candidate ParetoFront fit_support pareto_front",
-    "search.searches": "AdaptiveLasso STLSQ BestSubset",
+    "search.searches": "AdaptiveLasso BestSubset STLSQ",
     "selection.criteria": "AICc EBIC Evidence Knee",
     "selection.free_run": "FreeRunScore",
     "selection.refined": "RefinedScore",
     "selection.rule": "selected",
     "signals.attractor": "Cycle find_cycle",
-    "signals.embedding": "LogRate Rate Delays Embedded embed",
+    "signals.embedding": "Delays Embedded LogRate Rate embed",
     "signals.kalman": "KalmanSmoother",
     "signals.log_smoother": "LogSmoother",
-    "signals.smoothers": "SavitzkyGolay NoSmoothing",
-    "signals.spectrum": "power_spectrum dominant_frequency",
+    "signals.smoothers": "NoSmoothing SavitzkyGolay",
+    "signals.spectrum": "dominant_frequency power_spectrum",
     "signals.trace": "Trace trace",
-    "studies.parametric.points": "Refining",
-    "studies.parametric.quantities": "Quantity",
-    "studies.parametric.time_bootstrap": "TimeBootstrap",
     "studies.pysindy_variants": (
-        "PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm PySINDySmoothing"
+        "PySINDyEnsemble PySINDySmoothing PySINDySsr PySINDyStlsq PySINDyVariant  PySINDyWeakForm "
     ),
     "synthetic.regions": "three_regions",
-    "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz pendulum",
+    "synthetic.systems": "System damped_oscillator lorenz lotka_volterra pendulum van_der_pol",
     "thruster.anode": "AnodeSheath FixedAnode",
     "thruster.axial.balance": "zone_balance",
     "thruster.axial.simulate": "simulate",
@@ -297,11 +294,12 @@ _FACE = {
     "thruster.magnetic_field": "MagneticField MagneticFieldTable read_magnetic_field",
     "thruster.parameters": "OPERATING_POINTS OperatingPoint Thruster",
     "thruster.plane.cache": "simulate_2d_cached",
-    "thruster.plane.simulate": "simulate_2d THRUSTER_2D OPERATING_POINT_2D",
+    "thruster.plane.simulate": "OPERATING_POINT_2D THRUSTER_2D simulate_2d",
     "thruster.propellant_files": "propellant read_propellant",
     "thruster.propellants": "PropellantTable TabulatedRates XenonFits",
     "thruster.transport": "AnomalousTransport GaussianTransport MultiLogTransport",
     "thruster.walls": "ExponentialWall SheathWall wall_material",
+    "trust.user_code": "for_configs",
 }
 _MODULES = {name: module for module, names in _FACE.items() for name in names.split()}
 __all__ = ["__version__", *_MODULES]

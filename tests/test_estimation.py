@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy.constraints.relations import parse_relation
-from ep2sindy.estimation import size
+from ep2sindy.estimation import problem as size
 from ep2sindy.estimation.kernels import departures, eliminated
 from ep2sindy.estimation.likelihood import Fit, Gram, Level, fitted, gram, squares
 from ep2sindy.estimation.noise import noise_beside

@@ -7,11 +7,11 @@ import pytest
 
 from benchmarks.joint import find, rates, run_family
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.coefficient_law import tied_fit
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.operating.law import tied_fit
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit

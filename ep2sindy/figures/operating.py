@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ep2sindy.discovery.operating_law import OperatingLaw
 from ep2sindy.figures.style import (
     DATA,
     GREY,
@@ -22,6 +21,7 @@ from ep2sindy.figures.style import (
 )  # fmt: skip
 from ep2sindy.library.equations import latex_derivative, latex_name, latex_term_name
 from ep2sindy.library.units import prefixed, unit_product
+from ep2sindy.operating.law import OperatingLaw
 
 FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # of errors; what is farther off stands filled on the edge
 

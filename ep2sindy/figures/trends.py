@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ep2sindy.discovery.control_law import ControlLaw
 from ep2sindy.figures.style import COLOURS, equals_label, legend_above
 from ep2sindy.library.equations import latex_name
+from ep2sindy.operating.quantity_law import ControlLaw
 
 Style = str | tuple[int, tuple[int, ...]]
 

@@ -18,6 +18,7 @@ from ep2sindy.signals.attractor import (
     spectrum_distance,
     waveform_errors,
 )
+from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
 from ep2sindy.signals.wander import statistics_wander
 
 LONG = 8.0  # periods of a record whose first half may be left out as a transient
@@ -25,7 +26,6 @@ REPEATS = 0.9  # of the variance, that the waveform of a cycle explains; of chao
 # Times what the spectra of quarters are apart: they lack the slow bands, in which a record that
 # does not repeat itself wanders most.
 SPECTRUM_WANDERS = 2.0
-DEAD = 0.1  # of the data's spread: a state that varies less in the second half has died out
 
 
 class Verdict(StrEnum):
@@ -131,7 +131,7 @@ class Record:
         by_state["amplitude_ratio"] = late.std(axis=0) / self.std
         spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
         middle = len(states) // 2
-        if (states[middle:].std(axis=0) < DEAD * self.states[middle:].std(axis=0)).all():
+        if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
             return Likeness(Verdict.DIES_OUT, np.nan, spectrum, by_state)
         if not self._repeats and self._is_alike(by_state["distribution"], spectrum, bounds):
             return Likeness(Verdict.LIVES, np.nan, spectrum, by_state)

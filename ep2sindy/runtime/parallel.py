@@ -6,7 +6,7 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -42,6 +42,29 @@ def _on_one_thread(function: Callable[[Any], Any], numbered: tuple[int, Any]) ->
     number, piece = numbered
     with one_thread():
         return number, function(piece)
+
+
+def collect(
+    workers: Workers,
+    function: Callable[[Any], Any],
+    pieces: Sequence[Any],
+    stage: AbstractContextManager[Callable[[int], None]],
+    *,
+    size: Callable[[Any], int] = lambda piece: 1,
+    tell: Callable[[int, Any], None] = lambda number, result: None,
+) -> list[Any]:
+    """The results of all pieces in their order, though they come in any order.
+
+    stage: of a `Progress`; it is told the size of every piece that is done. tell: is given the
+    number and the result of every piece as it comes.
+    """
+    results: dict[int, Any] = {}
+    with stage as advance:
+        for number, result in workers.run(function, pieces):
+            results[number] = result
+            tell(number, result)
+            advance(size(pieces[number]))
+    return [results[number] for number in range(len(pieces))]
 
 
 def rows_in_order(

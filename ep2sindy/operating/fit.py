@@ -11,24 +11,23 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
-from ep2sindy.discovery.operating_law import OperatingLaw, in_hull
-from ep2sindy.discovery.operating_points import (
-    OperatingRecord,
-    check_records,
-    point_text,
-    values_of,
-)
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds, deviation
 from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.law import OperatingLaw, in_hull
+from ep2sindy.operating.records import (
+    OperatingRecord,
+    check_records,
+    values_of,
+)
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many
 from ep2sindy.refinement.tied import TiedRefinement, refine_tied
 from ep2sindy.refinement.weighted_law import Basis, information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.runtime.parallel import Serial, Workers
+from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import Progress, as_progress
 
 MOST = 10.0  # deviations count no more, however far a run is off, or where there is none
@@ -239,16 +238,11 @@ def left_out(
         try:
             Basis(fit.without(k).basis(functions))
         except ValueError as error:
-            raise ValueError(
-                f"{point_text(record.parameters)} cannot be left out: {error}"
-            ) from error
+            raise ValueError(f"{record.label} cannot be left out: {error}") from error
     one = partial(_left_out, fit=fit, functions=functions, start=start)
-    done, n_points = {}, len(fit.records)
-    with as_progress(progress).stage(n_points, "point", "law without a point") as advance:
-        for number, result in (workers or Serial()).run(one, range(n_points)):
-            done[number] = result
-            advance(1)
-    return [done[k] for k in range(len(fit.records))]
+    n_points = len(fit.records)
+    stage = as_progress(progress).stage(n_points, "point", "law without a point")
+    return collect(workers or Serial(), one, range(n_points), stage)
 
 
 def _left_out(

@@ -11,15 +11,16 @@ from jaxtyping import Bool, Complex, Float
 from scipy.optimize import root
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.discovery.operating_law import OperatingLaw
-from ep2sindy.discovery.operating_points import OperatingRecord, values_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import Stability, limit_cycle
+from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.records import OperatingRecord, values_of
+from ep2sindy.signals.oscillation import SIMULATED, relative_amplitude
 
 # Growth per period below which a fixed point counts as one that rests: e-fold in a hundred periods.
 NEUTRAL = 0.01
 
-STILL = 0.02  # of the mean: cycles smaller than the simulator calls steady
+STILL = SIMULATED.spread  # of the mean: what the simulator would call steady is no cycle
 
 N_PERIODS = 40  # of a run that may settle
 
@@ -82,7 +83,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
         else:
             mean = cycle.states.mean(axis=0)
             frequency_Hz = 1.0 / cycle.period_s
-            amplitude = _relative(cycle.states)
+            amplitude = relative_amplitude(mean, cycle.states.std(axis=0))
             second = float(np.abs(cycle.multipliers[1:]).max(initial=0.0))
             fate = Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS
     elif fate is Fate.RESTS:
@@ -117,12 +118,8 @@ def _run(
     if run.diverged or not np.isfinite(run.states).all():
         return Fate.DIVERGES, start
     late = run.states[-5 * n :]
-    return (Fate.OSCILLATES if _relative(late) >= STILL else Fate.RESTS), run.states[-1]
-
-
-def _relative(states: Float[np.ndarray, "samples n_states"]) -> float:
-    mean = zero_to_one(np.abs(states.mean(axis=0)))
-    return float(np.sqrt(np.square(states.std(axis=0) / mean).mean()))
+    amplitude = relative_amplitude(late.mean(axis=0), late.std(axis=0))
+    return (Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS), run.states[-1]
 
 
 def fixed_point(

@@ -1,9 +1,9 @@
-"""Physical quantities read from coefficients, with their intervals."""
+"""Physical quantities read from coefficients, with their intervals; what one point gave."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,8 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
 
 LEVEL = 0.95  # of all intervals here
+FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
+REFINED = "_refined"  # ends the name of a case's refinement
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,46 @@ class Estimate:
     value: float
     low: float
     high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model of one operating point.
+
+    status: fitted, by least squares; searched; or what became of a refinement.
+    r2: by state, of the derivative, on training rows. loss: of a refinement, else NaN.
+    draws: by quantity, (draws,), what the intervals of least squares were taken from.
+    The model's covariance is that of the draws, or of the refinement.
+    """
+
+    model: SparseModel
+    status: str
+    r2: Mapping[str, float]
+    loss: float = float("nan")
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    draws: Mapping[str, Float[np.ndarray, " draws"]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class PointResult:
+    """What one operating point gave; without fits unless its status is "oscillating".
+
+    f_Hz: dominant frequency of the first state. spread: by state, standard deviation over mean.
+    fits: by case, and by case + "_refined". searched: what the search chose.
+    """
+
+    parameters: Mapping[str, float]
+    status: str
+    n_samples: int = 0
+    dt_s: float = float("nan")
+    f_Hz: float = float("nan")
+    spread: Mapping[str, float] = field(default_factory=dict)
+    fits: Mapping[str, Fitted] = field(default_factory=dict)
+    searched: Fitted | None = None
+
+    def usable(self, fit: str) -> bool:
+        """Whether a fit was made here and came to its end."""
+        return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
 
 
 def drawn_estimates(

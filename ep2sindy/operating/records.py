@@ -1,9 +1,11 @@
-"""Records of operating points: which of them oscillate on which cycle."""
+"""Operating points: where a record was taken, what it holds, and which cycle it is on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,6 +13,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
 
 LEAST_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
 
@@ -27,22 +30,52 @@ FEW = 4
 
 @dataclass(frozen=True, eq=False)
 class OperatingRecord:
-    """One operating point, its record, and the cycle that it shows.
+    """One operating point, and the record that was taken there.
 
-    Raises ValueError, with the point, for a record without a period or of under six of them.
+    trajectory: None where the source says that nothing oscillates. status: what the source says
+    of it; "oscillating" is looked into, all else believed. notes: what is amiss with its data.
+    used: which data they are, in words. Raises ValueError for parameters that are not finite.
     """
 
     parameters: Mapping[str, float]
-    run: Trajectory
-    cycle: Cycle
+    trajectory: Trajectory | None
+    status: str = Oscillation.OSCILLATING
+    notes: Sequence[str] = ()
+    used: str = ""
+
+    def __post_init__(self) -> None:
+        values = {name: float(value) for name, value in self.parameters.items()}
+        object.__setattr__(self, "parameters", values)
+        if not values or not np.isfinite(list(values.values())).all():
+            raise ValueError(f"operating point {self.label} must have parameters, all finite")
+        if self.trajectory is None and self.status == Oscillation.OSCILLATING:
+            raise ValueError(f"{self.label} oscillates: it needs its trajectory")
 
     @staticmethod
     def of(parameters: Mapping[str, float], run: Trajectory) -> OperatingRecord:
-        values = {name: float(value) for name, value in parameters.items()}
-        cycle = find_cycle(run.t, run.states)
-        where = f"operating point {point_text(values)}"
-        if not values or not np.isfinite(list(values.values())).all():
-            raise ValueError(f"{where} must have parameters, all finite")
+        """A record that laws can be made of; raises ValueError for one without a `cycle`."""
+        record = OperatingRecord(parameters, run)
+        _ = record.cycle
+        return record
+
+    @property
+    def label(self) -> str:
+        return point_label(self.parameters)
+
+    @property
+    def run(self) -> Trajectory:
+        if self.trajectory is None:
+            raise ValueError(f"operating point {self.label} has no record: it is {self.status}")
+        return self.trajectory
+
+    @cached_property
+    def cycle(self) -> Cycle:
+        """What the record repeats.
+
+        Raises ValueError, with the point, for a record without a period or of under six of them.
+        """
+        cycle = find_cycle(self.run.t, self.run.states)
+        where = f"operating point {self.label}"
         if cycle is None:
             raise ValueError(
                 f"{where}: its record has no period to learn from; leave the point out, or record "
@@ -53,13 +86,12 @@ class OperatingRecord:
                 f"{where}: its record holds {cycle.n_periods:.1f} periods of the {LEAST_PERIODS:g} "
                 "that are needed; record it for longer"
             )
-        return OperatingRecord(values, run, cycle)
+        return cycle
 
     @property
     def relative_amplitude(self) -> float:
         """Root mean square over the states of standard deviation over mean, of the waveform."""
-        mean = zero_to_one(np.abs(self.cycle.mean))
-        return float(np.sqrt(np.square(self.cycle.std / mean).mean()))
+        return relative_amplitude(self.cycle.mean, self.cycle.std)
 
     @property
     def slowest(self) -> int:
@@ -76,9 +108,41 @@ class OperatingRecord:
         return self.run.window(self.slowest, self.run.n_samples)
 
 
-def point_text(parameters: Mapping[str, float]) -> str:
-    """`V_d=300, mass_flow=5e-06`."""
+def point_label(parameters: Mapping[str, float]) -> str:
+    """`V_D_V=300, mdot_mg_s=5`."""
     return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
+
+
+@contextmanager
+def naming(parameters: Mapping[str, float]) -> Iterator[None]:
+    """What cannot work at an operating point is said with its name before it."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise ValueError(f"operating point {point_label(parameters)}: {error}") from error
+
+
+def check_alike(records: Sequence[OperatingRecord], variables: Sequence[str]) -> None:
+    """Raise ValueError, naming the point, unless all have the same states, variables and units."""
+    known = [record for record in records if record.trajectory is not None]
+    for record in known:
+        with naming(record.parameters):
+            check_agreement([known[0].run, record.run], variables)
+
+
+def check_varying(
+    points: Float[np.ndarray, "points parameters"],
+    parameters: Sequence[str],
+    *,
+    remedy: str = "leave it out, or add points",
+) -> None:
+    """Raise ValueError for a parameter that is the same at all points: no law can hold it."""
+    for name, column in zip(parameters, points.T, strict=True):
+        if np.ptp(column) == 0.0:
+            raise ValueError(
+                f"a parameter must vary: {name!r} is {column[0]:g} at all {len(points)} operating "
+                f"points; {remedy}"
+            )
 
 
 def check_records(records: Sequence[OperatingRecord]) -> None:
@@ -93,17 +157,11 @@ def check_records(records: Sequence[OperatingRecord]) -> None:
             )
     if len(records) == 1:
         raise ValueError(
-            f"a law needs more than one operating point: {point_text(records[0].parameters)} came "
-            "alone; add points near it"
+            f"a law needs more than one operating point: {records[0].label} came alone; add "
+            "points near it"
         )
-    values = values_of(records)
-    for name, column in zip(names, values.T, strict=True):
-        if np.ptp(column) == 0.0:
-            raise ValueError(
-                f"a parameter must vary: {name!r} is {column[0]:g} at all {len(records)} "
-                "operating points; leave it out, or add points"
-            )
-    check_agreement([record.run for record in records], records[0].run.state_names)
+    check_varying(values_of(records), names)
+    check_alike(records, records[0].run.state_names)
 
 
 def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:

@@ -1,0 +1,1 @@
+"""Records at operating points, and laws of the parameters between them."""
