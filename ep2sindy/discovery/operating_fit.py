@@ -24,9 +24,9 @@ from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import Bounds, deviation
 from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.law import TiedRefinement, refine_tied
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many
-from ep2sindy.refinement.tied import TiedRefinement, refine_tied
 from ep2sindy.refinement.weighted_law import Basis, information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit

@@ -16,7 +16,7 @@ from ep2sindy.model.likeness import Bounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.refinement.many import refine_together
+from ep2sindy.refinement.refine import refine_together
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, joint_scores
 from ep2sindy.selection.folds import Fold, folds_of

@@ -14,7 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.machine.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.model.many import MAX_ERROR, Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.many import follow_together, refine_together
+from ep2sindy.refinement.refine import follow_together, refine_together
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, joint_scores, smallest

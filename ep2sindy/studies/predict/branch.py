@@ -23,7 +23,7 @@ from ep2sindy.discovery.operating_points import (
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.machine.progress import SILENT, Progress
-from ep2sindy.refinement.tied import TiedRefinement
+from ep2sindy.refinement.law import TiedRefinement
 
 MOST_PARAMETERS = 2  # of a map that can be drawn
 
