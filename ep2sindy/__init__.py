@@ -90,19 +90,19 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.operating.records import branches_of as branches_of
     from ep2sindy.refinement.correction import Corrected as Corrected
     from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
+    from ep2sindy.refinement.law import TiedRefinement as TiedRefinement
+    from ep2sindy.refinement.law import refine_tied as refine_tied
     from ep2sindy.refinement.methods.gradient_descent import GradientDescent as GradientDescent
     from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting as MultipleShooting
     from ep2sindy.refinement.methods.nelder_mead import NelderMead as NelderMead
     from ep2sindy.refinement.methods.single_shooting import SingleShooting as SingleShooting
     from ep2sindy.refinement.ode import ODE as ODE
+    from ep2sindy.refinement.ode import HermiteSimpson as HermiteSimpson
+    from ep2sindy.refinement.ode import RungeKutta as RungeKutta
     from ep2sindy.refinement.refine import Refinement as Refinement
     from ep2sindy.refinement.refine import loss_against_window as loss_against_window
     from ep2sindy.refinement.refine import refine as refine
     from ep2sindy.refinement.refine import refine_many as refine_many
-    from ep2sindy.refinement.steps import HermiteSimpson as HermiteSimpson
-    from ep2sindy.refinement.steps import RungeKutta as RungeKutta
-    from ep2sindy.refinement.tied import TiedRefinement as TiedRefinement
-    from ep2sindy.refinement.tied import refine_tied as refine_tied
     from ep2sindy.refinement.windows import WindowBatch as WindowBatch
     from ep2sindy.refinement.windows import cut_windows as cut_windows
     from ep2sindy.regression.differential import Differential as Differential
@@ -246,14 +246,13 @@ _FACE = {
     "operating.quantity_law": "ControlLaw control_law",
     "operating.records": "OperatingRecord branches_of",
     "refinement.correction": "Corrected refine_with_correction",
+    "refinement.law": "TiedRefinement refine_tied",
     "refinement.methods.gradient_descent": "GradientDescent",
     "refinement.methods.multiple_shooting": "MultipleShooting",
     "refinement.methods.nelder_mead": "NelderMead",
     "refinement.methods.single_shooting": "SingleShooting",
-    "refinement.ode": "ODE",
+    "refinement.ode": "HermiteSimpson ODE RungeKutta",
     "refinement.refine": "Refinement loss_against_window refine refine_many",
-    "refinement.steps": "HermiteSimpson RungeKutta",
-    "refinement.tied": "TiedRefinement refine_tied",
     "refinement.windows": "WindowBatch cut_windows",
     "regression.differential": "Differential",
     "regression.rows": "RegressionRows",

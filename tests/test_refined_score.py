@@ -7,9 +7,9 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.many import Together, follow_together, refine_together
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
+from ep2sindy.refinement.refine import Together, follow_together, refine_together
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.front import Candidate, ParetoFront

@@ -29,7 +29,7 @@ from ep2sindy.operating.records import (
     check_records,
     measured_left_out,
 )
-from ep2sindy.refinement.tied import TiedRefinement
+from ep2sindy.refinement.law import TiedRefinement
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress

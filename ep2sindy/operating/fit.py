@@ -21,9 +21,9 @@ from ep2sindy.operating.records import (
     check_records,
     values_of,
 )
+from ep2sindy.refinement.law import TiedRefinement, refine_tied
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many
-from ep2sindy.refinement.tied import TiedRefinement, refine_tied
 from ep2sindy.refinement.weighted_law import Basis, information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit

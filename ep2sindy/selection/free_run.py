@@ -15,7 +15,7 @@ from ep2sindy.model.likeness import Bounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.refinement.many import refine_together
+from ep2sindy.refinement.refine import refine_together
 from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.refined import RefinedScore

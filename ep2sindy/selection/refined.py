@@ -13,7 +13,7 @@ from ep2sindy.constraints.relations import Constraint, Relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.many import follow_together, refine_together
+from ep2sindy.refinement.refine import follow_together, refine_together
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.search.front import ParetoFront
