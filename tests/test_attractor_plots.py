@@ -11,8 +11,7 @@ from ep2sindy.figures.frames import OFF_SCALE
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.studies.identified import FirstRealizations, first_realizations
-from ep2sindy.studies.variants import Variant
+from ep2sindy.studies.benchmark import FirstRealizations, Variant, first_realizations
 from ep2sindy.synthetic.draws import realization
 
 SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]

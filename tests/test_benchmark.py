@@ -15,8 +15,7 @@ from ep2sindy.runtime.parallel import Loky, Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
 from ep2sindy.selection.criteria import Knee
-from ep2sindy.studies.benchmark import Study, cells
-from ep2sindy.studies.variants import Variant, merits
+from ep2sindy.studies.benchmark import Study, Variant, cells, merits
 from ep2sindy.synthetic.draws import realization
 from ep2sindy.synthetic.systems import damped_oscillator
 

@@ -18,7 +18,7 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.discovery.pointwise import Block, Kept
 from ep2sindy.studies import pointwise
-from ep2sindy.studies.pointwise_view import Outcome
+from ep2sindy.studies.pointwise import Outcome
 from ep2sindy.synthetic.regions import TERMS, three_regions
 from tests import programs
 

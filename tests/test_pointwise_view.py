@@ -10,7 +10,7 @@ from ep2sindy.discovery.regimes import regimes
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import drawn
 from ep2sindy.report.screen import WIDTH, Screen
-from ep2sindy.studies.pointwise_view import Outcome
+from ep2sindy.studies.pointwise import Outcome
 
 TERMS = ["1", "n_n", "n_i*u_iz"]
 

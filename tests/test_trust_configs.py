@@ -18,7 +18,7 @@ from ep2sindy.app.build import as_node, bind, defaults_of
 from ep2sindy.app.runner import run_config, study_class
 from ep2sindy.app.safety import CheckedLoader, check_places, check_references, resolved
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
-from ep2sindy.studies.functions import registered
+from ep2sindy.studies.libraries import registered
 from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,7 +31,7 @@ REFUSED = [
     "ep2sindy.write_field", "ep2sindy.SparseModel.load", "ep2sindy.SparseModel",
     "ep2sindy.discover", "ep2sindy.register_function", "ep2sindy.for_configs",
     "ep2sindy.runtime.files.write_text", "ep2sindy.app.build.bind",
-    "ep2sindy.studies.functions._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
+    "ep2sindy.studies.libraries._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
     "ep2sindy._MODULES", "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
 ]  # fmt: skip
 

@@ -21,7 +21,7 @@ from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies import frontier as frontiers
 from ep2sindy.studies import weak_windows
-from ep2sindy.studies.weak_forms import Setting, boxes_grid, fit_settings, fitted_terms
+from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings, fitted_terms
 from ep2sindy.studies.weak_windows import (
     coefficient_error,
     true_library,

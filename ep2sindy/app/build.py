@@ -20,8 +20,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import ep2sindy
 from ep2sindy.app.targets import target_of
-from ep2sindy.studies.kinds import Deferred, Kind
 from ep2sindy.studies.source import Step
+from ep2sindy.studies.study import Check, Deferred
 
 PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 
@@ -31,8 +31,8 @@ def value_of(kind: Any, node: Any, place: str) -> Any:
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         value = contents(node)
-        if isinstance(parts[1], Kind) and not parts[1].fits(value):
-            raise ValueError(f"{place} must be {parts[1].says}: {value!r} came")
+        if isinstance(parts[1], Check) and not parts[1].test(value):
+            raise ValueError(f"{place} must be {parts[1].message}: {value!r} came")
         return value_of(parts[0], node, place)
     if kind is Any:
         return contents(node)

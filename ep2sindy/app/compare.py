@@ -26,11 +26,11 @@ from ep2sindy.report.about import by_place
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
 from ep2sindy.report.page import TEMPLATES, page_html
 from ep2sindy.report.picture import Drawn, read_png
+from ep2sindy.report.results import in_words, value_text
 from ep2sindy.report.screen import Screen
-from ep2sindy.report.words import in_words, value_text
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import say
-from ep2sindy.studies.shown import shown_equation
+from ep2sindy.studies.views import shown_equation
 
 ABOUT = """Compares runs: settings that differ, headline figures, equations with their intervals.
 A run is the folder that it printed last, such as outputs/breathing/2025-01-31_101500."""

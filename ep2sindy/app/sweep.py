@@ -22,7 +22,7 @@ from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
 from ep2sindy.report.folder import freeze_layout
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import DPI, Drawn, drawn
-from ep2sindy.report.words import in_words, value_text
+from ep2sindy.report.results import in_words, value_text
 from ep2sindy.runtime.files import read_json, write_json, write_text
 from ep2sindy.runtime.screen import in_line
 

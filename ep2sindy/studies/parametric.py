@@ -32,10 +32,10 @@ from ep2sindy.operating.records import point_label
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
-from ep2sindy.studies.kinds import Count, Kind
-from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.shown import coefficients
+from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.study import Check, Count
+from ep2sindy.studies.views import coefficients
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
@@ -112,7 +112,7 @@ class Panels:
 
 Cases = Annotated[
     Mapping[str, CaseSettings],
-    Kind(
+    Check(
         "like {free: {relations: [], quantities: {k: {coefficient: 'x: x'}}}}",
         lambda value: isinstance(value, dict) and bool(value),
     ),

@@ -35,10 +35,10 @@ from ep2sindy.report.document import (
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.oscillation import Oscillation
-from ep2sindy.studies.kinds import Count, Counts, Kind, Positive
-from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.simulate_scan import compile_kernels
+from ep2sindy.studies.fits import Terms, terms_of
+from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.study import Check, Count, Counts, Positive
 
 INTERVALS = (
     "In SI units, and the parameters in theirs. ±: half the 95 % interval, from a sandwich with "
@@ -100,7 +100,7 @@ class SearchSettings:
 Parameters = Mapping[str, float]
 Points = Annotated[
     Sequence[Mapping[str, Any]],
-    Kind(
+    Check(
         "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], every combination being a point",
         lambda value: isinstance(value, list) and bool(value),
     ),

@@ -16,7 +16,7 @@ from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table
-from ep2sindy.studies.kinds import PositiveOrAll
+from ep2sindy.studies.study import PositiveOrAll
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +37,7 @@ CAPTIONS = {
 
 
 @dataclass(frozen=True)
-class Shown:
+class PlotRange:
     """How much figures show: the start of a record, and the low end of spectra."""
 
     duration_s: PositiveOrAll
@@ -67,7 +67,7 @@ def run_figures(
     names: Sequence[str],
     data: Trajectory,
     models: Mapping[str, FreeRun],
-    shown: Shown,
+    shown: PlotRange,
     *,
     formulation: object = None,
     since: str = series.SINCE_START,
@@ -105,7 +105,7 @@ def run_figures(
 def trajectories(
     data: Trajectory,
     models: Mapping[str, FreeRun],
-    shown: Shown,
+    shown: PlotRange,
     caption: str,
     *,
     since: str = series.SINCE_START,
