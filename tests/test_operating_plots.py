@@ -8,8 +8,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from ep2sindy.discovery.operating_law import OperatingLaw
-from ep2sindy.figures.operating import frequency_scale, laws_figure, left_out_figure
-from ep2sindy.figures.operating_map import line_figure, map_figure
+from ep2sindy.figures.operating import (
+    frequency_scale,
+    laws_figure,
+    left_out_figure,
+    line_figure,
+    map_figure,
+)
 from ep2sindy.library.library import named_terms, polynomial
 
 POINTS = pd.DataFrame(

@@ -72,7 +72,7 @@ def _headlines(records: Records) -> list[str]:
 
 def _figures(records: Records, varied: Mapping[str, Sequence[str]]) -> dict[str, Drawn]:
     """Over the one number that was varied, or over the jobs."""
-    from ep2sindy.figures.sweeps import sweep_figure
+    from ep2sindy.figures.trends import sweep_figure
 
     values = {
         in_words(name) + (" (kHz)" if name.endswith("f_kHz") else ""): np.array(

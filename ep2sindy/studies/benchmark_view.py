@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.figures.attractors import attractor_figure
-from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure, merit_table
+from ep2sindy.figures.identified import (
+    COUNTS,
+    MERITS,
+    attractor_figure,
+    benchmark_figure,
+    merit_table,
+)
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import (
     Block,

@@ -10,7 +10,7 @@ import numpy as np
 
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.figures.attractors import Identified
+from ep2sindy.figures.identified import Identified
 from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.studies.variants import Variant
 from ep2sindy.synthetic.draws import realization

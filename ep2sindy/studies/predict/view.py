@@ -12,8 +12,13 @@ import pandas as pd
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.discovery.operating_points import OperatingRecord, values_of
-from ep2sindy.figures.operating import frequency_scale, laws_figure, left_out_figure
-from ep2sindy.figures.operating_map import line_figure, map_figure
+from ep2sindy.figures.operating import (
+    frequency_scale,
+    laws_figure,
+    left_out_figure,
+    line_figure,
+    map_figure,
+)
 from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import (
