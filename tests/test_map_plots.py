@@ -9,14 +9,15 @@ from matplotlib.figure import Figure
 from ep2sindy.discovery.regimes import Regimes, regimes
 from ep2sindy.figures.maps import (
     ABSENT,
+    COUNTS,
     GAP,
     HALF,
+    SHARES,
     SINK,
     coefficient_maps,
     quality_maps,
     regime_map,
 )
-from ep2sindy.figures.panels import COUNTS, SHARES
 from ep2sindy.thruster.parameters import Thruster
 
 TERMS = ["1", "n_n", "n_i*u_iz"]

@@ -17,7 +17,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table as Grid
 
-from ep2sindy.figures.sweeps import sweep_figure
+from ep2sindy.figures.trends import sweep_figure
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
 from ep2sindy.report.folder import freeze_layout
 from ep2sindy.report.page import page_html

@@ -20,8 +20,14 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Finding, Recipe
-from ep2sindy.figures.attractors import Identified, attractor_figure
-from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure, merit_table
+from ep2sindy.figures.identified import (
+    COUNTS,
+    MERITS,
+    Identified,
+    attractor_figure,
+    benchmark_figure,
+    merit_table,
+)
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import (
