@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-import ep2sindy
+from ep2sindy._stubs import place_of
 
 
 def write_defaults(node: DictConfig, place: str, target: Callable[[Any], Any]) -> None:
@@ -60,7 +60,5 @@ def plain(value: Any) -> Any:
 
 
 def _name(kind: type) -> str:
-    """By the package's face where that has it: modules may move."""
-    if getattr(ep2sindy, kind.__name__, None) is kind:
-        return f"ep2sindy.{kind.__name__}"
-    return f"{kind.__module__}.{kind.__qualname__}"  # a user's
+    """By the package's stubs where they have it: modules may move."""
+    return place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"  # a user's

@@ -22,7 +22,7 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Serial, Workers
 from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds, deviation
+from ep2sindy.model.likeness import FreeRunBounds, deviation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many
@@ -219,7 +219,7 @@ class LeftOut:
         amplitude, waveform = (
             np.array(list(each.values())) for each in (run.amplitude_ratio, run.waveform_error)
         )
-        found = deviation(run.f_error, amplitude, waveform, Bounds())
+        found = deviation(run.f_error, amplitude, waveform, FreeRunBounds())
         return MOST if np.isnan(found) else min(found, MOST)
 
 

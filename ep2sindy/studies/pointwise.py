@@ -18,7 +18,7 @@ from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.discovery.blocks import Kept, blocks_of
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.discovery.regimes import regimes
+from ep2sindy.discovery.regimes import find_regimes
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
 from ep2sindy.machine.files import fingerprint
@@ -86,7 +86,7 @@ class Study:
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(run.seed)
         with run.progress(None, "", "regimes"):
-            found = regimes(result, rng=rng, max_regimes=self.max_regimes)
+            found = find_regimes(result, rng=rng, max_regimes=self.max_regimes)
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
         write_netcdf(result, run.folder.path / "pointwise.nc", encoding=packed)

@@ -15,7 +15,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery
 from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds
+from ep2sindy.model.likeness import FreeRunBounds
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Section, Table, Text, places
 from ep2sindy.studies.living import start_of, two_periods
@@ -89,7 +89,7 @@ def term_roles(
     train: Trajectory,
     held: Trajectory,
     compared: Compared,
-    bounds: Bounds,
+    bounds: FreeRunBounds,
     *,
     length_m: float | None,
     progress: Progress = SILENT,
@@ -121,7 +121,7 @@ def _run(
     relations: Sequence[Relation],
     train: Trajectory,
     held: Trajectory,
-    bounds: Bounds,
+    bounds: FreeRunBounds,
     progress: Progress,
     *,
     window: int | None,

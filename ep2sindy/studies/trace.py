@@ -16,7 +16,7 @@ from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.stability import share_reaching
 from ep2sindy.report.run import Run
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
-from ep2sindy.signals.trace import Trace, trace
+from ep2sindy.signals.trace import Trace, from_one_signal
 from ep2sindy.studies.kinds import Count, Deferred, Positive, Share
 from ep2sindy.studies.living import cycle_of
 from ep2sindy.studies.source import Source
@@ -62,7 +62,7 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         data = self._sampled(run)
-        signal = trace(data, decimate=self.decimate, detrend=self.detrend)
+        signal = from_one_signal(data, decimate=self.decimate, detrend=self.detrend)
         for text in signal.done:
             run.say(f"{signal.name}: {text}")
         for text in signal.advice:
