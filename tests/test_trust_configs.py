@@ -12,6 +12,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from test_face import targets
 
+from ep2sindy._stubs import dotted_names
 from ep2sindy.app import yaml_files
 from ep2sindy.app.build import call_of
 from ep2sindy.app.defaults import defaults_of, plain
@@ -35,7 +36,7 @@ REFUSED = [
     "ep2sindy.studies.functions._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
     "ep2sindy._stubs.dotted_names", "ep2sindy.warnings", "ep2sindy.thruster.zone_balance",
     "ep2sindy.thruster.parameters.Thruster", "ep2sindy.prepare.import_module", "crop",
-    "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.selected", "prepare.crop",
+    "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.r2", "prepare.crop",
     "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
 ]  # fmt: skip
 
