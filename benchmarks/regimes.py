@@ -13,7 +13,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.discovery.regimes import Regimes, regimes
+from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.bootstraps import Bootstraps
@@ -44,7 +44,7 @@ def found(truth: RegionField, rule: Selection, *, noise: float, seed: int) -> Re
         seed=seed,
     )
     field = truth.noisy(noise, rng=rng).field
-    return regimes(pointwise(field, search, workers=Loky()), rng=rng)
+    return find_regimes(pointwise(field, search, workers=Loky()), rng=rng)
 
 
 def main() -> None:

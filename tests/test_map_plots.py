@@ -6,7 +6,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from ep2sindy.discovery.regimes import Regimes, regimes
+from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.figures.maps import (
     ABSENT,
     COUNTS,
@@ -66,7 +66,7 @@ def study() -> xr.Dataset:
 
 
 def grouped(result: xr.Dataset) -> Regimes:
-    return regimes(result, rng=np.random.default_rng(0))
+    return find_regimes(result, rng=np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")

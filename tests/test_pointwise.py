@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.data.zones import point
+from ep2sindy.data.zones import point_samples
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
@@ -108,7 +108,7 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     search = searching(formulation=formulation, search=AdaptiveLasso(), bootstraps=draws)
     field = noisy()
     result = pointwise(field, search, workers=Serial()).isel(z=2, r=1)
-    run = point(field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"])
+    run = point_samples(field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"])
     found = discover(
         [run],
         LIBRARY,

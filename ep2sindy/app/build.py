@@ -18,7 +18,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-import ep2sindy
+from ep2sindy._stubs import place_of
 from ep2sindy.app.targets import target_of
 from ep2sindy.studies.source import Step
 from ep2sindy.studies.study import Check, Deferred
@@ -332,7 +332,5 @@ def as_node(value: Any) -> Any:
 
 
 def _name(kind: type) -> str:
-    """By the package's face where that has it: modules may move."""
-    if getattr(ep2sindy, kind.__name__, None) is kind:
-        return f"ep2sindy.{kind.__name__}"
-    return f"{kind.__module__}.{kind.__qualname__}"  # a user's
+    """By the package's stubs where they have it: modules may move."""
+    return place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"  # a user's

@@ -167,7 +167,7 @@ class Inspection:
         return roles
 
 
-def inspect(path: str | Path) -> Inspection:
+def inspect_file(path: str | Path) -> Inspection:
     """Look into a file: what it holds, and what that is by names, units, shapes and sizes.
 
     Reads every array once. The result prints as a table and says what is missing for which

@@ -73,7 +73,7 @@ class Regimes:
         }
 
 
-def regimes(
+def find_regimes(
     result: xr.Dataset,
     *,
     rng: np.random.Generator | int,

@@ -13,7 +13,7 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds, deviation
+from ep2sindy.model.likeness import FreeRunBounds, deviation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import OperatingLaw, in_hull
 from ep2sindy.operating.records import (
@@ -218,7 +218,7 @@ class LeftOut:
         amplitude, waveform = (
             np.array(list(each.values())) for each in (run.amplitude_ratio, run.waveform_error)
         )
-        found = deviation(run.f_error, amplitude, waveform, Bounds())
+        found = deviation(run.f_error, amplitude, waveform, FreeRunBounds())
         return MOST if np.isnan(found) else min(found, MOST)
 
 

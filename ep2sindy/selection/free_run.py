@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
-from ep2sindy.model.likeness import Bounds, Verdict, against_cycle, deviation
+from ep2sindy.model.likeness import FreeRunBounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
@@ -102,7 +102,7 @@ class FreeRunScore:
     max_combinations: more are refused. n_confirmed: refined on all data, at most. seed: of windows.
     """
 
-    bounds: Bounds = field(default_factory=Bounds)
+    bounds: FreeRunBounds = field(default_factory=FreeRunBounds)
     n_folds: int = 3
     n_windows: int = 20
     window_periods: float = 2.0

@@ -19,7 +19,7 @@ from ep2sindy.data.fields import SPACE
 from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.discovery.regimes import UNSURE, Regimes, regimes, spread
+from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
 from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regime_map
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
@@ -107,7 +107,7 @@ class Study:
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(run.seed)
         with run.progress(None, "", "regimes"):
-            found = regimes(result, rng=rng, max_regimes=self.max_regimes)
+            found = find_regimes(result, rng=rng, max_regimes=self.max_regimes)
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
         write_netcdf(result, run.folder.path / "pointwise.nc", encoding=packed)

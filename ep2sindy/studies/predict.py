@@ -13,8 +13,13 @@ import pandas as pd
 from scipy.special import ndtri
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.figures.operating import frequency_scale, laws_figure, left_out_figure, line_figure
-from ep2sindy.figures.operating_map import map_figure
+from ep2sindy.figures.operating import (
+    frequency_scale,
+    laws_figure,
+    left_out_figure,
+    line_figure,
+    map_figure,
+)
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
