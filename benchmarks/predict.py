@@ -17,13 +17,13 @@ from itertools import product
 import numpy as np
 
 import ep2sindy as ep
-from ep2sindy.discovery.operating_fit import LeftOut, OperatingFit, left_out, operating_fit
-from ep2sindy.discovery.operating_map import Fate, law_map
-from ep2sindy.discovery.operating_points import (
+from ep2sindy.operating.fit import LeftOut, OperatingFit, left_out, operating_fit
+from ep2sindy.operating.map import Fate, law_map
+from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
     measured_left_out,
-    point_text,
+    point_label,
 )
 
 STRUCTURE = {"n_i": ["n_i", "n_n", "n_i*n_n"], "n_n": ["1", "n_i", "n_n"]}
@@ -62,7 +62,7 @@ def one_branch(records: Sequence[OperatingRecord | None]) -> list[OperatingRecor
     branch = branches_of(known)
     for record, number in zip(known, branch, strict=True):
         if number:
-            print(f"on another cycle: {point_text(record.parameters)}")
+            print(f"on another cycle: {record.label}")
     return [record for record, number in zip(known, branch, strict=True) if not number]
 
 
@@ -95,7 +95,7 @@ def judged(fit: OperatingFit, degree: int) -> None:
     print(line("tied, enclosed only", [each for each in inside if each.inside]))
     for each in inside:
         r = each.run
-        print(f"  {point_text(each.record.parameters)}: {r.verdict}, f {r.f_error:+.2%}")
+        print(f"  {each.record.label}: {r.verdict}, f {r.f_error:+.2%}")
 
 
 def mapped(strong: Sequence[OperatingRecord], quiet: Sequence[Mapping[str, float]]) -> None:
@@ -108,7 +108,7 @@ def mapped(strong: Sequence[OperatingRecord], quiet: Sequence[Mapping[str, float
         right += (agrees := (point.fate is Fate.OSCILLATES) == (k >= len(quiet)))
         if k < len(quiet) or not agrees:
             state = "quiet" if k < len(quiet) else "oscillates"
-            print(f"  {point_text(point.parameters)}: {state}; the model {point.fate}")
+            print(f"  {point_label(point.parameters)}: {state}; the model {point.fate}")
     print(f"map, {len(strong)} points fitted ({found.status}): right at {right} of {len(points)}")
 
 

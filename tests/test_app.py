@@ -18,7 +18,7 @@ from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_
 from ep2sindy.app.schema import keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.machine.files import write_json, write_text
+from ep2sindy.runtime.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
 from tests.programs import ended

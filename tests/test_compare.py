@@ -10,8 +10,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.app.compare import main as compare
-from ep2sindy.app.sweep import write_index
-from ep2sindy.app.sweep_page import parted
+from ep2sindy.app.sweep import parted, write_index
 from ep2sindy.report.results import LABELS, in_words
 from tests.browser import seen
 

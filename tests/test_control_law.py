@@ -4,8 +4,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ep2sindy.discovery.control_law import control_law
 from ep2sindy.library.library import polynomial
+from ep2sindy.operating.quantity_law import control_law
 
 # The thesis's six operating points, V and mg/s: a cross.
 POINTS = np.array([[200, 5], [300, 2], [300, 4], [300, 5], [300, 6], [400, 5]], dtype=np.float64)

@@ -11,13 +11,12 @@ from omegaconf.errors import OmegaConfBaseException
 from ep2sindy.app.runner import run_config, started_run
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.discovery.control_law import control_law
 from ep2sindy.figures.trends import trends_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.quantity_law import control_law
 from ep2sindy.report.page import page_html
-from ep2sindy.studies.parametric.study import Study
-from ep2sindy.studies.parametric.view import Outcome, with_error
+from ep2sindy.studies.parametric import Outcome, Study, with_error
 from tests import programs
 
 ESTIMATES = {

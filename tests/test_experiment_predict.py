@@ -9,11 +9,11 @@ from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
-from ep2sindy.discovery.operating_law import OperatingLaw
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.studies.predict.branch import map_points
-from ep2sindy.studies.predict.study import Study, expanded
+from ep2sindy.operating.choice import map_points
+from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.studies.predict import Study, expanded
 from tests import programs
 
 POINTS = "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"

@@ -16,17 +16,11 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
-from ep2sindy.machine.files import WriteError
-from ep2sindy.studies.parametric import study as parametric
-from ep2sindy.studies.parametric.opening import point_sources
+from ep2sindy.runtime.files import WriteError
+from ep2sindy.studies import parametric
 from ep2sindy.studies.simulate import Outcome, Simulated, Study, scan_points, value_text
-from ep2sindy.studies.simulated import (
-    DivergedError,
-    amiss,
-    check_recorded,
-    compile_kernels,
-    doubts,
-)
+from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, compile_kernels, doubts
+from ep2sindy.studies.source import point_sources
 from tests import programs
 
 VOLTAGES = "scan={operating_point.voltage:[-5.0,250.0,300.0,5000.0]}"

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.operating_fit import LeftOut, OperatingFit, Windows, left_out, operating_fit
-from ep2sindy.discovery.operating_law import OperatingLaw, in_hull
-from ep2sindy.discovery.operating_points import (
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.likeness import Verdict
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.operating.fit import LeftOut, OperatingFit, Windows, left_out, operating_fit
+from ep2sindy.operating.law import OperatingLaw, in_hull
+from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
     check_records,
     measured_left_out,
 )
-from ep2sindy.library.library import polynomial
-from ep2sindy.model.likeness import Verdict
-from ep2sindy.model.model import SparseModel, coef_matrix
 
 STATES = ("x", "y")
 LIBRARY = polynomial(STATES, degree=3)

@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ep2sindy.discovery.operating_choice import Tried, candidate_structures, chosen, tried
-from ep2sindy.discovery.operating_fit import Windows
-from ep2sindy.discovery.operating_law import OperatingLaw
-from ep2sindy.discovery.operating_map import Fate, eigenvalues, fixed_point, law_map
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.operating.choice import Tried, candidate_structures, chosen, tried
+from ep2sindy.operating.fit import Windows
+from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.map import Fate, eigenvalues, fixed_point, law_map
 from tests.test_operating_law import LIBRARY, STATES, STRUCTURE, recorded, records
 
 # Radius r' = r (a - r^2), phase' = 1: a cycle of radius sqrt(a) and period 2 pi where a > 0.

@@ -11,34 +11,36 @@ from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.resampling import moving_block_counts
-from ep2sindy.regression.rows import Regression
-from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
-from ep2sindy.search.searches import AdaptiveLasso, BestSubset
-from ep2sindy.selection.knees import Knee
-from ep2sindy.signals.smoothers import NoSmoothing
-from ep2sindy.studies.parametric.all_points import searched_jointly
-from ep2sindy.studies.parametric.oscillation import PointData, oscillation
-from ep2sindy.studies.parametric.points import (
+from ep2sindy.operating.point_fits import (
     Case,
-    Fitted,
-    PointResult,
     PointStudy,
     Refining,
-    parametric_study,
+    TimeBootstrap,
+    fit_points,
+    resampled_coefficients,
+    searched_jointly,
 )
-from ep2sindy.studies.parametric.quantities import (
+from ep2sindy.operating.quantities import (
     Estimate,
+    Fitted,
+    PointResult,
     Quantity,
     drawn_estimates,
     propagated_estimates,
 )
-from ep2sindy.studies.parametric.time_bootstrap import TimeBootstrap, resampled_coefficients
-from ep2sindy.studies.parametric.trends import laws, power_law_r2, trends
+from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
+from ep2sindy.operating.records import OperatingRecord
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.regression.weak import Weak
+from ep2sindy.runtime.parallel import Loky, Serial
+from ep2sindy.search.bootstraps import moving_block_counts
+from ep2sindy.search.searches import AdaptiveLasso, BestSubset
+from ep2sindy.selection.criteria import Knee
+from ep2sindy.signals.oscillation import oscillation
+from ep2sindy.signals.smoothers import NoSmoothing
 
 LIBRARY = named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])
 TERMS = {"x": ["x*u", "x*y*R"], "y": ["1", "x*y*R"]}
@@ -111,25 +113,26 @@ TRUTHS = [
 
 
 @pytest.fixture(scope="module")
-def points() -> list[PointData]:
+def points() -> list[OperatingRecord]:
     """Three points with sampling of their own, and one that does not oscillate."""
     runs = [
         forced(**truth, dt=dt, periods=periods)
         for truth, dt, periods in zip(TRUTHS, (0.01, 0.013, 0.008), (20, 25, 15), strict=True)
     ]
     return [
-        *(PointData({"V": 100.0 * (k + 1), "m": 2.0**k}, run) for k, run in enumerate(runs)),
-        PointData({"V": 400.0, "m": 8.0}, None, "steady"),
+        *(OperatingRecord({"V": 100.0 * (k + 1), "m": 2.0**k}, run) for k, run in enumerate(runs)),
+        OperatingRecord({"V": 400.0, "m": 8.0}, None, "steady"),
     ]
 
 
-def results_of(points: list[PointData], how: PointStudy, *, seed: int = 0) -> list[PointResult]:
-    found = dict(parametric_study(points, how, workers=Serial(), rng=np.random.default_rng(seed)))
-    return [found[k] for k in range(len(points))]
+def results_of(
+    points: list[OperatingRecord], how: PointStudy, *, seed: int = 0
+) -> list[PointResult]:
+    return fit_points(points, how, workers=Serial(), rng=np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
-def results(points: list[PointData]) -> list[PointResult]:
+def results(points: list[OperatingRecord]) -> list[PointResult]:
     return results_of(points, study())
 
 
@@ -153,7 +156,7 @@ def test_quantities_of_every_point_come_back(results: list[PointResult]) -> None
 
 
 def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
-    points: list[PointData], results: list[PointResult]
+    points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
     law, rng = polynomial(["V"], degree=1), np.random.default_rng(0)
     plane = [replace(p, parameters={"V": p.parameters["V"]}) for p in points]
@@ -175,7 +178,7 @@ def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
 
 
 def test_a_joint_search_says_why_it_ties_nothing(
-    points: list[PointData], results: list[PointResult]
+    points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
     law = polynomial(["V", "m"], degree=2)
     joint = searched_jointly(points, results, study(), law, rng=np.random.default_rng(0))
@@ -185,7 +188,7 @@ def test_a_joint_search_says_why_it_ties_nothing(
 
 
 def test_there_is_no_joint_search_of_one_point_or_without_best_subsets(
-    points: list[PointData], results: list[PointResult]
+    points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
     law, rng = polynomial(["V", "m"], degree=1), np.random.default_rng(0)
     alone = [points[0], points[3]], [results[0], results[3]]
@@ -216,7 +219,7 @@ def test_a_search_finds_the_terms_that_made_the_data(results: list[PointResult])
 
 
 def test_a_point_that_does_not_oscillate_is_kept_and_left_out(
-    points: list[PointData], results: list[PointResult]
+    points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
     assert (results[3].status, dict(results[3].fits)) == ("steady", {})
     assert not results[3].usable("free")
@@ -231,7 +234,7 @@ def test_a_point_that_does_not_oscillate_is_kept_and_left_out(
 
 
 def test_a_point_does_not_depend_on_the_others(
-    points: list[PointData], results: list[PointResult]
+    points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
     (alone,) = results_of(points[:1], study())
     for fit, fitted in alone.fits.items():
@@ -239,8 +242,8 @@ def test_a_point_does_not_depend_on_the_others(
 
 
 @pytest.mark.slow
-def test_workers_change_nothing(points: list[PointData], results: list[PointResult]) -> None:
-    found = dict(parametric_study(points, study(), workers=Loky(2), rng=np.random.default_rng(0)))
+def test_workers_change_nothing(points: list[OperatingRecord], results: list[PointResult]) -> None:
+    found = fit_points(points, study(), workers=Loky(2), rng=np.random.default_rng(0))
     for k, result in enumerate(results):
         assert {fit: dict(found[k].fits[fit].estimates) for fit in found[k].fits} == {
             fit: dict(result.fits[fit].estimates) for fit in result.fits
@@ -259,7 +262,7 @@ def test_workers_change_nothing(points: list[PointData], results: list[PointResu
     ],
 )
 def test_points_that_differ_in_their_variables_are_refused(
-    change: Mapping[str, object], message: str, points: list[PointData]
+    change: Mapping[str, object], message: str, points: list[OperatingRecord]
 ) -> None:
     other = replace(points[1], trajectory=replace(points[1].trajectory, **change))
     with pytest.raises(ValueError, match=re.escape(message)):
@@ -285,7 +288,7 @@ def wave(t: np.ndarray) -> np.ndarray:
 def test_records_say_whether_they_oscillate(signal: object, status: str) -> None:
     t = np.linspace(0.0, 20.0, 2001)
     x = signal(t)  # type: ignore[operator]
-    assert oscillation(Trajectory(t, np.stack([x, 2 + wave(t)], axis=1), ["x", "y"])) == status
+    assert oscillation(t, np.stack([x, 2 + wave(t)], axis=1)) == status
 
 
 def test_draws_are_least_squares_on_repeated_rows() -> None:
@@ -344,13 +347,13 @@ def test_draws_of_whitened_rows_spread_as_their_covariance_says(case: Case) -> N
     np.testing.assert_allclose(ratio, 1.0, atol=0.35)
 
 
-def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) -> Regression:
+def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) -> RegressionRows:
     """z' = 2 a - 3 b, with columns and errors that are averages over `memory` rows."""
     white = rng.normal(size=(n_rows + memory, 3))
     kernel = np.ones(memory) / np.sqrt(memory)
     smooth = np.stack([np.convolve(column, kernel, "valid")[:n_rows] for column in white.T], 1)
     theta = smooth[:, :2]
-    return Regression(
+    return RegressionRows(
         theta=theta,
         target=(theta @ [2.0, -3.0] + 0.3 * smooth[:, 2])[:, None],
         library=named_terms(["a", "b"], ["a", "b"]),
@@ -477,7 +480,7 @@ def test_laws_are_made_from_fits_that_came_to_their_end() -> None:
             lambda: Refining(n_windows=1, periods=0.5, max_iter=50),
             "two windows and iterations or more",
         ),
-        (lambda: PointData({"V": 1.0}, None), "V=1 oscillates: it needs its trajectory"),
+        (lambda: OperatingRecord({"V": 1.0}, None), "V=1 oscillates: it needs its trajectory"),
         (
             lambda: replace(
                 study(), cases={"a": replace(CASES["free"], quantities={"q": Quantity("x: 1")})}
@@ -491,7 +494,7 @@ def test_settings_that_cannot_work_are_refused(make: object, message: str) -> No
         make()  # type: ignore[operator]
 
 
-def test_a_record_of_few_blocks_is_refused(points: list[PointData]) -> None:
+def test_a_record_of_few_blocks_is_refused(points: list[OperatingRecord]) -> None:
     how = replace(study(weak=False), bootstrap=TimeBootstrap(n_draws=60, periods=6.0))
     with pytest.raises(
         ValueError,
@@ -511,7 +514,7 @@ def test_smoothing_biases_least_squares_and_not_refinements(
     run = forced(**TRUTHS[0], dt=1.0 / samples_per_period, periods=20)
     form = Differential(split=RandomSplit(0.0))
     smoothed = replace(study(), recipe=replace(study().recipe, formulation=form))
-    (result,) = results_of([PointData({"V": 1.0}, run)], smoothed)
+    (result,) = results_of([OperatingRecord({"V": 1.0}, run)], smoothed)
     for name, value in TRUTHS[0].items():
         fitted, refined = (result.fits[f"constrained{end}"].estimates for end in ("", "_refined"))
         assert abs(fitted[name].value / value - 1.0) == pytest.approx(missed, rel=0.15)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.frames import OFF_SCALE, STOPS, exits, framing
-from ep2sindy.figures.phase import phase_figure
 from ep2sindy.figures.series import (
     derivative_figure,
+    phase_figure,
     spectrum_figure,
     trajectory_figure,
 )
+from ep2sindy.figures.style import OFF_SCALE, STOPS, exits, framing
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel

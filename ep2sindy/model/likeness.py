@@ -18,6 +18,7 @@ from ep2sindy.signals.attractor import (
     spectrum_distance,
     waveform_errors,
 )
+from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
 from ep2sindy.signals.wander import statistics_wander
 
 LONG = 8.0  # periods of a record whose first half may be left out as a transient
@@ -25,7 +26,6 @@ REPEATS = 0.9  # of the variance, that the waveform of a cycle explains; of chao
 # Times what the spectra of quarters are apart: they lack the slow bands, in which a record that
 # does not repeat itself wanders most.
 SPECTRUM_WANDERS = 2.0
-DEAD = 0.1  # of the data's spread: a state that varies less in the second half has died out
 
 
 class Verdict(StrEnum):
@@ -40,7 +40,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Bounds:
+class FreeRunBounds:
     """How close a model that lives stays to the data.
 
     frequency, amplitude: relative error of the frequency and of each state's standard deviation.
@@ -76,7 +76,7 @@ def deviation(
     f_error: float,
     amplitude_ratio: Float[np.ndarray, " n_states"],
     waveform_error: Float[np.ndarray, " n_states"],
-    bounds: Bounds,
+    bounds: FreeRunBounds,
 ) -> float:
     """The largest from the data's cycle, in units of its bound; NaN where there is none."""
     return float(
@@ -119,7 +119,7 @@ class Record:
     def excursion(self, states: Float[np.ndarray, "_ n_states"]) -> float:
         return float((np.abs(states - self.states.mean(axis=0)) / self.std).max())
 
-    def likeness(self, states: Float[np.ndarray, "_ n_states"], bounds: Bounds) -> Likeness:
+    def likeness(self, states: Float[np.ndarray, "_ n_states"], bounds: FreeRunBounds) -> Likeness:
         """Of a run at the times t; one with fewer samples has diverged."""
         nothing = np.full(states.shape[1], np.nan)
         by_state = dict.fromkeys(("amplitude_ratio", "waveform_error", "distribution"), nothing)
@@ -131,7 +131,7 @@ class Record:
         by_state["amplitude_ratio"] = late.std(axis=0) / self.std
         spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
         middle = len(states) // 2
-        if (states[middle:].std(axis=0) < DEAD * self.states[middle:].std(axis=0)).all():
+        if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
             return Likeness(Verdict.DIES_OUT, np.nan, spectrum, by_state)
         if not self._repeats and self._is_alike(by_state["distribution"], spectrum, bounds):
             return Likeness(Verdict.LIVES, np.nan, spectrum, by_state)
@@ -155,13 +155,13 @@ class Record:
         return self._repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
     def _with_period(
-        self, f_error: float, amplitude: np.ndarray, waveform: np.ndarray, bounds: Bounds
+        self, f_error: float, amplitude: np.ndarray, waveform: np.ndarray, bounds: FreeRunBounds
     ) -> Verdict:
         if deviation(0.0, amplitude, waveform, bounds) > 1.0:
             return Verdict.WRONG_CYCLE
         return Verdict.LIVES if abs(f_error) <= bounds.frequency else Verdict.SLIPS
 
-    def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: Bounds) -> bool:
+    def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: FreeRunBounds) -> bool:
         """Whether a run is about as near to the record as its quarters are to each other."""
         apart, apart_spectrum = statistics_wander(self.t, self.states)
         near = (distribution <= np.maximum(bounds.distribution, apart)).all()

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ep2sindy.machine.files import sweep, write_bytes, write_json, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.picture import DPI
+from ep2sindy.runtime.files import sweep, write_bytes, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

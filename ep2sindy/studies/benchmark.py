@@ -20,11 +20,15 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Finding, Recipe
-from ep2sindy.figures.attractors import Identified, attractor_figure
-from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure, merit_table
+from ep2sindy.figures.identified import (
+    COUNTS,
+    MERITS,
+    Identified,
+    attractor_figure,
+    benchmark_figure,
+    merit_table,
+)
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Workers, rows_in_order
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import (
     Block,
@@ -37,6 +41,8 @@ from ep2sindy.report.document import (
     places,
 )
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers, rows_in_order
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.studies.study import Count, Deferred, Levels, Names
 from ep2sindy.synthetic.draws import DRAWS, check_systems, realization
 from ep2sindy.synthetic.systems import System

@@ -17,13 +17,13 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.windows import loss_against_window_figure
 from ep2sindy.library.library import polynomial
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import (

@@ -18,13 +18,12 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.own import own_module
-from ep2sindy.machine.progress import Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import Progress, counted
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import first_and_last
@@ -42,6 +41,7 @@ from ep2sindy.studies.views import (
     shown_equation,
     trajectories,
 )
+from ep2sindy.trust.user_code import load_user_module
 
 FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
 THESIS = "The same with the thesis's terms, fitted to these data."
@@ -210,7 +210,7 @@ def _registered(text: str) -> str:
         return text
     module, name = found["module"], found["name"]
     try:
-        own_module(module)
+        load_user_module(module)
     except ImportError as error:
         raise ValueError(
             f"functions may name one of your own as MODULE.NAME: {text!r} came, and {error}; the "

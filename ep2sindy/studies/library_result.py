@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import assemble_model
 from ep2sindy.discovery.discover import Discovery
-from ep2sindy.discovery.last_fit import assemble_model
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.equations import equation_text

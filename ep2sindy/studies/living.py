@@ -19,14 +19,14 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures import living as figures
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds, Verdict
+from ep2sindy.model.likeness import FreeRunBounds, Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
@@ -79,9 +79,9 @@ class LivingSearch:
         return discover(train, library, own, seed=rng, progress=progress)
 
     @property
-    def bounds(self) -> Bounds:
+    def bounds(self) -> FreeRunBounds:
         """What its rule calls living."""
-        return getattr(self.selection, "bounds", Bounds())
+        return getattr(self.selection, "bounds", FreeRunBounds())
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,24 +17,23 @@ import xarray as xr
 
 from ep2sindy.data.fields import SPACE
 from ep2sindy.data.netcdf import write_netcdf
-from ep2sindy.discovery.blocks import Kept, blocks_of
-from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.discovery.regimes import UNSURE, Regimes, regimes, spread
+from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
 from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regime_map
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
-from ep2sindy.machine.files import fingerprint
-from ep2sindy.machine.own import own_source
-from ep2sindy.machine.parallel import Workers
-from ep2sindy.machine.progress import Advance
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.files import fingerprint
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.runtime.progress import Advance
 from ep2sindy.studies.simulated import say_simulation
 from ep2sindy.studies.source import FieldSource, say_field
 from ep2sindy.studies.study import A_LIST, Count, Names
 from ep2sindy.thruster.parameters import Thruster
+from ep2sindy.trust.user_code import own_source
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # What does not change the result of a point, and may differ when a broken run is taken up.
@@ -108,7 +107,7 @@ class Study:
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(run.seed)
         with run.progress(None, "", "regimes"):
-            found = regimes(result, rng=rng, max_regimes=self.max_regimes)
+            found = find_regimes(result, rng=rng, max_regimes=self.max_regimes)
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
         write_netcdf(result, run.folder.path / "pointwise.nc", encoding=packed)

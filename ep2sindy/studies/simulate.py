@@ -20,11 +20,11 @@ import xarray as xr
 
 from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
-from ep2sindy.machine.files import WriteError
-from ep2sindy.machine.parallel import Workers
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures, places
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.files import WriteError
+from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.spectrum import power_spectrum
 from ep2sindy.studies.simulated import (
     compile_kernels,

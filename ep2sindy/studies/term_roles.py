@@ -13,12 +13,12 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Constraint, Relation, constraint, parse_relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds
+from ep2sindy.model.likeness import FreeRunBounds
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.studies.living import start_of, two_periods
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def term_roles(
     train: Trajectory,
     held: Trajectory,
     compared: Compared,
-    bounds: Bounds,
+    bounds: FreeRunBounds,
     *,
     length_m: float | None,
     progress: Progress = SILENT,
@@ -175,7 +175,7 @@ def _run(
     relations: Sequence[Relation],
     train: Trajectory,
     held: Trajectory,
-    bounds: Bounds,
+    bounds: FreeRunBounds,
     progress: Progress,
     *,
     window: int | None,

@@ -35,7 +35,7 @@ from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, p
 from ep2sindy.report.run import Run
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
-from ep2sindy.signals.trace import LEAST_PERIODS, Trace, trace
+from ep2sindy.signals.trace import LEAST_PERIODS, Trace, from_one_signal
 from ep2sindy.studies.library_result import Row, candidate_rows
 from ep2sindy.studies.living import cycle_of
 from ep2sindy.studies.source import Source, data_summary
@@ -104,7 +104,7 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         data = self._sampled(run)
-        signal = trace(data, decimate=self.decimate, detrend=self.detrend)
+        signal = from_one_signal(data, decimate=self.decimate, detrend=self.detrend)
         for text in signal.done:
             run.say(f"{signal.name}: {text}")
         for text in signal.advice:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures import phase, series
+from ep2sindy.figures import series
 from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
@@ -97,7 +97,7 @@ def run_figures(
         )
     if len(plane := data.state_names[:2]) > 1:
         drawn["phase"] = partial(
-            phase.phase_figure, data, rollouts, plane=plane, duration_s=span, verdicts=verdicts
+            series.phase_figure, data, rollouts, plane=plane, duration_s=span, verdicts=verdicts
         )
     return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
 

@@ -13,18 +13,18 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.last_fit import assemble_model, reweighted
+from ep2sindy.discovery.choice import assemble_model, reweighted
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
-from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
 from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import Terms, equation_texts, terms_of
@@ -204,7 +204,7 @@ def fitted_terms(
     setting: Setting,
     *,
     rng: np.random.Generator,
-) -> dict[str, tuple[Candidate, Regression]]:
+) -> dict[str, tuple[Candidate, RegressionRows]]:
     """Fit given terms, state by state, and keep the rows that they were fitted to.
 
     Raises ValueError as the form's `assemble` and `fit_support` do.
@@ -275,7 +275,7 @@ def _half_widths(
     }
 
 
-def _r2_own_rows(candidate: Candidate, problem: Regression) -> float:
+def _r2_own_rows(candidate: Candidate, problem: RegressionRows) -> float:
     columns = [problem.library.index(name) for name in candidate.terms]
     prediction = candidate.coef[None] @ problem.theta[:, columns].T
     truth = problem.target[:, problem.equations.index(candidate.equation)]

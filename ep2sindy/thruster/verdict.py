@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
+from ep2sindy.signals.oscillation import SIMULATED, oscillation
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.thruster.parameters import OperatingPoint
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, exact (CGPM 1901)
 TRANSIT_HZ = 60e3  # ions cross the domain in some microseconds; the breathing mode is slower
-STEADY_SHARE = 0.02  # of the mean: a current that varies less is steady
-DECAYED_SHARE = 0.7  # of the amplitude earlier in the record
+BREATHING = replace(SIMULATED, max_Hz=TRANSIT_HZ)
 STRONG_SHARE = 0.9  # of the mean: a larger standard deviation is that of the strong cycle
 
 
@@ -29,15 +30,7 @@ def judge_status(current: Float[np.ndarray, " time"], sample_s: float) -> str:
     Some sets oscillate for 2 ms and die by 3 ms: a verdict needs 4 ms or more of simulated time.
     """
     late = current[current.size // 2 :]
-    blocks = np.array_split(late, 4)
-    first, last = blocks[0].std(), blocks[-1].std()
-    if last < STEADY_SHARE * abs(blocks[-1].mean()):
-        return "steady"
-    if last < DECAYED_SHARE * first:
-        return "decaying"
-    if dominant_frequency(sample_s * np.arange(late.size), late) > TRANSIT_HZ:
-        return "transit"
-    return "oscillating"
+    return str(oscillation(sample_s * np.arange(late.size), late[:, None], BREATHING))
 
 
 def diagnose(field: xr.Dataset, *, diverged: bool) -> dict[str, Any]:

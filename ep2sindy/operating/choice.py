@@ -1,0 +1,287 @@
+"""The law of one cycle's records: its structure and order, points left out, and a map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.shared_support import discover_jointly
+from ep2sindy.library.library import Library
+from ep2sindy.operating.fit import (
+    LeftOut,
+    OperatingFit,
+    Structure,
+    Windows,
+    left_out,
+    operating_fit,
+)
+from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.map import MapPoint, law_map
+from ep2sindy.operating.records import (
+    OperatingRecord,
+    branches_of,
+    check_records,
+    measured_left_out,
+)
+from ep2sindy.refinement.law import TiedRefinement
+from ep2sindy.regression.differential import Differential
+from ep2sindy.runtime.parallel import Serial, Workers, collect
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.search.searches import BestSubset
+
+MOST_PARAMETERS = 2  # of a map that can be drawn
+N_TOGETHER = 24  # points of a map that are computed as one piece: the records travel with each
+CLOSE = 0.05  # of its bound: a deviation that is no reason for another term
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A structure with laws of one degree, weighted by information, at points left out.
+
+    errors: by record, the largest deviation from its cycle in units of its bound, ten at most, and
+    no less than a twentieth: what is closer buys no term.
+    """
+
+    fit: OperatingFit
+    degree: int
+    found: Sequence[LeftOut]
+
+    @property
+    def n_numbers(self) -> int:
+        return self.fit.n_coefs * len(self.fit.functions(self.degree))
+
+    @property
+    def errors(self) -> np.ndarray:
+        return np.maximum([each.error for each in self.found], CLOSE)
+
+
+def candidate_structures(
+    records: Sequence[OperatingRecord],
+    library: Library,
+    *,
+    max_terms: int,
+    progress: Progress = SILENT,
+) -> list[Structure]:
+    """The best support of every size from two on for each equation, in all combinations.
+
+    One search over all records: a term is in or out everywhere. Rows are those of the derivative.
+    """
+    recipe = Recipe(formulation=Differential(), search=BestSubset(max_terms=max_terms))
+    runs = {record.label: [record.run] for record in records}
+    found = discover_jointly(runs, library, recipe, progress=progress)
+    sizes = {
+        state: [support for support in front.supports if len(support) >= 2]
+        for state, front in found.fronts.items()
+    }
+    return [dict(zip(sizes, chosen, strict=True)) for chosen in product(*sizes.values())]
+
+
+def tried(
+    records: Sequence[OperatingRecord],
+    library: Library,
+    structures: Sequence[Structure],
+    degrees: Sequence[int],
+    *,
+    windows: Windows,
+    seed: int = 0,
+    workers: Workers | None = None,
+    progress: Progress = SILENT,
+) -> list[Tried]:
+    """Every structure with every degree that leaves a point over.
+
+    Raises ValueError where the records suffice for none.
+    """
+    one = partial(
+        _tried, records=records, library=library, degrees=degrees, windows=windows, seed=seed
+    )
+    stage = progress.stage(len(structures), "structure", "laws at points left out")
+    by_structure = collect(workers or Serial(), one, structures, stage)
+    found = [trial for trials in by_structure for trial in trials]
+    if not found:
+        n = len(records)
+        raise ValueError(
+            f"{n} operating points suffice for no law of degree {min(degrees)}, each left out in "
+            "turn: add points, or lower the degree"
+        )
+    return found
+
+
+def chosen(found: Sequence[Tried]) -> Tried:
+    """The one of fewest numbers whose mean error is not told apart from the least.
+
+    That is within one standard error of the difference, point by point.
+    """
+    best = min(found, key=lambda each: (float(each.errors.mean()), each.n_numbers))
+    near = []
+    for each in found:
+        apart = each.errors - best.errors
+        reach = apart.std(ddof=1) / np.sqrt(len(apart)) if len(apart) > 1 else 0.0
+        if apart.mean() <= reach:
+            near.append(each)
+    return min(near, key=lambda each: (each.n_numbers, float(each.errors.mean())))
+
+
+def _tried(
+    structure: Structure,
+    *,
+    records: Sequence[OperatingRecord],
+    library: Library,
+    degrees: Sequence[int],
+    windows: Windows,
+    seed: int,
+) -> list[Tried]:
+    fit = operating_fit(records, library, structure, windows=windows, seed=seed)
+    found = []
+    for degree in degrees:
+        try:
+            found.append(Tried(fit, degree, left_out(fit, fit.functions(degree))))
+        except ValueError:
+            continue  # too few points for this degree
+    return found
+
+
+@dataclass(frozen=True)
+class Searched:
+    """Structures to try where none is given: supports of two to `max_terms` terms an equation."""
+
+    degree: int
+    max_terms: int
+
+
+@dataclass(frozen=True, eq=False)
+class How:
+    """How the law of a branch is found.
+
+    structure: None searches. degrees: of the polynomials, tried in turn. n_map: points of the map
+    along each parameter.
+    """
+
+    library: Library
+    structure: Structure | None
+    searched: Searched
+    degrees: Sequence[int]
+    windows: Windows
+    n_map: int
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """One cycle's records and their law.
+
+    smooth: relative errors of frequency and amplitude, interpolated themselves at points left out
+    by the law's functions. at_points: the law's models at all points of the study; map: over a
+    grid that encloses these, empty for more than two parameters.
+    """
+
+    name: str
+    trials: Sequence[Tried]
+    choice: Tried
+    law: OperatingLaw
+    tied: TiedRefinement
+    left_out: Sequence[LeftOut]
+    smooth: tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]
+    at_points: Sequence[MapPoint]
+    map: Sequence[MapPoint]
+
+    @property
+    def fit(self) -> OperatingFit:
+        return self.choice.fit
+
+
+def grouped(records: Sequence[OperatingRecord]) -> dict[str, list[OperatingRecord]]:
+    """Records by cycle: all, or strong and weak."""
+    check_records(records)
+    number = branches_of(records)
+    if not number.any():
+        return {"all": list(records)}
+    names = {"strong": 0, "weak": 1}
+    return {
+        name: [r for r, n in zip(records, number, strict=True) if n == which]
+        for name, which in names.items()
+    }
+
+
+def branch_of(
+    name: str,
+    records: Sequence[OperatingRecord],
+    points: Sequence[Mapping[str, float]],
+    how: How,
+    workers: Workers,
+    *,
+    progress: Progress = SILENT,
+) -> Branch:
+    """Find the law of one cycle's records, and follow it over points and a map.
+
+    Raises ValueError where the records do not suffice for a law.
+    """
+    check_records(records)
+    structures = (
+        [how.structure] if how.structure is not None else _structures(records, how, progress)
+    )
+    trials = tried(
+        records,
+        how.library,
+        structures,
+        how.degrees,
+        windows=how.windows,
+        seed=how.seed,
+        workers=workers,
+        progress=progress,
+    )
+    choice = chosen(trials)
+    functions = choice.fit.functions(choice.degree)
+    law, found = choice.fit.tied(functions, progress=progress)
+    grid = map_points(points, how.n_map)
+    return Branch(
+        name=name,
+        trials=trials,
+        choice=choice,
+        law=law,
+        tied=found,
+        left_out=left_out(choice.fit, functions, start=law, workers=workers, progress=progress),
+        smooth=measured_left_out(records, choice.fit.basis(functions)),
+        at_points=_followed(law, records, points, workers, progress),
+        map=_followed(law, records, grid, workers, progress),
+    )
+
+
+def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, float]]:
+    """A grid over the ranges of the points, the last parameter varying fastest."""
+    names = list(points[0])
+    if len(names) > MOST_PARAMETERS:
+        return []
+    values = np.array([[point[name] for name in names] for point in points])
+    axes = [np.linspace(low, high, n).tolist() for low, high in zip(*_ends(values), strict=True)]
+    return [dict(zip(names, each, strict=True)) for each in product(*axes)]
+
+
+def _ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return values.min(axis=0), values.max(axis=0)
+
+
+def _structures(
+    records: Sequence[OperatingRecord], how: How, progress: Progress
+) -> list[Structure]:
+    return candidate_structures(
+        records, how.library, max_terms=how.searched.max_terms, progress=progress
+    )
+
+
+def _followed(
+    law: OperatingLaw,
+    records: Sequence[OperatingRecord],
+    points: Sequence[Mapping[str, float]],
+    workers: Workers,
+    progress: Progress,
+) -> list[MapPoint]:
+    pieces = [points[first : first + N_TOGETHER] for first in range(0, len(points), N_TOGETHER)]
+    stage = progress.stage(len(points), "point", "map of the law")
+    maps = collect(workers, partial(law_map, law, records), pieces, stage, size=len)
+    return [point for piece in maps for point in piece]

@@ -1,0 +1,259 @@
+"""Laws of the operating point, fitted to records, and judged at points that are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.constraints.fit import constrained_fit
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.likeness import FreeRunBounds, deviation
+from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.law import OperatingLaw, in_hull
+from ep2sindy.operating.records import (
+    OperatingRecord,
+    check_records,
+    values_of,
+)
+from ep2sindy.refinement.law import TiedRefinement, refine_tied
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.refine import Refinement, refine_many
+from ep2sindy.refinement.weighted_law import Basis, information_of, weighted_law
+from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.runtime.parallel import Serial, Workers, collect
+from ep2sindy.runtime.progress import Progress, as_progress
+
+MOST = 10.0  # deviations count no more, however far a run is off, or where there is none
+
+Structure = Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """How much of every record is followed: windows of so many periods of the median frequency."""
+
+    n_windows: int = 20
+    periods: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.n_windows < 1 or not self.periods > 0.0:
+            raise ValueError(f"windows must be one or more, of positive length: {self} came")
+
+    def samples(self, records: Sequence[OperatingRecord]) -> int:
+        each = [self.periods / (r.cycle.frequency_Hz * r.run.dt_s) for r in records]
+        wanted = round(float(np.median(each))) + 1
+        return min(wanted, *(record.run.n_samples // 2 for record in records))
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingFit:
+    """Records of one branch, each refined alone with the same terms; laws are made of these.
+
+    structure: state -> terms. fits: by record.
+    """
+
+    records: Sequence[OperatingRecord]
+    structure: Structure
+    fits: Sequence[Refinement]
+    windows: Windows
+    seed: int
+
+    @property
+    def n_coefs(self) -> int:
+        return sum(len(terms) for terms in self.structure.values())
+
+    @cached_property
+    def coefficients(self) -> Float[np.ndarray, "records coefs"]:
+        return np.array([_values(fit.model) for fit in self.fits])
+
+    @cached_property
+    def information(self) -> Float[np.ndarray, "records coefs coefs"]:
+        """Of each record's coefficients; zero where its refinement came to nothing."""
+        nothing = np.zeros((self.n_coefs, self.n_coefs))
+        return np.stack(
+            [
+                nothing if f.covariance_naive is None else information_of(f.covariance_naive)
+                for f in self.fits
+            ]
+        )
+
+    @property
+    def own_runs(self) -> list[FreeRun]:
+        """Every point run freely with coefficients of its own: what no law can better by much."""
+        pairs = zip(self.fits, self.records, strict=True)
+        return [free_run(fit.model, record.from_slowest) for fit, record in pairs]
+
+    def without(self, number: int) -> OperatingFit:
+        others = [k for k in range(len(self.records)) if k != number]
+        return replace(
+            self,
+            records=[self.records[k] for k in others],
+            fits=[self.fits[k] for k in others],
+        )
+
+    def basis(self, functions: Library) -> Float[np.ndarray, "records functions"]:
+        return functions.evaluate(values_of(self.records))
+
+    def functions(self, degree: int) -> Library:
+        """Polynomials of the parameters; ValueError where the records do not suffice."""
+        found = polynomial(list(self.records[0].parameters), degree=degree)
+        Basis(self.basis(found))
+        return found
+
+    def weighted(self, functions: Library) -> OperatingLaw:
+        """The law through the separate refinements, each weighted by its information."""
+        law = weighted_law(self.coefficients, self.information, self.basis(functions))
+        return self._law(functions, law, None, "weighted")
+
+    def tied(
+        self,
+        functions: Library,
+        *,
+        start: OperatingLaw | None = None,
+        progress: Progress | bool = False,
+    ) -> tuple[OperatingLaw, TiedRefinement]:
+        """The law refined over all records at once, with intervals.
+
+        start: a law that is close; the weighted one, and all stages, otherwise.
+        """
+        near = self.weighted(functions) if start is None else start
+        window = self.windows.samples(self.records)
+        method = MultipleShooting()
+        if start is not None:
+            method = MultipleShooting(first_block=window, tolerance=1e-4)
+        found = refine_tied(
+            [fit.model for fit in self.fits],
+            [[record.run] for record in self.records],
+            self.basis(functions),
+            window=window,
+            n_windows=self.windows.n_windows,
+            start=near.coef,
+            method=method,
+            rng=self.seed,
+            progress=progress,
+        )
+        return self._law(functions, found.law, found.covariance, "tied"), found
+
+    def _law(
+        self,
+        functions: Library,
+        law: Float[np.ndarray, "coefs functions"],
+        covariance: Float[np.ndarray, "_ _"] | None,
+        how: str,
+    ) -> OperatingLaw:
+        model = self.fits[0].model
+        return OperatingLaw(
+            functions=functions,
+            library=model.library,
+            states=tuple(model.states),
+            coefficients=tuple((s, term) for s in model.states for term in model.terms(s)),
+            coef=law,
+            points=values_of(self.records),
+            covariance=covariance,
+            units=model.units,
+            provenance={"law": f"{how}, {len(self.records)} points"},
+        )
+
+
+def operating_fit(
+    records: Sequence[OperatingRecord],
+    library: Library,
+    structure: Structure,
+    *,
+    windows: Windows | None = None,
+    seed: int = 0,
+    progress: Progress | bool = False,
+) -> OperatingFit:
+    """Refine every record on its own with the same terms, from least squares of the derivative.
+
+    Raises ValueError for records whose parameters do not vary or whose states differ, or a state
+    or term that is not there.
+    """
+    check_records(records)
+    states = list(records[0].run.state_names)
+    if set(structure) != set(states):
+        raise ValueError(f"a structure must have terms for each of {states}: {structure} came")
+    windows = windows or Windows()
+    held = constraint(library, {state: structure[state] for state in states})
+    rows = Differential(split=RandomSplit(test_fraction=0.0))
+    starts = []
+    for record in records:
+        problems = rows.assemble([record.run], library, rng=np.random.default_rng(seed))
+        starts.append(constrained_fit(problems, held, units=record.run.units))
+    fits = refine_many(
+        starts,
+        [[record.run] for record in records],
+        window=windows.samples(records),
+        n_windows=windows.n_windows,
+        n_reweights=0,  # states count by their standard deviation, as they are judged
+        rng=seed,
+        progress=progress,
+    )
+    whole = {state: list(structure[state]) for state in states}
+    return OperatingFit(records, whole, fits, windows, seed)
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """A point read off the law of the others, and run freely from one sample of its record.
+
+    inside: whether the others enclose it.
+    """
+
+    record: OperatingRecord
+    run: FreeRun
+    inside: bool
+
+    @property
+    def error(self) -> float:
+        """Largest deviation from the record's cycle, in units of its bound; at most ten."""
+        run = self.run
+        amplitude, waveform = (
+            np.array(list(each.values())) for each in (run.amplitude_ratio, run.waveform_error)
+        )
+        found = deviation(run.f_error, amplitude, waveform, FreeRunBounds())
+        return MOST if np.isnan(found) else min(found, MOST)
+
+
+def left_out(
+    fit: OperatingFit,
+    functions: Library,
+    *,
+    start: OperatingLaw | None = None,
+    workers: Workers | None = None,
+    progress: Progress | bool = False,
+) -> list[LeftOut]:
+    """Every point in turn by the law of the others: weighted, or tied, beginning at `start`.
+
+    Raises ValueError where points without one do not suffice for the law.
+    """
+    for k, record in enumerate(fit.records):
+        try:
+            Basis(fit.without(k).basis(functions))
+        except ValueError as error:
+            raise ValueError(f"{record.label} cannot be left out: {error}") from error
+    one = partial(_left_out, fit=fit, functions=functions, start=start)
+    n_points = len(fit.records)
+    stage = as_progress(progress).stage(n_points, "point", "law without a point")
+    return collect(workers or Serial(), one, range(n_points), stage)
+
+
+def _left_out(
+    number: int, *, fit: OperatingFit, functions: Library, start: OperatingLaw | None
+) -> LeftOut:
+    record, others = fit.records[number], fit.without(number)
+    law = others.weighted(functions) if start is None else others.tied(functions, start=start)[0]
+    model = law.model_at(record.parameters, extrapolate=True)
+    at = values_of([record])[0]
+    return LeftOut(record, free_run(model, record.from_slowest), in_hull(law.points, at))
+
+
+def _values(model: SparseModel) -> list[float]:
+    return [value for state in model.states for value in model.terms(state).values()]

@@ -1,0 +1,443 @@
+"""A model whose coefficients are functions of the operating point, with intervals and bounds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import block_diag
+from scipy.optimize import nnls
+from scipy.special import ndtri
+from scipy.stats import f as f_distribution
+
+from ep2sindy.data.scales import column_norms, zero_to_one
+from ep2sindy.data.trajectory import read_only
+from ep2sindy.discovery.shared_support import JointDiscovery, JointFront
+from ep2sindy.library.equations import equation_text
+from ep2sindy.library.functions import UnknownFunctionError
+from ep2sindy.library.library import Library, named_terms
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.scores import r2
+from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
+from ep2sindy.operating.records import point_label
+from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.search.front import ParetoFront
+from ep2sindy.selection.rule import FLOOR
+
+FORMAT = "ep2sindy.OperatingLaw/1"
+
+# Steps of weighting and correction of the last fit, as `reweighted` takes them.
+N_STEPS = 8
+
+INSIDE = 1e-6  # a point this far outside the hull, in ranges of the parameters, lies on its edge
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingLaw:
+    """One structure, coefficients by law: coef[k] at a point = coef[k] @ functions(parameters).
+
+    functions: of the parameters; library: of the states. coefficients: (state, term) of each row
+    of coef, in SI. covariance: of coef.ravel(), None where it is not known. points: the operating
+    points that it was fitted to, columns in the order of the functions' variables.
+    """
+
+    functions: Library
+    library: Library
+    states: tuple[str, ...]
+    coefficients: tuple[tuple[str, str], ...]
+    coef: Float[np.ndarray, "coefs functions"]
+    points: Float[np.ndarray, "points parameters"]
+    covariance: Float[np.ndarray, "_ _"] | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coef", read_only(self.coef))
+        object.__setattr__(self, "points", read_only(self.points))
+        object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
+        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        shape = (len(self.coefficients), len(self.functions))
+        if self.coef.shape != shape or not np.isfinite(self.coef).all():
+            raise ValueError(
+                "a law must have a finite number for every coefficient and function: shape "
+                f"{self.coef.shape} came for {shape}"
+            )
+        for state, term in self.coefficients:
+            if state not in self.states or term not in self.library.names:
+                raise ValueError(
+                    f"a law's coefficients must be of {list(self.states)} and "
+                    f"{list(self.library.names)}: {term} of {state} came"
+                )
+        if self.points.shape[1:] != (len(self.parameters),) or not len(self.points):
+            raise ValueError(
+                f"points must have a column for each of {list(self.parameters)}: shape "
+                f"{self.points.shape} came"
+            )
+        if not np.isfinite(self.points).all():
+            raise ValueError(f"points must be finite: {self.points.tolist()} came")
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", read_only(self.covariance))
+            if self.covariance.shape != (self.coef.size, self.coef.size):
+                raise ValueError(
+                    f"the covariance must be that of {self.coef.size} numbers: shape "
+                    f"{self.covariance.shape} came"
+                )
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return tuple(self.functions.variables)
+
+    def model_at(
+        self, parameters: Mapping[str, float], *, extrapolate: bool = False
+    ) -> SparseModel:
+        """The model at an operating point, which need not be among those of the fit.
+
+        Raises ValueError unless `parameters` has a finite value for each of the law's, or outside
+        the convex hull of the points that it was fitted to, but for extrapolate=True.
+        """
+        values = self._values(parameters)
+        if not extrapolate and not self._holds(values):
+            raise ValueError(
+                f"{point_label(parameters)} lies outside the points that this law was fitted to, "
+                f"{self._ranges()}: pass extrapolate=True to read it off the law all the same"
+            )
+        functions = self.functions.evaluate(values[None])[0]
+        coef, covariance = np.zeros((len(self.library), len(self.states))), None
+        places = [(self.library.index(term), self.states.index(s)) for s, term in self.coefficients]
+        for place, value in zip(places, self.coef @ functions, strict=True):
+            coef[place] = value
+        if self.covariance is not None:
+            spread = np.kron(np.eye(len(self.coefficients)), functions)
+            order = [k for k in np.lexsort(np.transpose(places)) if coef[places[k]] != 0.0]
+            covariance = (spread @ self.covariance @ spread.T)[np.ix_(order, order)]
+        provenance = {**self.provenance, "point": point_label(parameters)}
+        return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
+
+    def is_inside(self, parameters: Mapping[str, float]) -> bool:
+        """Whether a point lies in the convex hull of those of the fit."""
+        return self._holds(self._values(parameters))
+
+    def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
+        """(state, term) -> function -> lower and upper bound of its number, for Gaussian errors.
+
+        Raises ValueError for a law without covariance.
+        """
+        if self.covariance is None:
+            raise ValueError("intervals need a covariance: this law has none; fit it tied")
+        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(self.coef.shape)
+        reach = ndtri(0.5 + 0.5 * level) * std
+        return {
+            pair: {
+                name: (low, high)
+                for name, low, high in zip(
+                    self.functions.names, (row - r).tolist(), (row + r).tolist(), strict=True
+                )
+            }
+            for pair, row, r in zip(self.coefficients, self.coef, reach, strict=True)
+        }
+
+    def text(self, *, digits: int = 3) -> str:
+        """One line per coefficient: `n_i: n_n = 4.83e+03 + 12.1 V_d`."""
+        lines = []
+        for (state, term), row in zip(self.coefficients, self.coef.tolist(), strict=True):
+            by_function = dict(zip(self.functions.names, row, strict=True))
+            right = equation_text("c", by_function, digits=digits).partition("= ")[2]
+            lines.append(f"{state}: {term} = {right}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        head = (
+            f"OperatingLaw of {len(self.coefficients)} coefficients in {list(self.parameters)}, "
+            f"{self.coef.size} numbers, {len(self.points)} points"
+        )
+        return f"{head}\n{self.text()}"
+
+    def to_json(self) -> str:
+        """Everything in the law; floats in their shortest exact form."""
+        content = {
+            "format": FORMAT,
+            "parameters": list(self.parameters),
+            "functions": list(self.functions.names),
+            "variables": list(self.library.variables),
+            "library": list(self.library.names),
+            "states": list(self.states),
+            "coefficients": [list(pair) for pair in self.coefficients],
+            "coef": self.coef.tolist(),
+            "points": self.points.tolist(),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "units": dict(self.units),
+            "provenance": dict(self.provenance),
+        }
+        return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+    @staticmethod
+    def from_json(text: str) -> OperatingLaw:
+        """Inverse of `to_json`, exact. Raises ValueError for anything else."""
+        try:
+            content = read_json(text)
+            if content["format"] != FORMAT:
+                raise ValueError(f"format {content['format']!r}")
+            known = content["covariance"]
+            return OperatingLaw(
+                functions=named_terms(*(names_in(content[k]) for k in ("parameters", "functions"))),
+                library=named_terms(*(names_in(content[k]) for k in ("variables", "library"))),
+                states=tuple(names_in(content["states"])),
+                coefficients=tuple((state, term) for state, term in content["coefficients"]),
+                coef=np.array(content["coef"], dtype=np.float64),
+                points=np.array(content["points"], dtype=np.float64),
+                covariance=None if known is None else covariance_in(known),
+                units=texts_in(content["units"], "units"),
+                provenance=texts_in(content["provenance"], "provenance"),
+            )
+        except UnknownFunctionError:
+            raise  # the file is sound: a function must be registered before it is read
+        except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
+            raise ValueError(f"a law file must hold {FORMAT} JSON: {error}") from error
+
+    def save(self, path: str | Path) -> None:
+        write_text(Path(path), self.to_json())
+
+    @staticmethod
+    def load(path: str | Path) -> OperatingLaw:
+        return read_stored(Path(path), OperatingLaw.from_json)
+
+    def _values(self, parameters: Mapping[str, float]) -> Float[np.ndarray, " parameters"]:
+        names = list(self.parameters)
+        if set(parameters) != set(names):
+            raise ValueError(
+                f"an operating point must have {names}, and no other: {dict(parameters)} came"
+            )
+        values = np.array([float(parameters[name]) for name in names])
+        if not np.isfinite(values).all():
+            raise ValueError(f"an operating point must be finite: {dict(parameters)} came")
+        return values
+
+    def _holds(self, values: Float[np.ndarray, " parameters"]) -> bool:
+        return in_hull(self.points, values)
+
+    def _ranges(self) -> str:
+        ends = zip(self.parameters, self.points.min(axis=0), self.points.max(axis=0), strict=True)
+        return ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in ends)
+
+
+def in_hull(
+    points: Float[np.ndarray, "points parameters"], value: Float[np.ndarray, " parameters"]
+) -> bool:
+    """Whether a value is an average of points, with weights that are not negative."""
+    scale = zero_to_one(np.ptp(points, axis=0))
+    columns = np.vstack([((points - value) / scale).T, np.ones(len(points))])
+    target = np.append(np.zeros(points.shape[1]), 1.0)
+    return float(nnls(columns, target)[1]) <= INSIDE
+
+
+@dataclass(frozen=True, eq=False)
+class TiedEquation:
+    """One equation whose coefficients follow a law: coef_j(point) = sum_m coef_jm law_m(point).
+
+    coef: (support, law terms), in SI. r2_free, r2_tied: by point, on its training rows, with
+    coefficients of its own and with those of the law. F: growth of the residual per coefficient
+    given up, in variances of a row; p_value: the chance of more if the law holds, for rows with
+    independent Gaussian errors; both NaN if the law gives up none.
+    covariance: of the coefficients, row by row, where noise has been followed to them.
+    """
+
+    terms: tuple[str, ...]
+    coef: Float[np.ndarray, "support law_terms"]
+    r2_free: Mapping[str, float]
+    r2_tied: Mapping[str, float]
+    F: float
+    p_value: float
+    covariance: Float[np.ndarray, "coefs coefs"] | None
+
+
+@dataclass(frozen=True, eq=False)
+class TiedFit:
+    """Equations by state, and what they say at any operating point."""
+
+    law: Library
+    equations: Mapping[str, TiedEquation]
+    library: Library
+    units: Mapping[str, str]
+
+    def model_at(self, parameters: Mapping[str, float]) -> SparseModel:
+        """The model at one operating point, which need not be among those of the fit.
+
+        Raises ValueError unless `parameters` are exactly the variables of the law.
+        """
+        law = _law_terms(self.law, {"this point": parameters})[0]
+        coef = [dict(zip(e.terms, e.coef @ law, strict=True)) for e in self.equations.values()]
+        blocks = []
+        for equation in self.equations.values():
+            spread = np.kron(np.eye(len(equation.terms)), law)
+            if equation.covariance is not None:
+                blocks.append(spread @ equation.covariance @ spread.T)
+        return SparseModel(
+            library=self.library,
+            states=list(self.equations),
+            coef=coef_matrix(self.library, coef),
+            units=self.units,
+            provenance={"point": ", ".join(f"{k}={v:g}" for k, v in parameters.items())},
+            covariance=block_diag(*blocks) if len(blocks) == len(coef) else None,
+        )
+
+
+def tied_fit(
+    found: JointDiscovery, law: Library, *, parameters: Mapping[str, Mapping[str, float]]
+) -> TiedFit:
+    """Fit the chosen supports again, all points at once, their coefficients tied by a law.
+
+    coef_j(point) = sum_m coef_jm law_m(parameters of the point): one least squares per equation
+    with columns theta_j law_m. Rows are weighted by their covariance where it is known, and every
+    point by the residual variance of its free fit, so that neither units nor noise of one point
+    lead. Compare `r2_tied` to `r2_free` and see F: a law that does not hold costs R2 at the
+    points that depart from it. Rows that are not independent (`Differential`) make F too large.
+    parameters: point -> {variable of the law: value}, in any units.
+    Raises ValueError for points or variables that are missing or unknown, and for points that
+    cannot tell the terms of the law apart.
+    """
+    points = list(found.models)
+    if set(parameters) != set(points):
+        raise ValueError(
+            f"every point needs parameters, and no other: the points are {points}, parameters "
+            f"came for {list(parameters)}"
+        )
+    values = _law_terms(law, {point: parameters[point] for point in points})
+    _check_law(law, values, {point: parameters[point] for point in points})
+    model = found.models[points[0]]
+    return TiedFit(
+        law=law,
+        equations={
+            state: _tied(front, found, dict(zip(points, values, strict=True)))
+            for state, front in found.fronts.items()
+        },
+        library=model.library,
+        units=model.units,
+    )
+
+
+def _law_terms(
+    law: Library, parameters: Mapping[str, Mapping[str, float]]
+) -> Float[np.ndarray, "points law_terms"]:
+    for point, known in parameters.items():
+        if set(known) != set(law.variables) or not np.isfinite(list(known.values())).all():
+            raise ValueError(
+                f"{point!r} needs one finite value for each of {list(law.variables)}: "
+                f"{dict(known)} came"
+            )
+    return law.evaluate(
+        np.array([[float(known[v]) for v in law.variables] for known in parameters.values()])
+    )
+
+
+def _check_law(
+    law: Library,
+    values: Float[np.ndarray, "points law_terms"],
+    parameters: Mapping[str, Mapping[str, float]],
+) -> None:
+    if len(values) < len(law):
+        raise ValueError(
+            f"a law of {len(law)} terms needs as many points: {len(values)} came; use a law of "
+            "fewer terms"
+        )
+    if np.linalg.matrix_rank(values / column_norms(values)) < len(law):
+        same = [v for v in law.variables if len({p[v] for p in parameters.values()}) == 1]
+        raise ValueError(
+            f"the points must tell the terms {list(law.names)} of the law apart: "
+            + (f"{same} do not vary" if same else "some are combinations of others there")
+            + "; leave some out"
+        )
+
+
+def _tied(
+    front: JointFront, found: JointDiscovery, law_at: Mapping[str, Float[np.ndarray, " law_terms"]]
+) -> TiedEquation:
+    """One least squares over the rows of all points."""
+    terms = found.chosen[front.equation]
+    fits = {
+        p: _FreeFit.of(each, front.supports.index(terms), terms) for p, each in front.points.items()
+    }
+    design = np.concatenate([np.kron(fit.theta, law_at[p][None]) for p, fit in fits.items()])
+    target = np.concatenate([fit.target for fit in fits.values()])
+    norms = column_norms(design)
+    columns = design / norms
+    solution, _, rank, _ = np.linalg.lstsq(columns, target)
+    if rank < len(norms):
+        raise ValueError(
+            f"too few points show the terms {list(terms)} of {front.equation!r} to tie them by a "
+            "law of this many terms; use a smaller law"
+        )
+    coef = (solution / norms).reshape(len(terms), len(next(iter(law_at.values()))))
+    root = np.linalg.inv(np.linalg.qr(columns, mode="r")) / norms[:, None]
+    growth = np.square(target - columns @ solution).sum() - sum(f.squares for f in fits.values())
+    n_given_up = sum(fit.n_terms for fit in fits.values()) - coef.size
+    n_left = len(target) - sum(fit.n_terms for fit in fits.values())
+    F = max(float(growth), 0.0) / n_given_up if n_given_up > 0 else np.nan
+    known = all(each.problem.noisy is not None for each in front.points.values())
+    return TiedEquation(
+        terms=terms,
+        coef=coef,
+        r2_free={
+            p: _r2(each, found.models[p].terms(front.equation)) for p, each in front.points.items()
+        },
+        r2_tied={
+            p: _r2(each, dict(zip(terms, coef @ law_at[p], strict=True)))
+            for p, each in front.points.items()
+        },
+        F=F,
+        p_value=float(f_distribution.sf(F, n_given_up, n_left)) if n_given_up > 0 else np.nan,
+        covariance=root @ root.T if known else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _FreeFit:
+    """Rows of one point, for coefficients in SI, whose own fit leaves residuals of variance 1.
+
+    n_terms: terms that the point determines. squares: of the residuals of its own fit.
+    """
+
+    theta: Float[np.ndarray, "rows support"]
+    target: Float[np.ndarray, " rows"]
+    n_terms: int
+    squares: float
+
+    @staticmethod
+    def of(front: ParetoFront, k: int, terms: Sequence[str]) -> _FreeFit:
+        problem, candidate = front.problem, front.candidates[k]
+        equation = problem.equations.index(front.equation)
+        scale = problem.coef_scale(equation)
+        theta, target = problem.train_theta, problem.train_target(equation)
+        if problem.noisy is not None:
+            coef = coef_matrix(problem.library, [candidate.coef_by_term])[:, 0] / scale
+            mask = np.isin(problem.term_names, candidate.terms)
+            white = whitened_rows(problem, mask, coef, n_steps=N_STEPS)
+            theta, target = white.theta, white.target
+        columns = [problem.library.index(name) for name in terms]
+        theta = theta[:, columns]
+        left = target - theta @ np.linalg.lstsq(theta, target)[0]
+        # Rows without noise: what is left is rounding, and no scale to judge by.
+        squares = max(float(left @ left), FLOOR * float(target @ target))
+        spread = np.sqrt(squares / max(len(target) - candidate.n_terms, 1))
+        return _FreeFit(
+            theta=theta / scale[columns] / spread,
+            target=target / spread,
+            n_terms=candidate.n_terms,
+            squares=float(left @ left) / spread**2,
+        )
+
+
+def _r2(front: ParetoFront, coef: Mapping[str, float]) -> float:
+    """R2 of SI coefficients on the training rows of one point."""
+    problem = front.problem
+    equation = problem.equations.index(front.equation)
+    scale = problem.coef_scale(equation)
+    scaled = coef_matrix(problem.library, [coef])[:, 0] / scale
+    truth, prediction = problem.train_target(equation), scaled @ problem.train_theta.T
+    return float(r2(truth=truth, prediction=prediction[None])[0])

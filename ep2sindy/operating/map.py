@@ -1,0 +1,157 @@
+"""What a law says over a map of operating points: cycles, fixed points, and where cycles end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+from scipy.optimize import root
+
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.stability import Stability, limit_cycle
+from ep2sindy.operating.law import OperatingLaw
+from ep2sindy.operating.records import OperatingRecord, values_of
+from ep2sindy.signals.oscillation import SIMULATED, relative_amplitude
+
+# Growth per period below which a fixed point counts as one that rests: e-fold in a hundred periods.
+NEUTRAL = 0.01
+
+STILL = SIMULATED.spread  # of the mean: what the simulator would call steady is no cycle
+
+N_PERIODS = 40  # of a run that may settle
+
+RESTING = 1e-8  # rates at a fixed point, of those half a standard deviation away
+
+STEP = 1e-6  # of central differences, in units of the states
+
+
+class Fate(StrEnum):
+    """What a model does at an operating point, started near the cycle of the nearest record."""
+
+    OSCILLATES = "oscillates"
+    RESTS = "rests"
+    DIVERGES = "diverges"
+
+
+@dataclass(frozen=True, eq=False)
+class MapPoint:
+    """A law's model at one operating point.
+
+    inside: of the hull of the records. frequency_Hz, relative_amplitude: of its cycle (standard
+    deviation over mean, root mean square over the states); NaN without one. growth_per_s: largest
+    real part of the fixed point's eigenvalues, in 1/s: positive where it is unstable; NaN where
+    there is none near. second: modulus of the second Floquet multiplier.
+    """
+
+    parameters: Mapping[str, float]
+    inside: bool
+    fate: Fate
+    frequency_Hz: float
+    relative_amplitude: float
+    growth_per_s: float
+    second: float
+
+
+def law_map(
+    law: OperatingLaw, records: Sequence[OperatingRecord], points: Sequence[Mapping[str, float]]
+) -> list[MapPoint]:
+    """The law's models at any operating points, each started as the nearest record begins."""
+    values = values_of(records)
+    scale = zero_to_one(np.ptp(values, axis=0))
+    found = []
+    for point in points:
+        at = np.array([point[name] for name in records[0].parameters])
+        nearest = int(np.argmin(np.linalg.norm((values - at) / scale, axis=1)))
+        found.append(_map_point(law, records[nearest], point))
+    return found
+
+
+def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, float]) -> MapPoint:
+    model = law.model_at(point, extrapolate=True)
+    period_s = 1.0 / record.cycle.frequency_Hz
+    start = record.run.states[record.slowest]
+    mean, frequency_Hz, amplitude, second = record.cycle.mean, np.nan, np.nan, np.nan
+    fate, late = _run(model, start, period_s)
+    if fate is Fate.OSCILLATES:
+        cycle = limit_cycle(model, late, period_s=period_s)
+        if cycle is None or cycle.stability is Stability.REPELLING:
+            fate = Fate.RESTS if cycle is None else Fate.DIVERGES
+        else:
+            mean = cycle.states.mean(axis=0)
+            frequency_Hz = 1.0 / cycle.period_s
+            amplitude = relative_amplitude(mean, cycle.states.std(axis=0))
+            second = float(np.abs(cycle.multipliers[1:]).max(initial=0.0))
+            fate = Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS
+    elif fate is Fate.RESTS:
+        mean = late
+    scale = zero_to_one(record.cycle.std)
+    positive = record.run.states.min(axis=0) > 0.0
+    fixed = fixed_point(model, mean, scale=scale, positive=positive)
+    growth = np.nan
+    if fixed is not None:
+        growth = float(eigenvalues(model, fixed, scale=scale).real.max())
+    if fate is Fate.DIVERGES and growth * period_s < -NEUTRAL:
+        # The nearest record's cycle lies beyond what rests here: the model is quiet.
+        fate = Fate.RESTS
+    return MapPoint(
+        parameters=dict(point),
+        inside=law.is_inside(point),
+        fate=fate,
+        frequency_Hz=float(frequency_Hz),
+        relative_amplitude=float(amplitude),
+        growth_per_s=growth,
+        second=second,
+    )
+
+
+def _run(
+    model: SparseModel, start: Float[np.ndarray, " n_states"], period_s: float
+) -> tuple[Fate, Float[np.ndarray, " n_states"]]:
+    """What becomes of a start, and where it is in the end."""
+    n = 50
+    t = np.linspace(0.0, N_PERIODS * period_s, N_PERIODS * n + 1)
+    run = model.simulate(t, start, blow_up=1e3, rtol=1e-7)
+    if run.diverged or not np.isfinite(run.states).all():
+        return Fate.DIVERGES, start
+    late = run.states[-5 * n :]
+    amplitude = relative_amplitude(late.mean(axis=0), late.std(axis=0))
+    return (Fate.OSCILLATES if amplitude >= STILL else Fate.RESTS), run.states[-1]
+
+
+def fixed_point(
+    model: SparseModel,
+    near: Float[np.ndarray, " n_states"],
+    *,
+    scale: Float[np.ndarray, " n_states"],
+    positive: Bool[np.ndarray, " n_states"],
+) -> Float[np.ndarray, " n_states"] | None:
+    """Where an autonomous model rests, by Newton's method from a state; None where there is none.
+
+    scale: of the states. positive: which of them must be, as densities.
+    """
+    rates = model.derivative(near + 0.5 * np.diag(scale), np.empty((len(near), 0)))
+    size = zero_to_one(np.abs(rates).max(axis=0))
+    found = root(lambda y: model.derivative(y * scale, np.empty(0)) / size, near / scale)
+    state: np.ndarray = found.x * scale
+    wrong_sign = bool((state[positive] <= 0.0).any())
+    return None if not np.abs(found.fun).max() < RESTING or wrong_sign else state
+
+
+def eigenvalues(
+    model: SparseModel,
+    state: Float[np.ndarray, " n_states"],
+    *,
+    scale: Float[np.ndarray, " n_states"],
+) -> Complex[np.ndarray, " n_states"]:
+    """Of the Jacobian of an autonomous model, in 1/s. scale: of the states."""
+    steps = STEP * np.diag(scale)
+    ahead, behind = (
+        model.derivative(state + sign * steps, np.empty((len(state), 0))) for sign in (1.0, -1.0)
+    )
+    jacobian = ((ahead - behind) / (2.0 * STEP)).T / scale[:, None]  # in units of the states
+    found: np.ndarray = np.linalg.eigvals(jacobian).astype(np.complex128)
+    return found

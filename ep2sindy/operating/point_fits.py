@@ -1,0 +1,393 @@
+"""One model at several operating points: its quantities and intervals, and what a search finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.constraints.fit import WeightedEquation, constrained_fit, weighted_equations
+from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.scales import column_norms
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.library.library import Library
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.scores import r2
+from ep2sindy.operating.law import TiedFit, tied_fit
+from ep2sindy.operating.quantities import (
+    FITTED,
+    REFINED,
+    SEARCHED,
+    Fitted,
+    PointResult,
+    Quantity,
+    drawn_estimates,
+    propagated_estimates,
+)
+from ep2sindy.operating.records import OperatingRecord, check_alike, naming
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.refine import refine
+from ep2sindy.refinement.windows import MIN_SAMPLES
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.parallel import Workers, collect
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
+from ep2sindy.search.searches import BestSubset
+from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
+from ep2sindy.signals.spectrum import dominant_frequency
+
+MIN_BLOCKS = 5  # in a record: fewer draws of blocks than these differ too little from another
+
+
+@dataclass(frozen=True)
+class Refining:
+    """What models are refined on: this many windows, each of so many periods."""
+
+    n_windows: int
+    periods: float
+    max_iter: int
+
+    def __post_init__(self) -> None:
+        if min(self.n_windows, self.max_iter) < 2 or self.periods <= 0.0:
+            raise ValueError(
+                "refinement needs two windows and iterations or more, and windows some length: "
+                f"n_windows={self.n_windows}, periods={self.periods}, max_iter={self.max_iter} came"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One way to fit the terms: under these relations, read as these quantities."""
+
+    constraint: Constraint
+    quantities: Mapping[str, Quantity]
+
+
+@dataclass(frozen=True, eq=False)
+class PointStudy:
+    """What is done at every operating point.
+
+    library: holds the terms of all cases. searched: the library that terms are looked for in, by
+    the recipe, whose formulation makes the rows of the fits as well.
+    Raises ValueError for a quantity whose coefficient a case does not have.
+    """
+
+    library: Library
+    cases: Mapping[str, Case]
+    bootstrap: TimeBootstrap
+    refining: Refining
+    searched: Library
+    recipe: Recipe
+
+    def __post_init__(self) -> None:
+        for case in self.cases.values():
+            for quantity in case.quantities.values():
+                quantity.place(case.constraint, self.library)
+
+    @property
+    def fits(self) -> dict[str, Case]:
+        """By name all fits of a point: every case, and its refinement."""
+        return {name + end: case for name, case in self.cases.items() for end in ("", REFINED)}
+
+
+def fit_points(
+    points: Sequence[OperatingRecord],
+    study: PointStudy,
+    *,
+    workers: Workers,
+    rng: np.random.Generator,
+    tell: Callable[[int, PointResult], None] = lambda number, result: None,
+    progress: Progress = SILENT,
+) -> list[PointResult]:
+    """Every point on its own samples: all cases fitted and refined, and terms searched for.
+
+    A result depends on its data and its place in the list, not on the workers or on what the other
+    points are. tell: is given the number of a point and its result as it comes.
+    Raises ValueError, naming the point, where one lacks a state or a variable, differs in its
+    unit, or is too short a record.
+    """
+    variables = [*study.library.variables, *study.searched.variables]
+    check_alike(points, list(dict.fromkeys(variables)))
+    pieces = list(zip(points, rng.spawn(len(points)), strict=True))
+    stage = progress.stage(len(points), "point fitted")
+    return collect(workers, partial(_fitted_point, study=study), pieces, stage, tell=tell)
+
+
+def _fitted_point(
+    piece: tuple[OperatingRecord, np.random.Generator], *, study: PointStudy
+) -> PointResult:
+    point, rng = piece
+    with naming(point.parameters):
+        return _point_result(point, study, rng=rng)
+
+
+def _point_result(
+    point: OperatingRecord, study: PointStudy, *, rng: np.random.Generator
+) -> PointResult:
+    run = point.trajectory
+    if run is None:
+        return PointResult(point.parameters, point.status)
+    result = PointResult(
+        parameters=point.parameters,
+        status=oscillation(run.t, run.states)
+        if point.status == Oscillation.OSCILLATING
+        else point.status,
+        n_samples=run.n_samples,
+        dt_s=run.dt_s,
+        f_Hz=dominant_frequency(run.t, run.states[:, 0]),
+        spread=dict(zip(run.state_names, relative_spread(run.states).tolist(), strict=True)),
+    )
+    if result.status != Oscillation.OSCILLATING:
+        return result
+    period_s = 1.0 / result.f_Hz
+    rows, *streams, last = rng.spawn(2 * len(study.cases) + 2)
+    problems = study.recipe.formulation.assemble([run], study.library, rng=rows)
+    fits = {}
+    for k, (name, case) in enumerate(study.cases.items()):
+        fits[name] = _least_squares(run, problems, case, study, period_s, rng=streams[2 * k])
+        fits[name + REFINED] = _refined(
+            run, problems, case, study, period_s, start=fits[name].model, rng=streams[2 * k + 1]
+        )
+    return replace(result, fits=fits, searched=_searched(run, study, rng=last))
+
+
+def _least_squares(
+    run: Trajectory,
+    problems: Sequence[RegressionRows],
+    case: Case,
+    study: PointStudy,
+    period_s: float,
+    *,
+    rng: np.random.Generator,
+) -> Fitted:
+    """The case's fit, its intervals and covariance from rows redrawn in blocks of time."""
+    provenance = {"formulation": repr(study.recipe.formulation), "trajectories": run.label}
+    model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
+    n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
+    group_s = (run.t[-1] - run.t[0]) / n_groups
+    draws = resampled_coefficients(
+        problems,
+        case.constraint,
+        model,
+        block=max(1, round(study.bootstrap.periods * period_s / group_s)),
+        n_draws=study.bootstrap.n_draws,
+        rng=rng,
+    )
+    coef = coefficients_of(model, case.constraint)
+    covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
+    estimates, drawn = drawn_estimates(coef, draws, case.quantities, case.constraint, study.library)
+    return Fitted(
+        model=replace(model, covariance=covariance),
+        status=FITTED,
+        r2=_r2(problems, model),
+        estimates=estimates,
+        draws=drawn,
+    )
+
+
+def _refined(
+    run: Trajectory,
+    problems: Sequence[RegressionRows],
+    case: Case,
+    study: PointStudy,
+    period_s: float,
+    *,
+    start: SparseModel,
+    rng: np.random.Generator,
+) -> Fitted:
+    """The same coefficients, moved until integrated windows follow the data."""
+    samples = round(study.refining.periods * period_s / run.dt_s) + 1
+    found = refine(
+        start,
+        [run],
+        n_windows=study.refining.n_windows,
+        window=int(np.clip(samples, MIN_SAMPLES, run.n_samples)),
+        method=MultipleShooting(max_iter=study.refining.max_iter),
+        constraint=case.constraint,
+        rng=rng,
+    )
+    known = found.model.covariance is not None
+    return Fitted(
+        model=found.model,
+        status=found.status,
+        r2=_r2(problems, found.model),
+        loss=found.loss,
+        estimates=propagated_estimates(found.model, case.quantities, case.constraint, study.library)
+        if known
+        else {},
+    )
+
+
+def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
+    found = discover(run, study.searched, study.recipe, seed=rng)
+    problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
+    return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))
+
+
+def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
+    """Of the derivative, by state, on training rows as they are."""
+    found = {}
+    for problem in problems:
+        rows = ~problem.test
+        for number, state in enumerate(problem.equations):
+            predicted = problem.theta[rows] @ model.coef[:, model.states.index(state)]
+            truth = problem.target[rows, number]
+            found[state] = float(r2(truth=truth, prediction=predicted[None])[0])
+    return found
+
+
+@dataclass(frozen=True)
+class TimeBootstrap:
+    """Intervals of least squares: draws of blocks that last `periods` of the oscillation."""
+
+    n_draws: int
+    periods: float
+
+    def __post_init__(self) -> None:
+        if self.n_draws < 40 or self.periods <= 0.0:
+            raise ValueError(
+                "a 95 % interval needs 40 draws or more, and blocks some length: "
+                f"n_draws={self.n_draws}, periods={self.periods} came"
+            )
+
+
+def resampled_coefficients(
+    problems: Sequence[RegressionRows],
+    constraint: Constraint,
+    model: SparseModel,
+    *,
+    block: int,
+    n_draws: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "draws coefs"]:
+    """Coefficients of `constrained_fit` on training rows redrawn in blocks of time, in SI.
+
+    A draw counts groups of rows, for all equations alike; each equation keeps the weight that it
+    has on all rows, and rows whose noise is followed stay whitened as under `model`.
+    model: of `constrained_fit` on these problems. block: groups that are drawn side by side.
+    Returns one column per coefficient of the constraint. Draws are moved so that their mean is
+    the fit: blocks seldom reach the ends of the record, which would shift them.
+    Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
+    Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for
+    Dependent Data, 2.5, for the centre.
+    """
+    if len(problems[0].trajectories) > 1:
+        raise ValueError(
+            "a bootstrap over time needs one trajectory, or blocks would cross from one to the "
+            f"next: {len(problems[0].trajectories)} came"
+        )
+    equations = weighted_equations(problems, constraint)
+    coef = coefficients_of(model, constraint)
+    rows = [_free_rows(equation, constraint, coef) for equation in equations]
+    groups = [e.problem.groups[~e.problem.test] for e in equations]
+    numbers = np.unique(np.concatenate(groups))
+    _check_blocks(len(numbers), block)
+    scale = column_norms(np.concatenate(rows))
+    sums = np.zeros((len(numbers), len(scale), len(scale)))
+    for own, group in zip(rows, groups, strict=True):
+        unit = own / scale
+        np.add.at(sums, np.searchsorted(numbers, group), unit[:, :, None] * unit[:, None, :])
+    counts = np.array(
+        [
+            moving_block_counts(len(numbers), n_drawn=len(numbers), block=block, rng=rng)
+            for _ in range(n_draws)
+        ],
+        dtype=np.float64,
+    )
+    grams = np.tensordot(counts, sums, axes=1)
+    z = np.linalg.solve(grams[:, :-1, :-1], grams[:, :-1, -1:])[:, :, 0]
+    z *= scale[-1] / scale[:-1]
+    return (z - z.mean(axis=0) + coef[constraint.free]) @ constraint.C.T + constraint.d
+
+
+def _check_blocks(n_groups: int, block: int) -> None:
+    if n_groups < MIN_BLOCKS * block:
+        raise ValueError(
+            f"a bootstrap over time needs {MIN_BLOCKS} blocks or more: blocks of {block} were "
+            f"asked of {n_groups} groups of rows; use fewer periods per block "
+            "(bootstrap.periods), or a longer record"
+        )
+
+
+def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
+    """In the order of the constraint's."""
+    index, states = model.library.index, model.states.index
+    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
+
+
+def _free_rows(
+    equation: WeightedEquation, constraint: Constraint, coef: Float[np.ndarray, " coefs"]
+) -> Float[np.ndarray, "rows columns"]:
+    """One equation's rows by free coefficient, the target last; residuals of variance 1."""
+    at = equation.at
+    theta, target = equation.rows(coef[at])
+    return np.column_stack([theta @ constraint.C[at], target - theta @ constraint.d[at]])
+
+
+@dataclass(frozen=True, eq=False)
+class JointResult:
+    """What one search over all points that oscillate found.
+
+    fitted: the support with coefficients of its own at every point, None at the others. tied: its
+    coefficients as polynomials of the parameters; None where the points do not suffice, for the
+    reason in `why_not_tied`.
+    """
+
+    found: JointDiscovery
+    fitted: Sequence[Fitted | None]
+    tied: TiedFit | None
+    why_not_tied: str = ""
+
+
+def searched_jointly(
+    points: Sequence[OperatingRecord],
+    results: Sequence[PointResult],
+    study: PointStudy,
+    law: Library,
+    *,
+    rng: np.random.Generator,
+    progress: Progress = SILENT,
+) -> JointResult | None:
+    """Search all points that oscillate at once; None for fewer than two of them.
+
+    law: terms that coefficients are tied by, over the parameters of the points.
+    None, too, for a search that cannot weigh several points: only BestSubset does.
+    """
+    used = {
+        point.label: point
+        for point, result in zip(points, results, strict=True)
+        if result.fits and point.trajectory is not None
+    }
+    if len(used) < 2 or not isinstance(study.recipe.search, BestSubset):
+        return None
+    found = discover_jointly(
+        {label: [point.trajectory] for label, point in used.items() if point.trajectory},
+        study.searched,
+        replace(study.recipe, bootstraps=Bootstraps(n=0)),
+        seed=rng,
+        progress=progress,
+    )
+    tied, reason = None, ""
+    try:
+        parameters = {label: point.parameters for label, point in used.items()}
+        with progress.stage(None, "", "coefficients tied by a law"):
+            tied = tied_fit(found, law, parameters=parameters)
+    except ValueError as error:
+        reason = str(error)
+    labels = [point.label for point in points]
+    fitted = [_fitted(found, label) if label in used else None for label in labels]
+    return JointResult(found, fitted, tied, reason)
+
+
+def _fitted(found: JointDiscovery, label: str) -> Fitted:
+    scores = {
+        state: front.points[label].candidates[front.supports.index(found.chosen[state])].r2_train
+        for state, front in found.fronts.items()
+    }
+    return Fitted(model=found.models[label], status=SEARCHED, r2=scores)

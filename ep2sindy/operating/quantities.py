@@ -1,0 +1,159 @@
+"""Physical quantities read from coefficients, with their intervals; what one point gave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.constraints.relations import Constraint, place_of
+from ep2sindy.library.library import Library
+from ep2sindy.library.units import unit_product
+from ep2sindy.model.model import SparseModel
+
+LEVEL = 0.95  # of all intervals here
+FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
+REFINED = "_refined"  # ends the name of a case's refinement
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a coefficient stands for: factor * coef^power, in SI.
+
+    coefficient: "state: term". power: 1, or -1 for a length or a time such as L = -1/coef.
+    """
+
+    coefficient: str
+    factor: float = 1.0
+    power: int = 1
+
+    def __post_init__(self) -> None:
+        if self.coefficient.count(":") != 1:
+            raise ValueError(
+                f"a quantity needs a coefficient such as 'n_i: n_i*u_iz': {self.coefficient!r} came"
+            )
+        if not np.isfinite(self.factor) or self.factor == 0.0 or self.power not in (-1, 1):
+            raise ValueError(
+                "a quantity is factor * coef^power, the factor not zero and the power 1 or -1: "
+                f"factor={self.factor!r}, power={self.power!r} came"
+            )
+
+    @property
+    def state(self) -> str:
+        return self.coefficient.split(":")[0].strip()
+
+    @property
+    def term(self) -> str:
+        return self.coefficient.split(":")[1].strip()
+
+    def of(self, coef: Float[np.ndarray, " coefs"]) -> Float[np.ndarray, " coefs"]:
+        """Its value for any number of values of the coefficient."""
+        return self.factor * coef**self.power
+
+    def slope(self, coef: float) -> float:
+        """Derivative by the coefficient."""
+        return self.factor * self.power * coef ** (self.power - 1)
+
+    def place(self, constraint: Constraint, library: Library) -> int:
+        """Which of the constraint's coefficients it is. Raises ValueError where it is none."""
+        who = f"the quantity of {self.coefficient!r}"
+        return place_of(library, constraint.coefficients, self.state, self.term, who)
+
+    def unit(self, library: Library, units: Mapping[str, str]) -> str:
+        """From the units of the states and variables."""
+        of_term = library.units(units)[library.index(self.term)]
+        p = self.power
+        return unit_product([(units[self.state], p), ("s", -p), (of_term, -p)])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A quantity with the ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model of one operating point.
+
+    status: fitted, by least squares; searched; or what became of a refinement.
+    r2: by state, of the derivative, on training rows. loss: of a refinement, else NaN.
+    draws: by quantity, (draws,), what the intervals of least squares were taken from.
+    The model's covariance is that of the draws, or of the refinement.
+    """
+
+    model: SparseModel
+    status: str
+    r2: Mapping[str, float]
+    loss: float = float("nan")
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    draws: Mapping[str, Float[np.ndarray, " draws"]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class PointResult:
+    """What one operating point gave; without fits unless its status is "oscillating".
+
+    f_Hz: dominant frequency of the first state. spread: by state, standard deviation over mean.
+    fits: by case, and by case + "_refined". searched: what the search chose.
+    """
+
+    parameters: Mapping[str, float]
+    status: str
+    n_samples: int = 0
+    dt_s: float = float("nan")
+    f_Hz: float = float("nan")
+    spread: Mapping[str, float] = field(default_factory=dict)
+    fits: Mapping[str, Fitted] = field(default_factory=dict)
+    searched: Fitted | None = None
+
+    def usable(self, fit: str) -> bool:
+        """Whether a fit was made here and came to its end."""
+        return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
+
+
+def drawn_estimates(
+    coef: Float[np.ndarray, " coefs"],
+    draws: Float[np.ndarray, "draws coefs"],
+    quantities: Mapping[str, Quantity],
+    constraint: Constraint,
+    library: Library,
+) -> tuple[dict[str, Estimate], dict[str, Float[np.ndarray, " draws"]]]:
+    """Estimates whose intervals are percentiles of draws, and the draws of every quantity.
+
+    The reciprocal of a coefficient whose own interval holds zero may be anything.
+    coef, draws: in the order of the constraint's coefficients.
+    """
+    estimates, drawn = {}, {}
+    for name, quantity in quantities.items():
+        k = quantity.place(constraint, library)
+        drawn[name] = quantity.of(draws[:, k])
+        ends = (50 * (1 - LEVEL), 50 * (1 + LEVEL))
+        low, high = np.percentile(drawn[name], ends)
+        if quantity.power < 0 and np.prod(np.sign(np.percentile(draws[:, k], ends))) <= 0:
+            low, high = -np.inf, np.inf
+        estimates[name] = Estimate(float(quantity.of(coef[k : k + 1])[0]), float(low), float(high))
+    return estimates, drawn
+
+
+def propagated_estimates(
+    model: SparseModel,
+    quantities: Mapping[str, Quantity],
+    constraint: Constraint,
+    library: Library,
+) -> dict[str, Estimate]:
+    """Estimates whose intervals are those of the model's covariance, carried by the slope."""
+    estimates = {}
+    for name, quantity in quantities.items():
+        state, term = constraint.coefficients[quantity.place(constraint, library)]
+        coef = model.terms(state)[term]
+        low, _ = model.intervals(state, level=LEVEL)[term]
+        reach = abs(quantity.slope(coef)) * (coef - low)
+        value = float(quantity.of(np.array([coef]))[0])
+        estimates[name] = Estimate(value, value - reach, value + reach)
+    return estimates

@@ -1,0 +1,237 @@
+"""Control laws and trends: one measured quantity as a function of operating parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from ep2sindy.data.scales import column_norms
+from ep2sindy.data.trajectory import read_only
+from ep2sindy.library.library import Library
+from ep2sindy.model.scores import r2
+from ep2sindy.operating.quantities import PointResult
+
+# A share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
+ROUNDING = 1e-10
+
+# A point with this leverage is the only one that knows some coefficient: without it no law.
+FULL_LEVERAGE = 1.0 - 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ControlLaw:
+    """quantity = library(parameters) coef, and how far it errs.
+
+    terms: of the library, in its order. coef: (terms,), in the units of quantity over term.
+    r2: of the points it was fitted to; NaN for a quantity that does not vary.
+    loo_error: RMS error at points left out one by one, the terms as they are, over the mean's
+    size. search_error: the same with the terms searched again without the point.
+    """
+
+    library: Library
+    terms: tuple[str, ...]
+    coef: Float[np.ndarray, " terms"]
+    r2: float
+    loo_error: float
+    search_error: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coef", read_only(self.coef))
+
+    @property
+    def coef_by_term(self) -> dict[str, float]:
+        return dict(zip(self.terms, self.coef.tolist(), strict=True))
+
+    def predict(
+        self, parameters: Float[np.ndarray, "points parameters"]
+    ) -> Float[np.ndarray, " points"]:
+        """The quantity at any points; columns in the order of the library's variables."""
+        columns = [self.library.index(name) for name in self.terms]
+        return self.library.evaluate(parameters)[:, columns] @ self.coef
+
+
+def control_law(
+    values: Float[np.ndarray, " points"],
+    parameters: Float[np.ndarray, "points parameters"],
+    library: Library,
+    *,
+    max_terms: int | None = None,
+) -> ControlLaw:
+    """Find the terms that predict best at points left out of their fit.
+
+    All supports of up to `max_terms` terms are fitted by least squares, every point with the same
+    weight, and judged by exact leave-one-out residuals r / (1 - h), h the diagonal of the hat
+    matrix. None: as many terms as leave two points over; never more than that, nor more than the
+    library has. A support to which one point is indispensable has no such residual, and is out.
+    Raises ValueError for under three points, another number of parameters than variables, values
+    that are not finite, or a parameter that never varies.
+    Source: Allen 1974, doi:10.1080/00401706.1974.10489157.
+    """
+    _check(values, parameters, library, max_terms)
+    theta = library.evaluate(parameters)
+    support = _best_support(values, theta, max_terms)
+    fitted, left_out = _predictions(values, theta[:, support])
+    coef = _least_squares(values, theta[:, support])
+    others = [np.delete(np.arange(len(values)), k) for k in range(len(values))]
+    searched = [
+        _predicted(theta[k], values[rest], theta[rest], max_terms) for k, rest in enumerate(others)
+    ]
+    varies = np.ptp(values) > 0.0
+    return ControlLaw(
+        library=library,
+        terms=tuple(library.names[j] for j in support),
+        coef=coef,
+        r2=float(r2(truth=values, prediction=fitted[None])[0]) if varies else float("nan"),
+        loo_error=_relative(values - left_out, values),
+        search_error=_relative(values - np.array(searched), values),
+    )
+
+
+def _check(
+    values: np.ndarray, parameters: np.ndarray, library: Library, max_terms: int | None
+) -> None:
+    names = list(library.variables)
+    if len(values) < 3:
+        raise ValueError(f"a law needs three points or more: {len(values)} came")
+    if parameters.shape[1] != len(names):
+        raise ValueError(
+            f"parameters must have one column for each of {names}: {parameters.shape[1]} came"
+        )
+    if not (np.isfinite(values).all() and np.isfinite(parameters).all()):
+        raise ValueError("values and parameters must be finite: leave out points that are not")
+    for name, column in zip(names, parameters.T, strict=True):
+        if np.ptp(column) == 0.0:
+            raise ValueError(
+                f"a parameter must vary: {name!r} is {column[0]:g} at all {len(values)} points; "
+                "leave it out of the library"
+            )
+    if max_terms is not None and max_terms < 1:
+        raise ValueError(f"max_terms must be at least 1: {max_terms} came")
+
+
+def _best_support(values: np.ndarray, theta: np.ndarray, max_terms: int | None) -> list[int]:
+    """Columns of least leave-one-out error; of equals but for rounding, the fewest."""
+    n_points, n_terms = theta.shape
+    largest = max(1, min(n_terms, n_points - 2, max_terms or n_terms))
+    floor = ROUNDING * np.sqrt(np.square(values).mean())
+    best, lowest = [0], np.inf
+    for size in range(1, largest + 1):
+        for support in map(list, combinations(range(n_terms), size)):
+            error = _rms(values - _predictions(values, theta[:, support])[1])
+            if max(error, floor) < lowest:
+                best, lowest = support, max(error, floor)
+    return best
+
+
+def _predictions(values: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every point by the fit to all, and by the fit to the others; infinite where there is none."""
+    left, singular, _ = np.linalg.svd(_scaled(columns), full_matrices=False)
+    leverage = np.square(left).sum(axis=1)
+    fitted = left @ (left.T @ values)
+    if singular[-1] <= ROUNDING * singular[0] or leverage.max() > FULL_LEVERAGE:
+        return fitted, np.full(len(values), np.inf)
+    return fitted, values - (values - fitted) / (1.0 - leverage)
+
+
+def _predicted(
+    row: np.ndarray, values: np.ndarray, theta: np.ndarray, max_terms: int | None
+) -> float:
+    """One more point, by the law found in these."""
+    support = _best_support(values, theta, max_terms)
+    return float(row[support] @ _least_squares(values, theta[:, support]))
+
+
+def _least_squares(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    scale = column_norms(columns)
+    return np.linalg.lstsq(columns / scale, values, rcond=None)[0] / scale
+
+
+def _scaled(columns: np.ndarray) -> np.ndarray:
+    return columns / column_norms(columns)
+
+
+def _rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.square(errors).mean()))
+
+
+def _relative(errors: np.ndarray, values: np.ndarray) -> float:
+    mean = abs(float(values.mean()))
+    return _rms(errors) / mean if mean else float("nan")
+
+
+def fit_names(results: Sequence[PointResult]) -> list[str]:
+    """Names of all fits, in the order of the study."""
+    return list(dict.fromkeys(name for result in results for name in result.fits))
+
+
+def laws(
+    results: Sequence[PointResult], library: Library, *, max_terms: int | None = None
+) -> dict[str, dict[str, ControlLaw]]:
+    """A control law per fit and quantity, from the points whose fit came to its end.
+
+    Fits with under three such points, or a parameter that does not vary over them, have none.
+    """
+    found = {}
+    for fit in fit_names(results):
+        usable = [result for result in results if result.usable(fit)]
+        values = np.array([[each.parameters[v] for v in library.variables] for each in usable])
+        if len(usable) < 3 or not np.ptp(values, axis=0).all():
+            continue
+        found[fit] = {
+            name: control_law(_values(usable, fit, name), values, library, max_terms=max_terms)
+            for name in usable[0].fits[fit].estimates
+        }
+    return found
+
+
+def trends(results: Sequence[PointResult], *, along: str, at: Mapping[str, float]) -> pd.DataFrame:
+    """Exponents p of |quantity| ~ parameter^p along one parameter, the others held.
+
+    One row per fit and quantity: the slope of logarithms, by least squares over the points.
+    r2: of that line, whether the points are a power law at all; near zero, too, without a trend.
+    low and high: its 95 % interval by the bootstraps of least-squares fits, points independent;
+    it says how well the slope is known, not whether points lie on a line.
+    Two points are always on a line: r2, low and high are NaN, as low and high of refined fits.
+    """
+    held = [each for each in results if all(each.parameters[k] == v for k, v in at.items())]
+    rows = []
+    for fit in fit_names(results):
+        usable = [each for each in held if each.usable(fit)]
+        x = np.array([each.parameters[along] for each in usable])
+        for name in usable[0].fits[fit].estimates if usable else ():
+            low, high = np.nan, np.nan
+            if len(usable) > 2 and all(each.fits[fit].draws for each in usable):
+                draws = np.stack([each.fits[fit].draws[name] for each in usable], axis=1)
+                slopes = [exponent(x, draw) for draw in draws]
+                low, high = np.percentile(slopes, (2.5, 97.5))
+            row = {"fit": fit, "quantity": name, "along": along, "n_points": len(usable)}
+            values = _values(usable, fit, name)
+            row |= {"exponent": exponent(x, values), "r2": power_law_r2(x, values)}
+            rows.append(row | {"low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def exponent(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]) -> float:
+    """Slope of log |values| by log x, by least squares; NaN unless x is two numbers above zero."""
+    if len(x) < 2 or np.ptp(x) == 0.0 or x.min() <= 0.0:
+        return float("nan")
+    centred = np.log(x) - np.log(x).mean()
+    return float(centred @ np.log(np.abs(values)) / np.square(centred).sum())
+
+
+def power_law_r2(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]) -> float:
+    """R2 of the line through logarithms; NaN for under three points, or values all alike."""
+    slope, logs = exponent(x, values), np.log(np.abs(values))
+    if len(x) < 3 or np.isnan(slope) or np.ptp(logs) == 0.0:
+        return float("nan")
+    line = logs.mean() + slope * (np.log(x) - np.log(x).mean())
+    return float(r2(truth=logs, prediction=line[None])[0])
+
+
+def _values(usable: Sequence[PointResult], fit: str, name: str) -> np.ndarray:
+    return np.array([each.fits[fit].estimates[name].value for each in usable])

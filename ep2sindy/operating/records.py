@@ -1,0 +1,229 @@
+"""Operating points: where a record was taken, what it holds, and which cycle it is on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.trajectory import Trajectory, check_agreement
+from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
+
+LEAST_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
+
+# Two cycles coexist where the relative amplitudes of the records, as far as a plane through the
+# parameters does not explain them, part in two groups this many times as far apart as those in a
+# group are spread, and by this share of themselves; a single amplitude or a trend is no branch.
+APART, LEAST_STEP = 3.0, 0.3
+
+N_ROBUST = 50  # of the plane's fits, each weighted by the last one's residuals
+
+# A group of this many or fewer records has no spread of its own to compare with.
+FEW = 4
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingRecord:
+    """One operating point, and the record that was taken there.
+
+    trajectory: None where the source says that nothing oscillates. status: what the source says
+    of it; "oscillating" is looked into, all else believed. notes: what is amiss with its data.
+    used: which data they are, in words. Raises ValueError for parameters that are not finite.
+    """
+
+    parameters: Mapping[str, float]
+    trajectory: Trajectory | None
+    status: str = Oscillation.OSCILLATING
+    notes: Sequence[str] = ()
+    used: str = ""
+
+    def __post_init__(self) -> None:
+        values = {name: float(value) for name, value in self.parameters.items()}
+        object.__setattr__(self, "parameters", values)
+        if not values or not np.isfinite(list(values.values())).all():
+            raise ValueError(f"operating point {self.label} must have parameters, all finite")
+        if self.trajectory is None and self.status == Oscillation.OSCILLATING:
+            raise ValueError(f"{self.label} oscillates: it needs its trajectory")
+
+    @staticmethod
+    def of(parameters: Mapping[str, float], run: Trajectory) -> OperatingRecord:
+        """A record that laws can be made of; raises ValueError for one without a `cycle`."""
+        record = OperatingRecord(parameters, run)
+        _ = record.cycle
+        return record
+
+    @property
+    def label(self) -> str:
+        return point_label(self.parameters)
+
+    @property
+    def run(self) -> Trajectory:
+        if self.trajectory is None:
+            raise ValueError(f"operating point {self.label} has no record: it is {self.status}")
+        return self.trajectory
+
+    @cached_property
+    def cycle(self) -> Cycle:
+        """What the record repeats.
+
+        Raises ValueError, with the point, for a record without a period or of under six of them.
+        """
+        cycle = find_cycle(self.run.t, self.run.states)
+        where = f"operating point {self.label}"
+        if cycle is None:
+            raise ValueError(
+                f"{where}: its record has no period to learn from; leave the point out, or record "
+                "it for longer"
+            )
+        if cycle.n_periods < LEAST_PERIODS:
+            raise ValueError(
+                f"{where}: its record holds {cycle.n_periods:.1f} periods of the {LEAST_PERIODS:g} "
+                "that are needed; record it for longer"
+            )
+        return cycle
+
+    @property
+    def relative_amplitude(self) -> float:
+        """Root mean square over the states of standard deviation over mean, of the waveform."""
+        return relative_amplitude(self.cycle.mean, self.cycle.std)
+
+    @property
+    def slowest(self) -> int:
+        """The sample of the first two periods at which the states move least, in deviations.
+
+        A free run starts here: in the pulse a small error of the model is a large one in phase.
+        """
+        n = round(2.0 / (self.cycle.frequency_Hz * self.run.dt_s))
+        x = self.run.states[: max(n, 3)] / zero_to_one(self.cycle.std)
+        return int(np.argmin(np.linalg.norm(np.gradient(x, axis=0), axis=1)))
+
+    @property
+    def from_slowest(self) -> Trajectory:
+        return self.run.window(self.slowest, self.run.n_samples)
+
+
+def point_label(parameters: Mapping[str, float]) -> str:
+    """`V_D_V=300, mdot_mg_s=5`."""
+    return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
+
+
+@contextmanager
+def naming(parameters: Mapping[str, float]) -> Iterator[None]:
+    """What cannot work at an operating point is said with its name before it."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise ValueError(f"operating point {point_label(parameters)}: {error}") from error
+
+
+def check_alike(records: Sequence[OperatingRecord], variables: Sequence[str]) -> None:
+    """Raise ValueError, naming the point, unless all have the same states, variables and units."""
+    known = [record for record in records if record.trajectory is not None]
+    for record in known:
+        with naming(record.parameters):
+            check_agreement([known[0].run, record.run], variables)
+
+
+def check_varying(
+    points: Float[np.ndarray, "points parameters"],
+    parameters: Sequence[str],
+    *,
+    remedy: str = "leave it out, or add points",
+) -> None:
+    """Raise ValueError for a parameter that is the same at all points: no law can hold it."""
+    for name, column in zip(parameters, points.T, strict=True):
+        if np.ptp(column) == 0.0:
+            raise ValueError(
+                f"a parameter must vary: {name!r} is {column[0]:g} at all {len(points)} operating "
+                f"points; {remedy}"
+            )
+
+
+def check_records(records: Sequence[OperatingRecord]) -> None:
+    """Raise ValueError unless all have the same parameters, which vary, states and units."""
+    if not records:
+        raise ValueError("a law needs operating points that oscillate: none came")
+    names = list(records[0].parameters)
+    for record in records:
+        if set(record.parameters) != set(names):
+            raise ValueError(
+                f"every operating point must have {names}: {dict(record.parameters)} came"
+            )
+    if len(records) == 1:
+        raise ValueError(
+            f"a law needs more than one operating point: {records[0].label} came alone; add "
+            "points near it"
+        )
+    check_varying(values_of(records), names)
+    check_alike(records, records[0].run.state_names)
+
+
+def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:
+    """Parameters, in the order of the first record's."""
+    names = list(records[0].parameters)
+    return np.array([[record.parameters[name] for name in names] for record in records])
+
+
+def measured_left_out(
+    records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
+) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
+    """How smooth the records are: what functions of the parameters miss at points left out.
+
+    Relative errors of the frequency, and the largest over the states of the standard deviation's,
+    each interpolated itself, logarithmically. No law of these functions can be asked for much less.
+    """
+    scaled = basis / zero_to_one(np.linalg.norm(basis, axis=0))
+    hat = scaled @ np.linalg.pinv(scaled)
+    f = np.log([[record.cycle.frequency_Hz] for record in records])
+    logs = np.hstack([f, np.log([record.cycle.std for record in records])])
+    left = (logs - hat @ logs) / np.maximum(1.0 - np.diag(hat), 1e-12)[:, None]
+    off = np.abs(np.expm1(-left))
+    return off[:, 0], off[:, 1:].max(axis=1)
+
+
+def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records"]:
+    """0 for records on one cycle, the stronger if there are two, and 1 for those on the other.
+
+    The logarithm of the relative amplitude is fitted by a plane over the parameters, robustly, and
+    its residuals are sorted. Two cycles coexist where they part in a gap that is wide against what
+    lies to both of its sides, and where the frequencies part as well: a strong cycle is slower.
+    """
+    amplitude = np.log([record.relative_amplitude for record in records])
+    left = _off_plane(values_of(records), amplitude)
+    order = np.argsort(left)
+    gaps = np.diff(left[order])
+    nothing = np.zeros(len(records), dtype=np.int64)
+    if len(records) < FEW or not gaps.size:
+        return nothing
+    k = int(np.argmax(gaps))
+    weak, strong = order[: k + 1], order[k + 1 :]
+    inner = [np.ptp(left[group]) / len(group) for group in (weak, strong) if len(group) > FEW]
+    spread = max(inner, default=np.inf)
+    if not (gaps[k] > LEAST_STEP and gaps[k] > APART * spread):
+        return nothing
+    found = nothing.copy()
+    found[weak] = 1
+    return found
+
+
+def _off_plane(
+    values: Float[np.ndarray, "points parameters"], target: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, " points"]:
+    """What a plane of least absolute deviations leaves; a constant where points are few."""
+    centred = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
+    columns = np.column_stack([np.ones(len(values)), centred])
+    if len(values) < 2 * columns.shape[1]:
+        columns = columns[:, :1]
+    weights = np.ones(len(values))
+    left = target
+    for _ in range(N_ROBUST):
+        coef = np.linalg.lstsq(columns * weights[:, None], target * weights)[0]
+        left = target - columns @ coef
+        weights = 1.0 / np.sqrt(np.maximum(np.abs(left), 1e-6))
+    return left

@@ -1,0 +1,604 @@
+"""One model at several operating points, its trends and control laws: `+exp=parametric`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.constraints.relations import constraint
+from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.figures.trends import rows_at, trends_figure
+from ep2sindy.library.equations import equation_text
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.units import SECONDS
+from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.point_fits import (
+    Case,
+    JointResult,
+    PointStudy,
+    Refining,
+    TimeBootstrap,
+    fit_points,
+    searched_jointly,
+)
+from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
+from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
+from ep2sindy.operating.records import point_label
+from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
+from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.studies.fits import Terms, terms_of
+from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.study import Check, Count
+from ep2sindy.studies.views import coefficients
+
+INTERVALS = (
+    "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
+    "refinements from their covariance. It says how far another stretch of the same record would "
+    "move a value, not how far the model is from the discharge: compare R2, and the fits. Nor does "
+    "it hold the bias that smoothing and differencing leave in least squares, even without noise, "
+    "which may be many times as large; refinements differentiate nothing. Refined models follow "
+    "trajectories: R2 is that of the derivative, and may be negative where pulses are sharp."
+)
+TIED = "One support for all points: R2 with coefficients of its own at each, and tied by a law"
+TRENDS = (
+    "Trends: exponents p of quantity ~ parameter^p, the other parameters held, with 95 % "
+    "intervals; r2: whether points follow it"
+)
+LAWS = "Control laws, with the RMS error at points left out, over the mean"
+LEFT_OUT = (
+    "loo_error: the law's terms, fitted without the point that they predict. search_error: the "
+    "terms searched without it too, the honest one of the two."
+)
+UNITS = "Units are SI, unless a name ends in another, such as mdot_mg_s."
+CAPTION = (
+    "Quantities against one parameter, the others held: filled with 95 % intervals, which are "
+    "smaller than the markers where no bars show"
+)
+
+
+@dataclass(frozen=True)
+class CaseSettings:
+    """One way to fit the terms: relations of their coefficients, and what these mean."""
+
+    relations: Sequence[str] | None
+    quantities: Mapping[str, Quantity]
+
+
+@dataclass(frozen=True)
+class Searched:
+    """A polynomial library, the same for every point."""
+
+    variables: Sequence[str]
+    degree: int
+    products: Sequence[str] = ()
+
+    def library(self) -> Library:
+        return polynomial(list(self.variables), degree=self.degree, products=list(self.products))
+
+
+@dataclass(frozen=True)
+class LawSettings:
+    """Quantities as polynomials of the parameters.
+
+    tied_degree: of the polynomials that tie the coefficients of the support for all points.
+    """
+
+    degree: int
+    max_terms: Count | None
+    tied_degree: int
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Along one parameter, the others held."""
+
+    along: str
+    at: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Panels:
+    """Quantities that share a panel of the figure, and what axes and legend call them."""
+
+    panels: Sequence[Sequence[str]]
+    labels: Mapping[str, str]
+
+
+Cases = Annotated[
+    Mapping[str, CaseSettings],
+    Check(
+        "like {free: {relations: [], quantities: {k: {coefficient: 'x: x'}}}}",
+        lambda value: isinstance(value, dict) and bool(value),
+    ),
+]
+Laws = Mapping[str, Mapping[str, ControlLaw]]  # fit -> quantity -> law
+Published = Mapping[str, Sequence[Mapping[str, float]]]  # fit -> points with their quantities
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Fit, refine and search every operating point; then laws, trends and one support for all.
+
+    parameters: where the data group takes each; None for nowhere. points: values of all
+    parameters each, and `data`: what else differs from the data group. model: state -> terms.
+    thesis: published quantities; a fit that it has is shown beside ours.
+    """
+
+    source: Source
+    recipe: Recipe
+    parallel: Workers
+    parameters: Mapping[str, str | None]
+    points: Sequence[Mapping[str, Any]]
+    model: Terms
+    cases: Cases
+    bootstrap: TimeBootstrap
+    refining: Refining
+    library: Searched
+    law: LawSettings
+    trends: Sequence[Trend]
+    figures: Panels
+    thesis: Published | None = None
+
+    def __post_init__(self) -> None:
+        names = list(self.parameters)
+        for each in self.trends:
+            if {each.along, *each.at} != set(names):
+                raise ValueError(
+                    f"a trend goes along one parameter and holds the others of {names}: {each} came"
+                )
+        known = {name for case in self.cases.values() for name in case.quantities}
+        unknown = {name for panel in self.figures.panels for name in panel} - known
+        if unknown:
+            raise ValueError(f"figures.panels names {sorted(unknown)}; there are {sorted(known)}")
+
+    def compute(self, run: Run) -> Outcome:
+        # Everything but the data is built first: a misspelt setting must not cost a simulation.
+        names = list(self.parameters)
+        how = self.at_every_point()
+        law, tying = (polynomial(names, degree=n) for n in (self.law.degree, self.law.tied_degree))
+        published = published_table(self.thesis or {}, names)
+        sources = point_sources(self.source, self.parameters, self.points)
+        inputs = self.source.inputs([how.library, how.searched])
+        points = open_points(sources, inputs, workers=self.parallel, run=run)
+        alone, together = np.random.default_rng(run.seed).spawn(2)
+
+        def tell(number: int, result: PointResult) -> None:
+            """To TensorBoard; a step is the number of a point in the config."""
+            run.board.scalars(live(result), step=number)
+
+        results = fit_points(
+            points, how, workers=self.parallel, rng=alone, tell=tell, progress=run.watch
+        )
+        return Outcome(
+            study=how,
+            results=results,
+            laws=laws(results, law, max_terms=self.law.max_terms),
+            joint=searched_jointly(points, results, how, tying, rng=together, progress=run.watch),
+            along=[(each.along, each.at) for each in self.trends],
+            published=published,
+            shown=self.figures,
+        )
+
+    def at_every_point(self) -> PointStudy:
+        library, terms = terms_of(self.model, states=self.source.states)
+        return PointStudy(
+            library=library,
+            cases={
+                name: Case(constraint(library, terms, case.relations or ()), case.quantities)
+                for name, case in self.cases.items()
+            },
+            bootstrap=self.bootstrap,
+            refining=self.refining,
+            searched=self.library.library(),
+            recipe=self.recipe,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What all points gave, and what is made of them together.
+
+    laws: by fit and quantity. joint: the search over all points at once; None where there was
+    none. along: (parameter, those held) of every trend. published: as `published_table` makes it.
+    """
+
+    study: PointStudy
+    results: Sequence[PointResult]
+    laws: Laws
+    joint: JointResult | None
+    along: Sequence[tuple[str, Mapping[str, float]]]
+    published: pd.DataFrame
+    shown: Panels
+
+    @property
+    def searches(self) -> dict[str, Sequence[Fitted | None]]:
+        """What searches chose, one entry per point, None where there was nothing to fit."""
+        alone = {"each point": [result.searched for result in self.results]}
+        return alone | ({"all points": self.joint.fitted} if self.joint else {})
+
+    def models(self, pattern: str = "point_{}_{}") -> dict[str, SparseModel]:
+        """By number of the point and name of the fit."""
+        return {
+            pattern.format(number, name): fit.model
+            for number, result in enumerate(self.results)
+            for name, fit in result.fits.items()
+        }
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        return dict(self._tables)
+
+    @cached_property
+    def _tables(self) -> dict[str, pd.DataFrame]:
+        given = [result.fits.get(next(iter(self.study.cases))) for result in self.results]
+        return {
+            "points": points_table(self.results),
+            "quantities": estimates_table(self.results, self.published),
+            "supports": supports_table(self.results, {"given": given, **self.searches}),
+            "laws": laws_table(self.laws),
+            "trends": trends_table(self.results, self.along, self.published),
+            "tied": tied_table(self.joint),
+            "coefficients": coefficients(self.models("point {}, {}"), heading="model"),
+        }
+
+    def figures(self) -> dict[str, Captioned]:
+        """None where no point oscillates or no trend was asked for: it would say nothing."""
+        estimates = self._tables["quantities"]
+        if estimates.empty or not self.along or not self.shown.panels:
+            return {}
+        published = ", open what the thesis found in its data" if len(self.published) else ""
+        lines = ", lines the control laws of least squares" if self.laws else ""
+        draw = partial(
+            trends_figure,
+            estimates[estimates["usable"]],
+            self.published,
+            {fit: laws for fit, laws in self.laws.items() if not fit.endswith(REFINED)},
+            panels=self.shown.panels,
+            trends=self.along,
+            labels=self.shown.labels,
+        )
+        return {"trends": Captioned(draw, f"{CAPTION}{published}{lines}.")}
+
+    def sections(self) -> list[Section]:
+        oscillating = [result for result in self.results if result.fits]
+        cases, fits = (self.study.cases, self.study.fits) if oscillating else ((), ())
+        lines = [Text(_point_line(result), warning=not result.fits) for result in self.results]
+        return [
+            *(_model(oscillating[0], case) for case in cases),
+            Section("Operating points", [*lines, Text(UNITS, page_only=True)]),
+            *(self._fit(fit) for fit in fits),
+            *([Section("Intervals", [Text(INTERVALS)], level=3)] if fits else []),
+            *self._together(),
+        ]
+
+    def _fit(self, fit: str) -> Section:
+        """One row per point: its quantities with half their intervals, and the thesis's."""
+        estimates = rows_at(self._tables["quantities"], {"fit": fit})
+        units = next(each.fits[fit].model.units for each in self.results if each.fits)
+        headings = {
+            name: _heading(name, quantity.unit(self.study.library, units))
+            for name, quantity in self.study.fits[fit].quantities.items()
+        }
+        rows = []
+        for result in self.results:
+            here = rows_at(estimates, result.parameters).to_dict("records")
+            cells = {each["quantity"]: _cell(each) for each in here}
+            row: dict[str, Any] = dict(result.parameters)
+            row |= {heading: cells.get(name, "-") for name, heading in headings.items()}
+            if fitted := result.fits.get(fit):
+                row |= {f"R2 {state}": f"{value:.2f}" for state, value in fitted.r2.items()}
+                row |= {"loss": f"{fitted.loss:.3f}"} if fit.endswith(REFINED) else {}
+            rows.append(row | {"status": fitted.status if fitted else result.status})
+        thesis = " (thesis)" if estimates["thesis"].notna().any() else ""
+        return Section(f"{_spoken(fit)}{thesis}", [Table(pd.DataFrame(rows))], level=3)
+
+    def _together(self) -> list[Section]:
+        """What is made of all points."""
+        shown = self._tables
+        tied = _table(shown["tied"], ["state"])
+        if self.joint and self.joint.why_not_tied:
+            tied = [Text(f"Not tied by a law: {self.joint.why_not_tied}.")]
+        laws = [*_table(shown["laws"], ["fit"]), Text(LEFT_OUT)]
+        if not self.laws:
+            n = max(sum(each.usable(fit) for each in self.results) for fit in self.study.fits)
+            needed = "a law needs 3, and all parameters to vary over them"
+            laws = [Text(f"None: {n} points fitted; {needed}.")]
+        supports = _table(shown["supports"], list(self.results[0].parameters))
+        trends = _table(shown["trends"], ["along", "fit"])
+        return [
+            Section("Terms found, beside those given", supports),
+            Section(TIED, tied),
+            Section(TRENDS, [*trends, Picture("trends")]),
+            Section(LAWS if self.laws else "Control laws", laws),
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "points": [
+                point_summary(
+                    result, self.study.cases, {name: at[k] for name, at in self.searches.items()}
+                )
+                for k, result in enumerate(self.results)
+            ],
+            "laws": laws_summary(self.laws),
+            "trends": self._tables["trends"].to_dict("records"),
+            "joint": joint_summary(self.joint),
+        }
+
+    def headline(self) -> dict[str, float]:
+        n_oscillating = float(sum(bool(result.fits) for result in self.results))
+        return {"n_oscillating": n_oscillating, **law_errors(self.laws, self.study.fits)}
+
+
+def _model(result: PointResult, case: str) -> Section:
+    at = ", ".join(f"{name} = {value:g}" for name, value in result.parameters.items())
+    model = result.fits[case].model
+    equations = [Equation(state, model.terms(state)) for state in model.states]
+    return Section(f"Model: {case}, at {at}", equations)
+
+
+def _point_line(result: PointResult) -> str:
+    """`V_D_V=300, mdot_mg_s=5: oscillating, 14.1 kHz; 12001 samples of 1.5e-06 s`."""
+    text = f"{point_label(result.parameters)}: {result.status}"
+    if result.fits:
+        text += f", {SECONDS.frequency_text(result.f_Hz)}"
+    if result.n_samples:
+        text += f"; {result.n_samples} samples of {SECONDS.duration_text(result.dt_s, digits=4)}"
+    return text if result.fits else f"{text}; left out of trends"
+
+
+def _heading(name: str, unit: str) -> str:
+    """`g_inj (m^-3 s^-1)`: a quantity with its unit, unless its name ends in that: `L_m`."""
+    return name if unit == "1" or name.endswith(f"_{unit}") else f"{name} ({unit})"
+
+
+def _spoken(fit: str) -> str:
+    return fit.replace("_", ", ")
+
+
+def _cell(row: Mapping[Any, Any]) -> str:
+    """`0.0241 ±0.0001 (0.025)`: value, half the interval, what was published."""
+    text = with_error(row["value"], 0.5 * (row["high"] - row["low"]))
+    return text if np.isnan(row["thesis"]) else f"{text} ({row['thesis']:.3g})"
+
+
+def with_error(value: float, reach: float) -> str:
+    """`0.03640 ±2e-05`: the value down to the digit of its error, three digits or more."""
+    digits = 3
+    if np.isfinite(reach) and reach > 0.0 and value != 0.0:
+        # Of the error as it is printed: 9.6e-05 reads 1e-04.
+        places = np.floor(np.log10([abs(value), float(f"{reach:.1g}")]))
+        digits = int(np.clip(places[0] - places[1] + 1, 3, 8))
+    return f"{f'{value:#.{digits}g}'.removesuffix('.')} ±{reach:.1g}"
+
+
+def _table(rows: pd.DataFrame, by: Sequence[str]) -> list[Block]:
+    """Without columns that say nothing; a rule follows where those of `by` change."""
+    if rows.empty:
+        return [Text("None.")]
+    if "fit" in rows:
+        rows = rows.assign(fit=rows["fit"].map(_spoken))
+    keys = rows[list(by)]
+    ends = (keys != keys.shift(-1)).any(axis=1)
+    shown = rows.dropna(axis=1, how="all").round({"r2": 3, "exponent": 3})
+    return [Table(shown, breaks=np.flatnonzero(ends)[:-1].tolist())]
+
+
+def published_table(
+    thesis: Mapping[str, Sequence[Mapping[str, float]]], parameters: Sequence[str]
+) -> pd.DataFrame:
+    """One row per published value: parameters, fit, quantity, value.
+
+    thesis: fit -> points, each with its parameters and quantities.
+    Raises ValueError for a published point without all parameters, or with nothing else.
+    """
+    rows = []
+    for fit, points in thesis.items():
+        for point in points:
+            if not set(parameters) < set(point):
+                raise ValueError(
+                    f"thesis must give {list(parameters)} and quantities at every point, or be "
+                    f"null: {point} came"
+                )
+            at = {name: point[name] for name in parameters}
+            found = {name: value for name, value in point.items() if name not in at}
+            rows += [{**at, "fit": fit, "quantity": q, "value": v} for q, v in found.items()]
+    table = pd.DataFrame(rows, columns=[*parameters, "fit", "quantity", "value"])
+    return table.astype(dict.fromkeys(parameters, float))
+
+
+def estimates_table(results: Sequence[PointResult], published: pd.DataFrame) -> pd.DataFrame:
+    """One row per point, fit and quantity, with what was published."""
+    parameters = list(results[0].parameters)
+    rows = [
+        (*result.parameters.values(), fit, result.usable(fit), name, e.value, e.low, e.high)
+        for result in results
+        for fit, fitted in result.fits.items()
+        for name, e in fitted.estimates.items()
+    ]
+    columns = [*parameters, "fit", "usable", "quantity", "value", "low", "high"]
+    table = pd.DataFrame(rows, columns=columns)
+    known = published.rename(columns={"value": "thesis"})
+    if not rows:  # without rows columns have no types to merge on
+        return table.assign(thesis=float("nan"))
+    return table.merge(known, how="left", on=[*parameters, "fit", "quantity"])
+
+
+def points_table(results: Sequence[PointResult]) -> pd.DataFrame:
+    """One row per point and fit; a point without fits has one row with its status."""
+    rows = []
+    for result in results:
+        row: dict[str, Any] = {
+            **result.parameters,
+            "point_status": result.status,
+            "f_Hz": result.f_Hz,
+            "n_samples": result.n_samples,
+            "dt_s": result.dt_s,
+            **{f"spread_{state}": value for state, value in result.spread.items()},
+        }
+        for fit, fitted in result.fits.items():
+            of_fit = {"fit": fit, "fit_status": fitted.status, "loss": fitted.loss}
+            rows.append(row | of_fit | {f"r2_{s}": value for s, value in fitted.r2.items()})
+        if not result.fits:
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def supports_table(
+    results: Sequence[PointResult], searches: Mapping[str, Sequence[Fitted | None]]
+) -> pd.DataFrame:
+    """Terms of every search at each point, with R2 of the derivative.
+
+    searches: one entry per point, None where there was nothing to fit.
+    """
+    rows = []
+    for k, result in enumerate(results):
+        for search, found in searches.items():
+            if (fitted := found[k]) is not None:
+                for state, r2 in ((s, fitted.r2[s]) for s in fitted.model.states):
+                    terms = fitted.model.terms(state)
+                    row = (search, state, len(terms), r2, equation_text(state, terms))
+                    rows.append((*result.parameters.values(), *row))
+    columns = [*results[0].parameters, "search", "state", "n_terms", "r2", "text"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def tied_table(joint: JointResult | None) -> pd.DataFrame:
+    """What it costs to tie the coefficients of the support for all points: R2 at each of them."""
+    tied = joint.tied.equations if joint and joint.tied else {}
+    rows = [
+        (state, ", ".join(equation.terms), point, r2, equation.r2_tied[point])
+        for state, equation in tied.items()
+        for point, r2 in equation.r2_free.items()
+    ]
+    return pd.DataFrame(rows, columns=["state", "terms", "point", "r2_free", "r2_tied"])
+
+
+def laws_table(laws: Mapping[str, Mapping[str, ControlLaw]]) -> pd.DataFrame:
+    rows = [
+        (fit, name, _law_text(name, law), law.r2, law.loo_error, law.search_error)
+        for fit, by_quantity in laws.items()
+        for name, law in by_quantity.items()
+    ]
+    return pd.DataFrame(rows, columns=["fit", "quantity", "law", "r2", "loo_error", "search_error"])
+
+
+def _law_text(name: str, law: ControlLaw) -> str:
+    """A law reads like an equation, but no derivative: `L_m = 0.00816 + 5.37e-05 V_D_V`."""
+    return equation_text(name, law.coef_by_term).replace("'", "", 1)
+
+
+def trends_table(
+    results: Sequence[PointResult],
+    along: Sequence[tuple[str, Mapping[str, float]]],
+    published: pd.DataFrame,
+) -> pd.DataFrame:
+    """Exponents along each parameter, the others held, and those of the published values."""
+    tables = [pd.DataFrame()]
+    for parameter, at in along:
+        table = trends(results, along=parameter, at=at)
+        for index, row in table.iterrows():
+            known = rows_at(published, {**at, "fit": row["fit"], "quantity": row["quantity"]})
+            table.loc[index, "thesis"] = exponent(
+                known[parameter].to_numpy(dtype=float), known["value"].to_numpy(dtype=float)
+            )
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
+
+
+def point_summary(
+    result: PointResult, cases: Mapping[str, Case], searched: Mapping[str, Fitted | None]
+) -> dict[str, Any]:
+    """Quantities are null where a point has no fit, or a refinement nothing finite."""
+    found = {name: _fit_summary(result.fits.get(name), case) for name, case in cases.items()}
+    refined: dict[str, dict[str, Any]] = {}
+    for name, case in cases.items():
+        fit = result.fits.get(name + REFINED)
+        values, ends, r2 = _fit_summary(fit, case)
+        refined[name] = {"status": fit and fit.status, "loss": fit and fit.loss, **values}
+        refined[name] |= {"ci95": ends, "r2": r2}
+    return {
+        **result.parameters,
+        "status": result.status,
+        "f_kHz": 1e-3 * result.f_Hz,
+        "n_samples": result.n_samples,
+        "dt_s": result.dt_s,
+        **{name: values for name, (values, _, _) in found.items()},
+        "ci95": {name: ends for name, (_, ends, _) in found.items()},
+        "r2": {name: r2 for name, (_, _, r2) in found.items() if r2},
+        "refined": refined,
+        "searched": {
+            search: {state: each.model.terms(state) for state in each.model.states}
+            for search, each in searched.items()
+            if each is not None
+        },
+    }
+
+
+def _fit_summary(
+    fit: Fitted | None, case: Case
+) -> tuple[dict[str, float | None], dict[str, list[float]] | None, dict[str, float] | None]:
+    """Values by quantity; ends of their intervals; R2 by state."""
+    if fit is None:
+        return dict.fromkeys(case.quantities), None, None
+    known = fit.estimates
+    values = {name: known[name].value if name in known else None for name in case.quantities}
+    return values, {name: [each.low, each.high] for name, each in known.items()}, dict(fit.r2)
+
+
+def laws_summary(laws: Laws) -> dict[str, Any]:
+    return {
+        fit: {
+            name: {
+                "terms": law.coef_by_term,
+                "r2": law.r2,
+                "loo_error": law.loo_error,
+                "search_error": law.search_error,
+            }
+            for name, law in by_quantity.items()
+        }
+        for fit, by_quantity in laws.items()
+    }
+
+
+def joint_summary(joint: JointResult | None) -> dict[str, Any] | None:
+    """The support for all points, and its coefficients as polynomials of the parameters."""
+    if joint is None:
+        return None
+    tied = joint.tied and {
+        state: {
+            term: dict(zip(joint.tied.law.names, row.tolist(), strict=True))
+            for term, row in zip(equation.terms, equation.coef, strict=True)
+        }
+        for state, equation in joint.tied.equations.items()
+    }
+    return {
+        "terms": {state: list(terms) for state, terms in joint.found.chosen.items()},
+        "tied": tied,
+        "why_not_tied": joint.why_not_tied or None,
+    }
+
+
+def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
+    """How well laws predict, by fit and quantity; NaN for one that was not found."""
+    errors = {}
+    for fit, case in fits.items():
+        for name in case.quantities:
+            law = laws.get(fit, {}).get(name)
+            errors[f"law/{fit}/{name}/loo_error"] = law.loo_error if law else float("nan")
+            errors[f"law/{fit}/{name}/search_error"] = law.search_error if law else float("nan")
+    return errors
+
+
+def live(result: PointResult) -> dict[str, float]:
+    """What TensorBoard shows of a point as it comes."""
+    scalars: dict[str, float] = {}
+    for fit, fitted in result.fits.items():
+        scalars |= {f"{fit}/{name}": each.value for name, each in fitted.estimates.items()}
+        scalars |= {f"{fit}/r2/{state}": value for state, value in fitted.r2.items()}
+    return scalars

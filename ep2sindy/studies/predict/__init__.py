@@ -1,1 +1,0 @@
-"""Laws of the operating point and what they predict."""
