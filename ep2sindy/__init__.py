@@ -95,7 +95,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.refinement.methods.gradient_descent import GradientDescent as GradientDescent
     from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting as MultipleShooting
     from ep2sindy.refinement.methods.nelder_mead import NelderMead as NelderMead
-    from ep2sindy.refinement.methods.single_shooting import SingleShooting as SingleShooting
     from ep2sindy.refinement.ode import ODE as ODE
     from ep2sindy.refinement.refine import Refinement as Refinement
     from ep2sindy.refinement.refine import loss_against_window as loss_against_window
@@ -180,8 +179,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
         simulate_hallthruster_input as simulate_hallthruster_input,
     )
     from ep2sindy.thruster.ionization import ionization_rate as ionization_rate
-    from ep2sindy.thruster.landmark import LANDMARK_POINT as LANDMARK_POINT
-    from ep2sindy.thruster.landmark import landmark_thruster as landmark_thruster
     from ep2sindy.thruster.magnetic_field import MagneticField as MagneticField
     from ep2sindy.thruster.magnetic_field import MagneticFieldTable as MagneticFieldTable
     from ep2sindy.thruster.magnetic_field import read_magnetic_field as read_magnetic_field
@@ -252,7 +249,6 @@ _FACE = {
     "refinement.methods.gradient_descent": "GradientDescent",
     "refinement.methods.multiple_shooting": "MultipleShooting",
     "refinement.methods.nelder_mead": "NelderMead",
-    "refinement.methods.single_shooting": "SingleShooting",
     "refinement.ode": "ODE",
     "refinement.refine": "Refinement refine refine_many loss_against_window",
     "refinement.steps": "RungeKutta HermiteSimpson",
@@ -295,7 +291,6 @@ _FACE = {
     "thruster.hallthruster_input": "HallThrusterInput read_hallthruster_input",
     "thruster.hallthruster_run": "simulate_hallthruster_input",
     "thruster.ionization": "ionization_rate",
-    "thruster.landmark": "LANDMARK_POINT landmark_thruster",
     "thruster.magnetic_field": "MagneticField MagneticFieldTable read_magnetic_field",
     "thruster.parameters": "OPERATING_POINTS OperatingPoint Thruster",
     "thruster.plane.cache": "simulate_2d_cached",

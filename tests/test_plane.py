@@ -7,11 +7,11 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
+from benchmarks.landmark import landmark_thruster
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.fields import check_field
 from ep2sindy.studies import pointwise
 from ep2sindy.thruster.axial.settings import to_json
-from ep2sindy.thruster.landmark import landmark_thruster
 from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.plane import electron_kernels as electrons
 from ep2sindy.thruster.plane import heavy_kernels as heavy

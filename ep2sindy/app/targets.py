@@ -26,11 +26,11 @@ KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing
 AdaptiveLasso STLSQ BestSubset Joint Bootstraps
 AICc EBIC Evidence FreeRunScore Bounds Knee RefinedScore
 Serial Loky Dask
-GradientDescent MultipleShooting NelderMead SingleShooting RungeKutta HermiteSimpson
+GradientDescent MultipleShooting NelderMead RungeKutta HermiteSimpson
 Refining Quantity TimeBootstrap Windows
 PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm PySINDySmoothing
 damped_oscillator lotka_volterra van_der_pol lorenz pendulum
-Thruster OperatingPoint landmark_thruster MagneticField MagneticFieldTable
+Thruster OperatingPoint MagneticField MagneticFieldTable
 read_magnetic_field propellant read_propellant PropellantTable TabulatedRates XenonFits
 AnomalousTransport GaussianTransport MultiLogTransport ExponentialWall SheathWall
 wall_material AnodeSheath FixedAnode ColdStart GuessedStart Restart SoftStart
