@@ -170,7 +170,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.thruster.axial.starts import GuessedStart as GuessedStart
     from ep2sindy.thruster.axial.starts import Restart as Restart
     from ep2sindy.thruster.axial.starts import SoftStart as SoftStart
-    from ep2sindy.thruster.cache import simulate_cached as simulate_cached
     from ep2sindy.thruster.hallthruster_input import HallThrusterInput as HallThrusterInput
     from ep2sindy.thruster.hallthruster_input import (
         read_hallthruster_input as read_hallthruster_input,
@@ -185,7 +184,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.thruster.parameters import OPERATING_POINTS as OPERATING_POINTS
     from ep2sindy.thruster.parameters import OperatingPoint as OperatingPoint
     from ep2sindy.thruster.parameters import Thruster as Thruster
-    from ep2sindy.thruster.plane.cache import simulate_2d_cached as simulate_2d_cached
     from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D as OPERATING_POINT_2D
     from ep2sindy.thruster.plane.simulate import THRUSTER_2D as THRUSTER_2D
     from ep2sindy.thruster.plane.simulate import simulate_2d as simulate_2d
@@ -287,13 +285,11 @@ _FACE = {
     "thruster.axial.balance": "zone_balance",
     "thruster.axial.simulate": "simulate",
     "thruster.axial.starts": "ColdStart GuessedStart Restart SoftStart",
-    "thruster.cache": "simulate_cached",
     "thruster.hallthruster_input": "HallThrusterInput read_hallthruster_input",
     "thruster.hallthruster_run": "simulate_hallthruster_input",
     "thruster.ionization": "ionization_rate",
     "thruster.magnetic_field": "MagneticField MagneticFieldTable read_magnetic_field",
     "thruster.parameters": "OPERATING_POINTS OperatingPoint Thruster",
-    "thruster.plane.cache": "simulate_2d_cached",
     "thruster.plane.simulate": "simulate_2d THRUSTER_2D OPERATING_POINT_2D",
     "thruster.propellant_files": "propellant read_propellant",
     "thruster.propellants": "PropellantTable TabulatedRates XenonFits",

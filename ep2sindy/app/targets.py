@@ -17,7 +17,7 @@ from ep2sindy.machine.own import is_for_configs, own_module
 
 # Names of the package's face.
 _NAMES = """
-Variable open_field read_field simulate simulate_cached simulate_2d simulate_2d_cached
+Variable open_field read_field simulate simulate_2d
 simulate_hallthruster_input three_regions
 crop decimate low_pass derive radial_from_middle keep_where ionization_rate
 Zone ZoneAverage GridPoint LogRate Rate Delays
