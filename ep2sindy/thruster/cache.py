@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
 import xarray as xr
 from tqdm import tqdm
@@ -13,7 +14,15 @@ from tqdm import tqdm
 from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.machine.files import fingerprint, sweep, writing
 from ep2sindy.machine.screen import in_line, on_screen
+from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.seal import sealed, unsealed
+
+
+def read_or_run(
+    cache: str | Path | None, name: str, parameters: dict[str, Any], run: Callable[[], xr.Dataset]
+) -> xr.Dataset:
+    """What `run` returns, from the folder `cache` where one is named; see `kept`."""
+    return run() if cache is None else kept(Path(cache) / name, to_json(parameters), run)
 
 
 def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:

@@ -39,7 +39,7 @@ from ep2sindy.thruster.axial.state_kernels import (
     Model,
     State,
 )
-from ep2sindy.thruster.cache import kept
+from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import uncovered
 from ep2sindy.thruster.verdict import diagnose, performance
@@ -91,18 +91,16 @@ def simulate(
     ('time', 'z')
     """
     settings = Settings(
-        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,
-        coldest_T_e_eV,
+        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl, coldest_T_e_eV,
     )  # fmt: skip
     start = as_start(initial)
     simulation = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
-    if cache is None:
-        return simulation()
-    parameters = {
-        "thruster": thruster, "operating_point": operating_point, "settings": settings,
-        "initial": start.label,
-    }  # fmt: skip
-    return kept(Path(cache) / f"thruster_{operating_point.label}", to_json(parameters), simulation)
+    parameters = _parameters(settings, thruster, operating_point) | {"initial": start.label}
+    return read_or_run(cache, f"thruster_{operating_point.label}", parameters, simulation)
+
+
+def _parameters(settings: Settings, thruster: Thruster, point: OperatingPoint) -> dict[str, Any]:
+    return {"thruster": thruster, "operating_point": point, "settings": settings}
 
 
 def simulate_as(
@@ -114,7 +112,7 @@ def simulate_as(
     progress: Progress | bool,
 ) -> xr.Dataset:
     """`simulate`, with its settings as one value."""
-    parameters = to_json({"thruster": thruster, "operating_point": point, "settings": settings})
+    parameters = to_json(_parameters(settings, thruster, point))
     faces = cell_faces(thruster, settings.n_cells, settings.stretch)
     model = build_model(
         thruster, point, faces, cfl=settings.cfl, reconstruct=settings.reconstruct,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ep2sindy.machine.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial.settings import Settings, to_json
-from ep2sindy.thruster.cache import kept
+from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plane.balance import diagnose
 from ep2sindy.thruster.plane.build import build_model, check_thruster, initial_state
@@ -84,10 +84,8 @@ def simulate_2d(
         "n_z": n_z, "n_r": n_r, "averaged": averaged,
     }  # fmt: skip
     run = partial(simulate_as, settings, thruster, operating_point, progress=progress)
-    if cache is None:
-        return run()
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
-    return kept(Path(cache) / f"plane_{operating_point.label}", to_json(parameters), run)
+    return read_or_run(cache, f"plane_{operating_point.label}", parameters, run)
 
 
 def simulate_as(
