@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
+from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
@@ -25,7 +26,6 @@ from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.runtime.parallel import Loky, Workers
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 
 
 def find(recipe: Recipe, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:

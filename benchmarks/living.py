@@ -55,7 +55,7 @@ class Case:
 @cache
 def record(label: str, zone_mm: tuple[int, int]) -> ep.Trajectory:
     """Zone averages of the default simulation."""
-    field = ep.simulate_cached(
+    field = ep.simulate(
         ep.Thruster(), POINTS[label], cache=Path(".cache/simulations"), progress=False
     )
     zone = ep.Zone(z=(1e-3 * zone_mm[0], 1e-3 * zone_mm[1]))

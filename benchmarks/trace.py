@@ -39,7 +39,7 @@ N_STARTS, STRIDE = 20, 11  # of the held-out samples, at most phases
 def current(point: str) -> Trajectory:
     """The simulator's, as +exp=trace takes it."""
     voltage, mass_flow = map(float, point.split("/"))
-    field = ep.simulate_cached(
+    field = ep.simulate(
         ep.Thruster(), ep.OperatingPoint(voltage, mass_flow), cache=".cache/simulations"
     )
     return Trajectory(field["time"].values, field[NAME].values[:, None], (NAME,), units={NAME: "A"})

@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from benchmarks.joint import find, rates, run_family
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
@@ -21,7 +22,6 @@ from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection
-from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.synthetic.systems import lotka_volterra
 
 METHOD = Recipe(

@@ -218,7 +218,7 @@ def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.Captu
     }
     simulators = {name for name, default in asking.items() if default is True}
     assert simulators == {
-        "simulate", "simulate_cached", "simulate_2d", "simulate_2d_cached",
+        "simulate", "simulate_2d",
         "simulate_hallthruster_input",
     }  # fmt: skip
     assert {asking[name] for name in set(asking) - simulators} == {False}
