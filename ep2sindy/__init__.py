@@ -46,6 +46,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.control_law import control_law as control_law
     from ep2sindy.discovery.discover import Discovery as Discovery
     from ep2sindy.discovery.discover import discover as discover
+    from ep2sindy.discovery.method import Recipe as Recipe
+    from ep2sindy.discovery.method import Regression as Regression
+    from ep2sindy.discovery.method import TrajectorySearch as TrajectorySearch
     from ep2sindy.discovery.operating_fit import LeftOut as LeftOut
     from ep2sindy.discovery.operating_fit import OperatingFit as OperatingFit
     from ep2sindy.discovery.operating_fit import Windows as Windows
@@ -59,7 +62,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.pointwise import Kept as Kept
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
     from ep2sindy.discovery.pointwise import pointwise as pointwise
-    from ep2sindy.discovery.recipe import Recipe as Recipe
     from ep2sindy.discovery.regimes import Regimes as Regimes
     from ep2sindy.discovery.regimes import regimes as regimes
     from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
@@ -67,7 +69,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.estimation.estimate import Estimate as Estimate
     from ep2sindy.estimation.estimate import estimate as estimate
     from ep2sindy.estimation.problem import SlowSearch as SlowSearch
-    from ep2sindy.estimation.solver import Joint as Joint
     from ep2sindy.library.equations import equation_text as equation_text
     from ep2sindy.library.functions import register_function as register_function
     from ep2sindy.library.library import Library as Library
@@ -229,11 +230,10 @@ _FACE = {
     "discovery.operating_map": "MapPoint law_map",
     "discovery.operating_points": "OperatingRecord branches_of",
     "discovery.pointwise": "Kept PointSearch pointwise",
-    "discovery.recipe": "Recipe",
+    "discovery.method": "Regression TrajectorySearch Recipe",
     "discovery.regimes": "Regimes regimes",
     "discovery.shared_support": "JointDiscovery discover_jointly",
     "estimation.estimate": "Estimate estimate",
-    "estimation.solver": "Joint",
     "estimation.problem": "SlowSearch",
     "library.equations": "equation_text",
     "library.functions": "register_function",

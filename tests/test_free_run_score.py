@@ -33,11 +33,11 @@ def record(n_periods=24.0, *, noise=0.0, seed=0):
 
 
 def recipe(*, max_terms=3, n_best=2, formulation=None, **settings):
-    return ep.Recipe(
+    return ep.Regression(
         formulation or ep.Differential(),
         ep.BestSubset(max_terms=max_terms, n_best=n_best),
-        ep.Bootstraps(n=0),
         ep.FreeRunScore(n_windows=4, n_folds=2, **settings),
+        ep.Bootstraps(n=0),
         depth=n_best,
     )
 
@@ -193,8 +193,12 @@ SHARED = "x: x*y == -1 * y: x*y"
 )
 def test_relations_hold_to_the_last_digit(rule):
     run = PREY.trajectory(noise=0.02, rng=0)
-    how = ep.Recipe(
-        ep.WeightedWeak(), ep.BestSubset(max_terms=2), ep.Bootstraps(n=0), rule, depth=1
+    how = ep.Regression(
+        ep.WeightedWeak(),
+        ep.BestSubset(max_terms=2),
+        rule,
+        ep.Bootstraps(n=0),
+        depth=1,
     )
     library = ep.polynomial(["x", "y"], degree=2)
     tied = ep.discover(run, library, how, relations=[SHARED]).model
@@ -204,7 +208,7 @@ def test_relations_hold_to_the_last_digit(rule):
 
 def test_a_coefficient_keeps_the_value_it_is_given():
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    value, how = "x: x*y == -1.1", ep.Recipe(ep.WeightedWeak())
+    value, how = "x: x*y == -1.1", ep.Regression(ep.WeightedWeak())
     free, fixed = (ep.discover(run, None, how, relations=r).model for r in ((), [value]))
     assert fixed.terms("x")["x*y"] == -1.1
     together = ep.discover(run, relations=[value])

@@ -21,9 +21,9 @@ Variable open_field read_field simulate simulate_cached simulate_2d simulate_2d_
 simulate_hallthruster_input three_regions
 crop decimate low_pass derive radial_from_middle keep_where ionization_rate
 Zone ZoneAverage GridPoint LogRate Rate Delays
-Recipe Differential Weak WeightedWeak Bumps Boxes RandomSplit BlockSplit
+Regression TrajectorySearch Recipe Differential Weak WeightedWeak Bumps Boxes RandomSplit BlockSplit
 KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing
-AdaptiveLasso STLSQ BestSubset Joint Bootstraps
+AdaptiveLasso STLSQ BestSubset Bootstraps
 AICc EBIC Evidence FreeRunScore Bounds Knee RefinedScore
 Serial Loky Dask
 GradientDescent MultipleShooting NelderMead SingleShooting RungeKutta HermiteSimpson

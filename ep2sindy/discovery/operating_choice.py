@@ -9,6 +9,7 @@ from itertools import product
 
 import numpy as np
 
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.operating_fit import (
     LeftOut,
     OperatingFit,
@@ -18,7 +19,6 @@ from ep2sindy.discovery.operating_fit import (
     operating_fit,
 )
 from ep2sindy.discovery.operating_points import OperatingRecord, point_text
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Serial, Workers
@@ -61,9 +61,9 @@ def candidate_structures(
 
     One search over all records: a term is in or out everywhere. Rows are those of the derivative.
     """
-    recipe = Recipe(formulation=Differential(), search=BestSubset(max_terms=max_terms))
+    method = Regression(formulation=Differential(), search=BestSubset(max_terms=max_terms))
     runs = {point_text(record.parameters): [record.run] for record in records}
-    found = discover_jointly(runs, library, recipe, progress=progress)
+    found = discover_jointly(runs, library, method, progress=progress)
     sizes = {
         state: [support for support in front.supports if len(support) >= 2]
         for state, front in found.fronts.items()

@@ -9,7 +9,7 @@ import pandas as pd
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
 from ep2sindy.report.document import Equation, Table, places
-from ep2sindy.search.front import Candidate
+from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.rule import selected
 from ep2sindy.studies.library_result import LibraryResult
 
@@ -38,8 +38,7 @@ def front_table(result: LibraryResult, state: str) -> pd.DataFrame:
         {
             "equation": front.equation,
             "n_terms": [c.n_terms for c in front.candidates],
-            "r2_test": [c.r2_test for c in front.candidates],
-            "r2_train": [c.r2_train for c in front.candidates],
+            **_r2_columns(front),
             result.recipe.selection.label: scores,
             "share": [c.share for c in front.candidates],
             "selected": [c is chosen for c in front.candidates],
@@ -48,11 +47,21 @@ def front_table(result: LibraryResult, state: str) -> pd.DataFrame:
     )
 
 
+def _r2_columns(front: ParetoFront) -> dict[str, list[float]]:
+    """None of a search of trajectories, which has no rows."""
+    if front.problem is None:
+        return {}
+    return {
+        "r2_test": [c.r2_test for c in front.candidates],
+        "r2_train": [c.r2_train for c in front.candidates],
+    }
+
+
 def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
     """Candidates, the selected one bold; below them the last fit, and what was published."""
     label = result.recipe.selection.label
     front, scores = result.discovery.fronts[state], result.discovery.scores[state]
-    chosen, held_out = selected(front, scores), bool(front.problem.test.any())
+    chosen, held_out = selected(front, scores), front.held_out
 
     def equation(terms: Mapping[str, float], lead: str = "", mark: str = "") -> Equation:
         shown = {name: clock.seconds * coef for name, coef in terms.items()}
@@ -81,8 +90,9 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
         rows.append(row)
     header = "R2 test" if held_out else "R2 train"
     table = pd.DataFrame(rows, columns=["terms", header, label, "share", "model"])
-    if table["share"].isin(["-", ""]).all():  # of a search without bootstraps
-        del table["share"]
+    for column in (header, "share"):  # of a search without rows, or without bootstraps
+        if table[column].isin(["-", ""]).all():
+            del table[column]
     unit = clock.rate_unit(result.discovery.model.units[state])
     bold = [k for k, each in enumerate(front.candidates) if each is chosen]
     return Table(table, title=f"candidates for {state}' [{unit}]", bold=bold, italic=italic)
@@ -91,4 +101,5 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
 def column_note(label: str) -> str:
     """What the columns of the fronts say."""
     rule = RULES.get(label, f"{label}: the score of the selection, least selected")
-    return f"{rule}. {COLUMNS}"
+    # Candidates that are weighed by trajectories have neither rows nor bootstraps.
+    return f"{rule}." if label == "deviance" else f"{rule}. {COLUMNS}"

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.figures.attractors import Identified
 from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.studies.variants import Variant
@@ -37,7 +37,7 @@ def first_realizations(
 
     Others offer supports alone.
     """
-    recipes = [(name, each) for name, each in variants.items() if isinstance(each, Recipe)]
+    recipes = [(name, each) for name, each in variants.items() if isinstance(each, DiscoveryMethod)]
     if not recipes:
         return None
     name, recipe = recipes[-1]

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.progress import counted
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.run import Run
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.studies.functions import registered
 from ep2sindy.studies.kinds import Coefficients, PositiveOrAll, Share
@@ -53,19 +55,19 @@ class LibraryCase:
             function_degree=self.function_degree,
         )
 
-    def recipe(self, recipe: Recipe) -> Recipe:
+    def recipe(self, recipe: AnyMethod) -> AnyMethod:
         """The recipe that all libraries share, with this one's norm where the rule has one."""
-        if self.n_norm is None or not hasattr(recipe.selection, "n_norm"):
+        if self.n_norm is None or not isinstance(recipe.selection, Knee):
             return recipe
-        rule: Any = recipe.selection
-        return replace(recipe, selection=replace(rule, n_norm=self.n_norm))
+        return replace(recipe, selection=replace(recipe.selection, n_norm=self.n_norm))
 
 
 @dataclass(frozen=True)
 class Study:
     """Discover a model with every library, integrate it from the first sample, compare.
 
-    rollout_s: how far to integrate; None, or more than there is, means to the data's end.
+    formulation, bootstraps: of rows, also where the recipe searches trajectories. rollout_s: how
+    far to integrate; None, or more than there is, means to the data's end.
     thesis: by library, published equations: state -> term -> SI coefficient; where the library
     has the terms, and the data can tell them from others, they are fitted as well. living: how
     libraries without inputs are searched for a model that lives; None leaves that out. held_out:
@@ -74,7 +76,9 @@ class Study:
     """
 
     source: Source
-    recipe: Recipe
+    recipe: AnyMethod
+    formulation: Formulation
+    bootstraps: Bootstraps
     libraries: Mapping[str, LibraryCase]
     rollout_s: PositiveOrAll
     figures: Shown
@@ -97,11 +101,13 @@ class Study:
         # Each case draws from its own stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
+        rows = Regression(self.formulation, bootstraps=self.bootstraps)
         results = {
             name: result_of(
                 runs,
                 library,
                 recipes[name],
+                rows,
                 self.thesis.get(name, {}),
                 self.rollout_s,
                 self.living,
@@ -117,7 +123,7 @@ class Study:
             if result.discovery.misfit:
                 run.warn(f"{name}: {result.discovery.misfit}")
         files = [str(field.attrs.get("file", "")) for field in opened]
-        return Outcome(data, results, self.figures, files)
+        return Outcome(data, results, self.figures, self.formulation.smoother, files)
 
 
 def alone(data: Trajectory) -> str | None:

@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
@@ -25,7 +26,7 @@ from ep2sindy.report.document import (
     pictures,
     places,
 )
-from ep2sindy.search.front import Candidate
+from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.estimate_view import estimate_section, estimate_summary
 from ep2sindy.studies.front_view import candidate_text, column_note, front_table, readable_front
@@ -61,11 +62,15 @@ FRONT = (
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What every library found in the same data; files: of all records, data being the first."""
+    """What every library found in the same data; files: of all records, data being the first.
+
+    smoother: of the data's derivative.
+    """
 
     data: Trajectory
     results: Mapping[str, LibraryResult]
     shown: Shown
+    smoother: Smoother | None
     files: Sequence[str] = ()
 
     @property
@@ -116,8 +121,7 @@ class Outcome:
         return pd.DataFrame(rows)
 
     def figures(self) -> dict[str, Captioned]:
-        formulation = next(iter(self.results.values())).recipe.formulation
-        drawn = run_figures(FIGURES, self.data, self.selected, self.shown, formulation=formulation)
+        drawn = run_figures(FIGURES, self.data, self.selected, self.shown, smoother=self.smoother)
         if self.published:
             drawn["trajectories_thesis"] = trajectories(
                 self.data, self.published, self.shown, THESIS
@@ -235,18 +239,18 @@ def _library_section(name: str, result: LibraryResult, clock: Clock) -> Section:
         )
     for state in found.fronts:
         blocks.append(readable_front(result, state, clock))
-        blocks += [Text(each) for each in left_over(found.chosen[state])]
+        blocks += [Text(each) for each in left_over(state, found.noise_test)]
     blocks.append(Text(column_note(result.recipe.selection.label), page_only=True))
     return Section(f"{name}: candidates", [*blocks, Picture(f"front_{name}")])
 
 
-def left_over(chosen: Candidate) -> list[str]:
+def left_over(state: str, test: NoiseTest) -> list[str]:
     """A line on what the selected terms leave of the rows, where their noise is known."""
-    if chosen.chi_squared is None or chosen.autocorrelation is None:
+    if (left := test.left.get(state)) is None:
         return []
     return [
-        f"left over of {chosen.equation}': {chosen.chi_squared:.3g} times the noise, "
-        f"autocorrelation {chosen.autocorrelation:.2f} (1 and 0 where noise alone is left)"
+        f"left over of {state}': {left.chi_squared:.3g} times the noise, "
+        f"autocorrelation {left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
     ]
 
 
@@ -277,15 +281,15 @@ def _published_summary(result: LibraryResult, state: str) -> dict[str, Any] | No
 
 def _equation_summary(result: LibraryResult, state: str) -> dict[str, Any]:
     chosen, scores = result.discovery.chosen[state], result.discovery.scores[state]
-    terms = result.discovery.model.terms(state)
+    terms, left = result.discovery.model.terms(state), result.discovery.noise_test.left.get(state)
     return {
         "terms": terms,
         "n_terms": chosen.n_terms,
         "r2_test": chosen.r2_test,
         "r2_train": chosen.r2_train,
         result.recipe.selection.label: float(scores.min()),
-        "chi_squared": chosen.chi_squared,
-        "residual_autocorrelation": chosen.autocorrelation,
+        "chi_squared": left and left.chi_squared,
+        "residual_autocorrelation": left and left.autocorrelation,
         "share": chosen.share,
         "inclusion": dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True)),
         "text": equation_text(state, terms),

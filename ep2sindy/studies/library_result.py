@@ -9,13 +9,14 @@ from itertools import compress
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import assemble_model
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
+from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.studies.held_out import first_and_last
 from ep2sindy.studies.living import Living, LivingSearch, living_model
@@ -31,7 +32,7 @@ class LibraryResult:
     selected model over the records beside the first.
     """
 
-    recipe: Recipe
+    recipe: AnyMethod
     discovery: Discovery
     selected: FreeRun
     given: Mapping[str, Mapping[str, float]]
@@ -45,7 +46,8 @@ class LibraryResult:
 def result_of(
     runs: Sequence[Trajectory],
     library: Library,
-    recipe: Recipe,
+    recipe: AnyMethod,
+    rows: Regression,
     published: Mapping[str, Mapping[str, float]],
     rollout_s: float | None,
     living: LivingSearch | None = None,
@@ -59,20 +61,18 @@ def result_of(
     """What one library finds in all records, and how its model and the published one run.
 
     They run over the first record, the model over the others as well; a model that lives is
-    searched in the first.
+    searched in the first. rows: whose formulation and bootstraps serve where the recipe has none.
     """
     first, *others = [
         (run, run.n_samples if rollout_s is None else samples_in(run, rollout_s)) for run in runs
     ]
     data, n_samples = first
     found = discover(list(runs), library, recipe, seed=rng, progress=progress)
-    refitted = _refitted(found, published)
+    refitted = _refitted(found, published, rows, runs, rng)
     lives = roles = None
     if living is not None and not found.model.inputs:
         parts = first_and_last(data, held_out)
-        lives = living_model(
-            *parts, library, recipe, living, found.model, rng=rng, progress=progress
-        )
+        lives = living_model(*parts, library, rows, living, found.model, rng=rng, progress=progress)
         if compared is not None:
             roles = term_roles(
                 lives.discovery, data, *parts, compared, living.bounds,
@@ -93,17 +93,33 @@ def result_of(
 
 
 def _refitted(
-    found: Discovery, published: Mapping[str, Mapping[str, float]]
+    found: Discovery,
+    published: Mapping[str, Mapping[str, float]],
+    rows: Regression,
+    runs: Sequence[Trajectory],
+    rng: np.random.Generator,
 ) -> dict[str, Candidate]:
     """Published terms fitted to our rows, where the data can tell them from others."""
     fits = {}
+    problems = _rows_of(found, rows, runs, rng) if published else {}
     for state, terms in published.items():
         if state in found.fronts:
-            problem = found.fronts[state].problem
+            problem = problems[state]
             at_hand = set(compress(problem.term_names, usable_terms(problem)))
             if set(terms) <= at_hand:
                 fits[state] = fit_support(problem, state, list(terms))
     return fits
+
+
+def _rows_of(
+    found: Discovery, rows: Regression, runs: Sequence[Trajectory], rng: np.random.Generator
+) -> dict[str, RegressionRows]:
+    """By state the rows that were searched; of a search of trajectories, rows for a fit."""
+    fronts = found.fronts.values()
+    if known := {front.equation: front.problem for front in fronts if front.problem is not None}:
+        return known
+    problems = rows.formulation.assemble(runs, found.model.library, rng=rng)
+    return {state: problem for problem in problems for state in problem.equations}
 
 
 def _run_refitted(
@@ -111,9 +127,11 @@ def _run_refitted(
 ) -> FreeRun | None:
     if set(refitted) != set(data.state_names):
         return None
-    model = assemble_model(
-        found.model.library,
-        [refitted[state] for state in data.state_names],
+    coef = [refitted[state].coef_by_term for state in data.state_names]
+    model = SparseModel(
+        library=found.model.library,
+        states=data.state_names,
+        coef=coef_matrix(found.model.library, coef),
         units=data.units,
         provenance={**found.model.provenance, "search": "published terms, refitted"},
     )

@@ -15,8 +15,8 @@ import xarray as xr
 
 import ep2sindy
 from ep2sindy.data.netcdf import write_netcdf
+from ep2sindy.discovery.method import AnyMethod, regression_of
 from ep2sindy.discovery.pointwise import Kept, PointSearch, blocks_of, pointwise
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import regimes
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
@@ -25,10 +25,10 @@ from ep2sindy.machine.own import own_source
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.machine.progress import Advance
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import A_LIST, Count, Names
+from ep2sindy.studies.kinds import A_LIST, Count, Deferred, Names
 from ep2sindy.studies.pointwise_view import Outcome
 from ep2sindy.studies.simulated import say_simulation
-from ep2sindy.studies.source import FieldSource, say_field
+from ep2sindy.studies.source import Step, open_prepared, say_field
 from ep2sindy.thruster.parameters import Thruster
 
 # What does not change the result of a point, and may differ when a broken run is taken up.
@@ -44,8 +44,9 @@ class Study:
     the thruster whose channel is drawn into the maps.
     """
 
-    source: FieldSource
-    recipe: Recipe
+    data: Deferred
+    prepare: Sequence[Step]
+    recipe: AnyMethod
     parallel: Workers
     states: Names
     terms: Annotated[Sequence[str | int], A_LIST]  # 1, the constant, is a number to YAML
@@ -67,11 +68,12 @@ class Study:
         return named_terms(list(used), terms)
 
     def search(self, library: Library, *, seed: int) -> PointSearch:
-        return PointSearch(self.states, library, self.recipe, self.least_variation, seed)
+        method = regression_of(self.recipe)
+        return PointSearch(self.states, library, method, self.least_variation, seed)
 
     def compute(self, run: Run) -> Outcome:
         with run.progress(None, "", "data"):
-            field = self.source.field()
+            field = open_prepared(self.data, self.prepare)
         say_simulation(run, field.attrs)
         say_field(run, field)
         lacking = [name for name in self.variables_if_present if name not in field]

@@ -8,18 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from ep2sindy.data.extent import Zone
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.stability import share_reaching
 from ep2sindy.report.run import Run
+from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
 from ep2sindy.signals.trace import Trace, trace
 from ep2sindy.studies.kinds import Count, Deferred, Positive, Share
 from ep2sindy.studies.living import cycle_of
-from ep2sindy.studies.source import Source
+from ep2sindy.studies.source import Source, zone_of
 from ep2sindy.studies.trace_judged import as_measured, fitted_samples
 from ep2sindy.studies.trace_view import Outcome
 
@@ -41,7 +43,7 @@ class Study:
     """
 
     source: Source
-    recipe: Recipe
+    recipe: AnyMethod
     signal: str
     offset: float
     embedding: str
@@ -79,8 +81,8 @@ class Study:
             return living(signal, chosen, found, states, held, label=self.recipe.selection.label)
 
     def _sampled(self, run: Run) -> Trajectory:
-        zone = getattr(self.source.trajectory, "zone", None)
-        space = [axis for axis in ("z", "r") if getattr(zone, axis, None) is None]
+        zone = zone_of(self.source) or Zone()
+        space = [axis for axis, bounds in (("z", zone.z), ("r", zone.r)) if bounds is None]
         data = only(self.source.data, self.signal, self.unit, without=space)
         source = replace(self.source, data=data)
         with run.progress(None, "", "data"):
@@ -100,9 +102,13 @@ class Study:
 
     def _found(self, chosen: Chosen, states: Trajectory, run: Run) -> Discovery:
         recipe, rule = self.recipe, self.recipe.selection
-        if hasattr(rule, "judged"):  # what was measured counts, not what is made of it
-            changed: Any = rule
-            recipe = replace(recipe, selection=replace(changed, judged=(self.signal,)))
+        if isinstance(rule, SystemSelection):  # what was measured counts, not what is made of it
+            from ep2sindy.selection.free_run import (
+                FreeRunScore,  # torch, for those alone who refine
+            )
+
+            if isinstance(rule, FreeRunScore):
+                recipe = replace(recipe, selection=replace(rule, judged=(self.signal,)))
         if not chosen.embedded.terms:
             recipe = replace(recipe, depth=min(recipe.depth, DEPTH_OF_BOTH))
         return discover(

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Finding
+from ep2sindy.discovery.method import Finding
 from ep2sindy.library.library import Library
 from ep2sindy.studies.kinds import Deferred
 from ep2sindy.synthetic.systems import System
@@ -17,7 +17,7 @@ from ep2sindy.synthetic.systems import System
 
 @runtime_checkable
 class Variant(Protocol):
-    """A complete method: trajectories and a library in, supports out; a `Recipe` is one."""
+    """A complete method: trajectories and a library in, supports out; a `Regression` is one."""
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator

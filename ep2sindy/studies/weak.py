@@ -111,8 +111,8 @@ class Outcome:
 
     def figures(self) -> dict[str, Captioned]:
         models = {name: fitted.integrated for name, fitted in self.labelled.items()}
-        shown, formulation = self.study.figures, self.study.formulation
-        return run_figures(FIGURES, self.data, models, shown, formulation=formulation)
+        shown, smoother = self.study.figures, self.study.formulation.smoother
+        return run_figures(FIGURES, self.data, models, shown, smoother=smoother)
 
     def sections(self) -> list[Section]:
         published = [

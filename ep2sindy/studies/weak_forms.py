@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import assemble_model, reweighted
+from ep2sindy.discovery.choice import EquationFit, assemble_model, reweight
 from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
@@ -16,7 +16,7 @@ from ep2sindy.model.scores import r2
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
-from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.search.front import fit_support
 from ep2sindy.studies.kinds import Deferred
 
 
@@ -122,7 +122,7 @@ def fitted_terms(
     setting: Setting,
     *,
     rng: np.random.Generator,
-) -> dict[str, tuple[Candidate, RegressionRows]]:
+) -> dict[str, tuple[EquationFit, RegressionRows]]:
     """Fit given terms, state by state, and keep the rows that they were fitted to.
 
     Raises ValueError as the form's `assemble` and `fit_support` do.
@@ -131,10 +131,9 @@ def fitted_terms(
     found = {}
     for problem in problems:
         for state in problem.equations:
-            candidate = fit_support(problem, state, terms[state])
-            if setting.weighted:
-                candidate = reweighted(problem, candidate)
-            found[state] = (candidate, problem)
+            plain = fit_support(problem, state, terms[state])
+            fit = EquationFit(state, plain.terms, plain.coef)
+            found[state] = (reweight(problem, plain) if setting.weighted else fit, problem)
     return found
 
 
@@ -165,7 +164,7 @@ def fit_settings(
         found = fitted_terms([run], library, terms, setting, rng=stream)
         model = assemble_model(
             library,
-            [candidate for candidate, _ in found.values()],
+            [fit for fit, _ in found.values()],
             units=run.units,
             provenance={"formulation": repr(setting.formulation), "trajectories": run.label},
         )
@@ -193,8 +192,8 @@ def _half_widths(
     }
 
 
-def _r2_own_rows(candidate: Candidate, problem: RegressionRows) -> float:
-    columns = [problem.library.index(name) for name in candidate.terms]
-    prediction = candidate.coef[None] @ problem.theta[:, columns].T
-    truth = problem.target[:, problem.equations.index(candidate.equation)]
+def _r2_own_rows(fit: EquationFit, problem: RegressionRows) -> float:
+    columns = [problem.library.index(name) for name in fit.terms]
+    prediction = fit.coef[None] @ problem.theta[:, columns].T
+    truth = problem.target[:, problem.equations.index(fit.equation)]
     return float(r2(truth=truth, prediction=prediction)[0])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ep2sindy.discovery.coefficient_law import TiedFit, tied_fit
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.machine.progress import SILENT, Progress
@@ -51,7 +52,9 @@ def searched_jointly(
         for point, result in zip(points, results, strict=True)
         if result.fits and point.trajectory is not None
     }
-    if len(used) < 2 or not isinstance(study.recipe.search, BestSubset):
+    if len(used) < 2 or not (
+        isinstance(study.recipe, Regression) and isinstance(study.recipe.search, BestSubset)
+    ):
         return None
     found = discover_jointly(
         {label: [point.trajectory] for label, point in used.items() if point.trajectory},

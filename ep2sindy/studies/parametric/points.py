@@ -13,7 +13,7 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.model.model import SparseModel
@@ -21,7 +21,7 @@ from ep2sindy.model.scores import r2
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.parametric.oscillation import (
     OSCILLATING,
@@ -76,7 +76,7 @@ class PointStudy:
     """What is done at every operating point.
 
     library: holds the terms of all cases. searched: the library that terms are looked for in, by
-    the recipe, whose formulation makes the rows of the fits as well.
+    the recipe. formulation: makes the rows of the fits.
     Raises ValueError for a quantity whose coefficient a case does not have.
     """
 
@@ -85,7 +85,8 @@ class PointStudy:
     bootstrap: TimeBootstrap
     refining: Refining
     searched: Library
-    recipe: Recipe
+    recipe: AnyMethod
+    formulation: Formulation
 
     def __post_init__(self) -> None:
         for case in self.cases.values():
@@ -178,7 +179,7 @@ def _point_result(point: PointData, study: PointStudy, *, rng: np.random.Generat
         return result
     period_s = 1.0 / result.f_Hz
     rows, *streams, last = rng.spawn(2 * len(study.cases) + 2)
-    problems = study.recipe.formulation.assemble([run], study.library, rng=rows)
+    problems = study.formulation.assemble([run], study.library, rng=rows)
     fits = {}
     for k, (name, case) in enumerate(study.cases.items()):
         fits[name] = _least_squares(run, problems, case, study, period_s, rng=streams[2 * k])
@@ -198,7 +199,7 @@ def _least_squares(
     rng: np.random.Generator,
 ) -> Fitted:
     """The case's fit, its intervals and covariance from rows redrawn in blocks of time."""
-    provenance = {"formulation": repr(study.recipe.formulation), "trajectories": run.label}
+    provenance = {"formulation": repr(study.formulation), "trajectories": run.label}
     model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
     n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
     group_s = (run.t[-1] - run.t[0]) / n_groups
@@ -257,8 +258,10 @@ def _refined(
 
 def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
     found = discover(run, study.searched, study.recipe, seed=rng)
-    problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
-    return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))
+    fronts = found.fronts.values()
+    problems = list(dict.fromkeys(front.problem for front in fronts if front.problem is not None))
+    no_rows = dict.fromkeys(found.model.states, float("nan"))  # of a search of trajectories
+    return Fitted(model=found.model, status=SEARCHED, r2=no_rows | _r2(problems, found.model))
 
 
 def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:

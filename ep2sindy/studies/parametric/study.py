@@ -10,9 +10,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from ep2sindy.constraints.relations import constraint
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.machine.parallel import Workers
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Count, Kind
 from ep2sindy.studies.known_terms import Terms, terms_of
@@ -95,7 +96,8 @@ class Study:
     """
 
     source: Source
-    recipe: Recipe
+    recipe: AnyMethod
+    formulation: Formulation
     parallel: Workers
     parameters: Mapping[str, str | None]
     points: Sequence[Mapping[str, Any]]
@@ -160,6 +162,7 @@ class Study:
             refining=self.refining,
             searched=self.library.library(),
             recipe=self.recipe,
+            formulation=self.formulation,
         )
 
 
