@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.constraints.relations import binding, completed, parse_relation
+from ep2sindy.constraints.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.selection.systems import folds_of
 
@@ -246,10 +246,10 @@ def test_supports_are_completed_by_what_relations_ask():
     library = ep.polynomial(["x", "y"], degree=2)  # 1, x, y, x^2, x*y, y^2
     masks = np.array([[0, 1, 0, 0, 0, 0], [0, 1, 0, 0, 1, 0]], dtype=bool)
     shared = [parse_relation(SHARED)]
-    both = completed(masks, library, "x", shared)
+    both = complete(masks, library, "x", shared)
     assert both.tolist() == [[False, True, False, False, False, False],
                              [False, True, False, False, True, False]]  # fmt: skip
-    valued = completed(masks, library, "x", [parse_relation("x: 1 == 2")])
+    valued = complete(masks, library, "x", [parse_relation("x: 1 == 2")])
     assert valued[:, 0].all()
     assert len(valued) == 2
     assert binding(shared, {"x": ("x*y",), "y": ("y",)}) is None

@@ -15,7 +15,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool
 
-from ep2sindy.constraints.relations import Relation, completed
+from ep2sindy.constraints.relations import Relation, complete
 from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.scales import column_norms, zero_to_one
 from ep2sindy.data.sensor import bounds_of
@@ -27,7 +27,7 @@ from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.weak import WeightedWeak
-from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, resamples
+from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
 from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset, Search
 from ep2sindy.selection.criteria import EBIC, Evidence
@@ -60,7 +60,7 @@ class Known:
             return [known] * len(found)
         if not self.relations:
             return list(found)
-        return [completed(masks, library, equation, self.relations) for masks in found]
+        return [complete(masks, library, equation, self.relations) for masks in found]
 
     def check(self, library: Library, states: Sequence[str]) -> None:
         """Raise ValueError for a state or term that is not there, or an equation without terms."""
@@ -352,12 +352,12 @@ class Regression:
             problems = self.formulation.assemble(runs, library, rng=rng)
         for problem in problems:
             with progress.stage(None, "", "draws of rows"):
-                draws = resamples(problem, self.bootstraps, rng=rng)
+                draws = draw_resamples(problem, self.bootstraps, rng=rng)
             for k, equation in enumerate(problem.equations):
                 with progress.stage(len(draws.xx), "draw", f"search for {equation}'") as advance:
-                    proposed = draws.searched(self.search, k, advance)
+                    proposed = draws.search(self.search, k, advance)
                 found = known.of(equation, library, proposed)
-                supports = pooled(draws, k, found)
+                supports = pool(draws, k, found)
                 front = pareto_front(problem, supports, depth=self.depth)
                 equations.append(SearchedEquation(draws, k, found, supports, front))
         return equations

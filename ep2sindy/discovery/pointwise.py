@@ -94,7 +94,7 @@ def pointwise(
     result = _empty(part, search)
     n_points = sum(block.n_points for block in blocks)
     with as_progress(progress).stage(n_points, "point") as advance:
-        for block, done in _done(part, search, blocks, workers, kept):
+        for block, done in _search_blocks(part, search, blocks, workers, kept):
             _place(result, block, done)
             advance(block.n_points)
     if not (result["status"] == 0).any():
@@ -102,7 +102,7 @@ def pointwise(
     return result
 
 
-def _done(
+def _search_blocks(
     part: xr.Dataset,
     search: PointSearch,
     blocks: Sequence[Block],
@@ -118,7 +118,7 @@ def _done(
         else:
             yield block, done
     pieces = (part.isel(block.slices) for block in waiting)
-    for number, done in workers.run(partial(_searched, search), pieces):
+    for number, done in workers.run(partial(_search_block, search), pieces):
         if kept:
             kept.write(waiting[number], done)
         yield waiting[number], done
@@ -199,7 +199,7 @@ def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> 
         target.values[...] = values.reshape(target.shape)
 
 
-def _searched(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
+def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
     """Every point of a block, points along the last axis; why a fit failed, if one did."""
     block = block.load(scheduler="synchronous")  # in chunks, if at all, on this thread
     t = grid_points(block, "time")

@@ -191,7 +191,8 @@ def _joint_front(
         np.array([gram.yy[0, k] for gram in grams]),
     )
     fits = {
-        p: fit_supports(each, equation, _determined(each, masks)) for p, each in problems.items()
+        p: fit_supports(each, equation, _keep_determined(each, masks))
+        for p, each in problems.items()
     }
     by_point = [errors_of(fits[p]) for p in problems]
     errors = np.exp(np.log(np.maximum(by_point, ROUNDING)).mean(axis=0))
@@ -208,7 +209,7 @@ def _joint_front(
     )
 
 
-def _determined(
+def _keep_determined(
     problem: RegressionRows, masks: Bool[np.ndarray, "supports terms"]
 ) -> Bool[np.ndarray, "supports terms"]:
     """The terms of each support that the rows of one point determine, earlier terms first."""

@@ -44,6 +44,7 @@ LET_GO = 0.5  # of a state's spread: what is left of a state that the model does
 ENOUGH_SAMPLES = 300  # to trust the first start: fewer are quickly tried from all
 # Moves of late channels, since the model of a delay is linear; mean steps that need no other.
 MOST_MOVES, SETTLED = 3, 0.05
+FEWEST_LEFT = 5  # samples of a record, that a smoother takes
 MOST_PASSES = 4  # until noise and support agree: two are the rule
 # Of the smoother, by log10 of process to measurement noise: where the likely one leads astray.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
@@ -138,6 +139,8 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
     for _ in range(MOST_MOVES):
         delays = delays + step
         here = move_channels(here, now.annealed.fit.paths, step)
+        if min(len(record.samples) for record in here.records) < FEWEST_LEFT:
+            return None  # brought as far apart as a record is long: that is no delay
         now = _from_start(here, None, max_terms)
         if now.annealed.around is None:
             return None

@@ -192,7 +192,7 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
     n_terms = len(problem.library)
     equation = problem.equations.index(supports.equation)
     sizes = supports.masks.sum(axis=1)
-    explained = _explained(problem, equation, supports.masks)
+    explained = _explain(problem, equation, supports.masks)
     best = _best_of_each_size(sizes, explained, depth)
     empty = np.zeros((1, n_terms), dtype=np.bool_)
     chosen = Supports(
@@ -248,7 +248,7 @@ def _candidates(problem: RegressionRows, supports: Supports) -> list[Candidate]:
     ]
 
 
-def _explained(
+def _explain(
     problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
 ) -> Float[np.ndarray, " supports"]:
     """By how much each support lowers the target's squares on the rows that judge.
