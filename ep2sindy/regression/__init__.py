@@ -1,1 +1,1 @@
-"""RegressionRows: rows of terms and targets, in each form that the data can be brought to."""
+"""Regression: rows of terms and targets, in each form that the data can be brought to."""
