@@ -21,7 +21,7 @@ import ep2sindy
 # Page of the reference -> the rooms (or modules) whose names in the face it shows.
 REFERENCE = {
     "Discover": [
-        "discovery.discover", "discovery.method", "estimation",
+        "discovery.discover", "discovery.method", "discovery.recipe", "estimation",
         "discovery.shared_support",
     ],
     "Data": [

@@ -46,7 +46,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.control_law import control_law as control_law
     from ep2sindy.discovery.discover import Discovery as Discovery
     from ep2sindy.discovery.discover import discover as discover
-    from ep2sindy.discovery.method import Recipe as Recipe
     from ep2sindy.discovery.method import Regression as Regression
     from ep2sindy.discovery.method import TrajectorySearch as TrajectorySearch
     from ep2sindy.discovery.operating_fit import LeftOut as LeftOut
@@ -62,6 +61,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.discovery.pointwise import Kept as Kept
     from ep2sindy.discovery.pointwise import PointSearch as PointSearch
     from ep2sindy.discovery.pointwise import pointwise as pointwise
+    from ep2sindy.discovery.recipe import Recipe as Recipe
     from ep2sindy.discovery.regimes import Regimes as Regimes
     from ep2sindy.discovery.regimes import regimes as regimes
     from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
@@ -230,7 +230,8 @@ _FACE = {
     "discovery.operating_map": "MapPoint law_map",
     "discovery.operating_points": "OperatingRecord branches_of",
     "discovery.pointwise": "Kept PointSearch pointwise",
-    "discovery.method": "Regression TrajectorySearch Recipe",
+    "discovery.method": "Regression TrajectorySearch",
+    "discovery.recipe": "Recipe",
     "discovery.regimes": "Regimes regimes",
     "discovery.shared_support": "JointDiscovery discover_jointly",
     "estimation.estimate": "Estimate estimate",

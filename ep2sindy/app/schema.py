@@ -11,7 +11,8 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.app.build import PLAIN, Configured, instance_of, is_plain, step_of
-from ep2sindy.discovery.method import AnyMethod, Recipe, method_of
+from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.discovery.recipe import Recipe, method_of
 from ep2sindy.studies.kinds import Deferred, Kind
 from ep2sindy.studies.source import Source, Step
 

@@ -72,7 +72,7 @@ class ParetoFront:
     """The best candidates of every size, the empty model first.
 
     From `pareto_front` they are sorted by size, and within a size by error: the first of each
-    size is the front proper, whose error falls, any others are runners-up. A joint search ranks
+    size is the front proper, whose error falls, any others are runners-up. A shared search ranks
     by all of its points: at one of them errors may rise. problem: the rows they were fitted to;
     None of a search of trajectories, which has none. cloud: all supports that these were taken
     from; None where a front was not made of any.

@@ -15,8 +15,9 @@ import xarray as xr
 
 import ep2sindy
 from ep2sindy.data.netcdf import write_netcdf
-from ep2sindy.discovery.method import AnyMethod, regression_of
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.pointwise import Kept, PointSearch, blocks_of, pointwise
+from ep2sindy.discovery.recipe import regression_of
 from ep2sindy.discovery.regimes import regimes
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
