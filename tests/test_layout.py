@@ -28,7 +28,6 @@ ROOMS = [
     "constraints",
     "search",
     "estimation",
-    "synthetic",
     "systems",
     "refinement",
     "selection",
@@ -61,7 +60,6 @@ HEAVY = {
     "pandas": (
         "data",
         "thruster",
-        "synthetic",
         "discovery",
         "operating",
         "figures",
@@ -72,7 +70,6 @@ HEAVY = {
     "xarray": (
         "data",
         "thruster",
-        "synthetic",
         "discovery",
         "operating",
         "figures",

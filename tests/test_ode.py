@@ -10,7 +10,7 @@ from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.ode import ODE, Drive, HermiteSimpson, RungeKutta, augmented
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 SCALE = np.array([2.0, 3.0])
 
