@@ -26,7 +26,7 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
+from ep2sindy.systems.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 
 
 def find(recipe: Recipe, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:

@@ -71,9 +71,9 @@ from ep2sindy.constraints.relations import constraint as constraint
 from ep2sindy.constraints.relations import Constraint as Constraint
 
 # Systems
-from ep2sindy.synthetic.systems import lorenz as lorenz  # for configs
-from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra  # for configs
-from ep2sindy.synthetic.systems import pendulum as pendulum  # for configs
+from ep2sindy.systems.systems import lorenz as lorenz  # for configs
+from ep2sindy.systems.systems import lotka_volterra as lotka_volterra  # for configs
+from ep2sindy.systems.systems import pendulum as pendulum  # for configs
 
 # Your own code
 from ep2sindy.library.functions import register_function as register_function

@@ -13,7 +13,7 @@ from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.studies.identified import FirstRealizations, first_realizations
 from ep2sindy.studies.variants import Variant
-from ep2sindy.synthetic.draws import realization
+from ep2sindy.systems.draws import realization
 
 SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]
 

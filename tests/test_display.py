@@ -16,7 +16,7 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 UNITS = {"n_i": "m^-3", "n_n": "m^-3"}
 

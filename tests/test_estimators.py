@@ -5,7 +5,7 @@ import pytest
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from ep2sindy.search.estimators import AdaptiveLassoRegressor, STLSQRegressor
-from ep2sindy.synthetic.systems import lorenz, lotka_volterra
+from ep2sindy.systems.systems import lorenz, lotka_volterra
 
 ESTIMATORS = [AdaptiveLassoRegressor(), STLSQRegressor()]
 every_estimator = pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)

@@ -503,7 +503,8 @@ def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "selection", [ep.IntegralScore(), pytest.param(ep.FreeRunScore(), marks=pytest.mark.slow)]
+    "selection",
+    [ep.selection.IntegralScore(), pytest.param(ep.FreeRunScore(), marks=pytest.mark.slow)],
 )
 def test_rules_that_run_models_take_functions(selection: object) -> None:
     run = ep.pendulum().trajectory(noise=0.02, rng=0)
@@ -532,7 +533,7 @@ def test_a_pendulum_swings_on_closed_orbits() -> None:
     [
         {},
         pytest.param(  # torch.optim imports torch's compiler: five seconds
-            {"method": ep.GradientDescent(), "free_start": False}, marks=pytest.mark.slow
+            {"method": ep.refinement.GradientDescent(), "free_start": False}, marks=pytest.mark.slow
         ),
     ],
     ids=["shooting", "descent"],

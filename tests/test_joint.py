@@ -23,8 +23,8 @@ from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
 from ep2sindy.selection.knees import Knee
 from ep2sindy.selection.rule import Selection
-from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
+from ep2sindy.systems.systems import lotka_volterra
 
 METHOD = Recipe(
     WeightedWeak(Weak(test_functions=Bumps(half_width_s=1.5), split=RandomSplit(0.0))),

@@ -12,7 +12,7 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.ode import ODE, Drive
 from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.tangents import augmented
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 SCALE = np.array([2.0, 3.0])
 

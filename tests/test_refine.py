@@ -19,7 +19,7 @@ from ep2sindy.refinement.problem import Iteration, Method
 from ep2sindy.refinement.refine import Refinement, loss_against_window, refine, refine_many
 from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.windows import cut_windows, dominant_window
-from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
+from ep2sindy.systems.systems import System, lorenz, lotka_volterra
 
 PREY, LORENZ = lotka_volterra(), lorenz()
 LONG = replace(PREY, duration_s=300.0)  # 30 windows of 100 samples, none twice

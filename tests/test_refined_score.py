@@ -17,8 +17,8 @@ from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.integral import IntegralScore
 from ep2sindy.selection.refined import RefinedScore, _refined
 from ep2sindy.selection.rule import FLOOR, Selection, selected
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import System, damped_oscillator, lorenz, lotka_volterra
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra
 
 PREY = lotka_volterra()
 Terms = dict[str, float]

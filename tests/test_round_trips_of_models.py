@@ -165,13 +165,13 @@ def test_a_model_that_was_stored_runs_to_the_same_bits(x0: float, n: int) -> Non
     np.testing.assert_array_equal(one.states, two.states)
 
 
-RULES = [ep.AICc(), ep.BIC(), ep.EBIC(), ep.Knee(), ep.LogKnee()]
+RULES = [ep.AICc(), ep.selection.BIC(), ep.EBIC(), ep.Knee(), ep.selection.LogKnee()]
 RECORD = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
 
 
 def found(run: ep.Trajectory, rule: Any, search: Any) -> ep.Discovery:
     library = ep.polynomial(list(run.state_names), degree=2)
-    smoother = ep.SavitzkyGolay()
+    smoother = ep.signals.SavitzkyGolay()
     recipe = ep.Recipe(ep.Differential(smoother=smoother), search, ep.Bootstraps(n=0), rule)
     return ep.discover(run, library, recipe)
 

@@ -18,7 +18,7 @@ from ep2sindy.selection.rule import selected
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)
 SEARCHES = [ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset(max_terms=4)]
-RULES = [ep.AICc(), ep.BIC(), ep.EBIC(), ep.Knee(), ep.LogKnee()]
+RULES = [ep.AICc(), ep.selection.BIC(), ep.EBIC(), ep.Knee(), ep.selection.LogKnee()]
 NAMES = ["a", "b", "c", "d", "e"]
 SIZES = st.sampled_from([1e-18, 1e-3, 1.0, 7.0, 1e19])
 COEF = st.sampled_from([-3.0, -0.5, 0.7, 2.0])
@@ -145,7 +145,7 @@ def test_a_number_that_is_none_is_named(exact: Rows, row: int, column: int, valu
         Rows(theta, exact.target, exact.coef).problem()
 
 
-@pytest.mark.parametrize("kind", [ep.AdaptiveLassoRegressor, ep.STLSQRegressor])
+@pytest.mark.parametrize("kind", [ep.AdaptiveLassoRegressor, ep.regression.STLSQRegressor])
 @FEW
 @given(rows(), st.sampled_from(["F", "C"]), st.booleans())
 def test_a_regressor_and_its_clone_find_the_same(

@@ -11,7 +11,7 @@ from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
 from ep2sindy.selection.knees import Knee, LogKnee
 from ep2sindy.selection.rule import Selection, selected
-from ep2sindy.synthetic.systems import lorenz
+from ep2sindy.systems.systems import lorenz
 
 RULES = [Knee(), LogKnee(), AICc(), BIC(), EBIC(), EBIC(coarsening=None)]
 CRITERIA = [AICc(), BIC(), EBIC(), EBIC(coarsening=None)]

@@ -18,7 +18,7 @@ from ep2sindy.machine.threads import NUMBERS, one_thread
 from ep2sindy.regression.weighted_weak import WeightedWeak
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 PREY = lotka_volterra()
 

@@ -15,7 +15,7 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine_many
 from ep2sindy.refinement.tied import TiedRefinement, refine_tied
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
-from ep2sindy.synthetic.family import LAW, PARAMETERS, TRUTH, realization, system_at
+from ep2sindy.systems.family import LAW, PARAMETERS, TRUTH, realization, system_at
 
 POINTS = list(PARAMETERS)
 WINDOW, N_WINDOWS = 60, 4

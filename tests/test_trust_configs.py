@@ -36,7 +36,7 @@ REFUSED = [
     "ep2sindy.studies.functions._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
     "ep2sindy._stubs.dotted_names", "ep2sindy.warnings", "ep2sindy.thruster.zone_balance",
     "ep2sindy.thruster.parameters.Thruster", "ep2sindy.prepare.import_module", "crop",
-    "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.r2", "prepare.crop",
+    "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.model.r2", "prepare.crop",
     "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
 ]  # fmt: skip
 
@@ -139,7 +139,10 @@ ELSEWHERE = [
     ({"output": "../elsewhere"}, "output to a folder below the one that you start in"),
     ({"output": "${oc.env:PATH}"}, "output to a folder below"),
     ({"data": {"cache": "/elsewhere"}}, "data.cache to a folder below"),
-    ({"parallel": {"_target_": "ep2sindy.Dask", "address": "tcp://a:1"}}, "parallel.address, for"),
+    (
+        {"parallel": {"_target_": "ep2sindy.parallel.Dask", "address": "tcp://a:1"}},
+        "parallel.address, for",
+    ),
 ]
 
 
@@ -233,7 +236,9 @@ def test_a_long_list_is_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_text_that_becomes_a_group_is_looked_at_as_one(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    said = {"data": "${oc.create:'{_target_: ep2sindy.simulate_cached, cache: ../elsewhere}'}"}
+    said = {
+        "data": "${oc.create:'{_target_: ep2sindy.thruster.simulate_cached, cache: ../elsewhere}'}"
+    }
     with pytest.raises(ValueError, match=r"data\.cache to a folder below"):
         check_places(resolved(OmegaConf.create(said)), [])
     check_places(resolved(OmegaConf.create(said)), ["data.cache=../elsewhere"])

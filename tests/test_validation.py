@@ -17,7 +17,7 @@ from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.integral import IntegralScore
 from ep2sindy.selection.resampled import CrossValidation, Stability, blocked_folds
 from ep2sindy.selection.rule import FLOOR, Selection, selected
-from ep2sindy.synthetic.systems import (
+from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
     lorenz,

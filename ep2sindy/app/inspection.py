@@ -26,7 +26,7 @@ records of one kind."""
 def main(arguments: Sequence[str], conf: Path) -> None:
     """conf: the package's configs.
 
-    Raises ValueError as `ep2sindy.inspect` does, and for a config that is there already.
+    Raises ValueError as `ep2sindy.inspect_file` does, and for a config that is there already.
     """
     parser = argparse.ArgumentParser("ep2sindy inspect", description=ABOUT)
     parser.add_argument("path", nargs="+", help="file, folder.zarr or pattern")

@@ -175,7 +175,7 @@ def inspect_file(path: str | Path) -> Inspection:
     r=found.r, dt_s=found.dt_s)` opens what it found.
     Raises ValueError for a file that is missing, empty, damaged or of no known kind.
 
-    >>> found = ep.inspect("run.nc")
+    >>> found = ep.inspect_file("run.nc")
     >>> found.variables["n_i"].unit
     'm^-3'
     """

@@ -204,5 +204,5 @@ def _check(t: np.ndarray, x: np.ndarray) -> None:
     if not x.mean() > 0.0:
         raise ValueError(
             f"a signal must be positive for its logarithm to be taken: its mean is {x.mean():.3g}; "
-            "take its derivative instead (ep.Rate)"
+            "take its derivative instead (ep.signals.Rate)"
         )

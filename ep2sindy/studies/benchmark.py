@@ -21,7 +21,7 @@ from ep2sindy.studies.benchmark_view import Outcome, published_cells
 from ep2sindy.studies.identified import first_realizations
 from ep2sindy.studies.kinds import Count, Deferred, Levels, Names
 from ep2sindy.studies.variants import Variant, built_variants, merits
-from ep2sindy.synthetic.draws import check_systems, realization
+from ep2sindy.systems.draws import check_systems, realization
 
 
 @dataclass(frozen=True)

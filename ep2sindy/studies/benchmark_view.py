@@ -25,7 +25,7 @@ from ep2sindy.report.document import (
 )
 from ep2sindy.studies.identified import FirstRealizations
 from ep2sindy.studies.variants import Variant
-from ep2sindy.synthetic.draws import DRAWS
+from ep2sindy.systems.draws import DRAWS
 
 FIGURE = (
     "Realizations in which all true equations are among the candidates (left), and are the ones "

@@ -21,7 +21,7 @@ from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.studies.kinds import Deferred, Names, Positives
 from ep2sindy.studies.variants import Variant, built_variants, merits
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.systems import System
 
 TITLE = "Lowest sampling rate (Hz) from which on all rates identify the system, by duration"
 FIGURE = (

@@ -13,7 +13,7 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.attractors import Identified
 from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.studies.variants import Variant
-from ep2sindy.synthetic.draws import realization
+from ep2sindy.systems.draws import realization
 
 
 @dataclass(frozen=True, eq=False)

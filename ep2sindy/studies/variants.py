@@ -12,7 +12,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Finding
 from ep2sindy.library.library import Library
 from ep2sindy.studies.kinds import Deferred
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.systems import System
 
 
 @runtime_checkable

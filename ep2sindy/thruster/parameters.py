@@ -72,7 +72,7 @@ class Thruster:
         if self.charge_states > self.propellant.charge_states:
             raise ValueError(
                 "charge_states 2 needs rates of the second charge, which the propellant "
-                f"{named(self.propellant)} has not; take ep2sindy.propellant(name='xenon')"
+                f"{named(self.propellant)} has not; take ep2sindy.thruster.propellant(name='xenon')"
             )
         if self.propellant.range_eV is None:
             return

@@ -115,7 +115,7 @@ def wall_material(
     if name not in MATERIALS:
         raise ValueError(
             f"there are walls of {list(MATERIALS)}: {name!r} came; another material is "
-            "ep2sindy.SheathWall(yield_0=..., crossover_eV=...)"
+            "ep2sindy.thruster.SheathWall(yield_0=..., crossover_eV=...)"
         )
     yield_0, crossover_eV = MATERIALS[name]
     return SheathWall(

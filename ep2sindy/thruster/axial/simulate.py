@@ -79,8 +79,9 @@ def simulate(
     A diverged run ends at its last finite sample and says so; it is not an error.
     Raises ValueError for settings that cannot be run.
 
-    >>> field = ep.simulate(
-    ...     ep.Thruster(), ep.OPERATING_POINTS[3], duration_s=5e-5, warm_up_s=0.0, progress=False
+    >>> point = ep.thruster.OPERATING_POINTS[3]
+    >>> field = ep.thruster.simulate(
+    ...     ep.thruster.Thruster(), point, duration_s=5e-5, warm_up_s=0.0, progress=False
     ... )
     >>> field["n_i"].dims
     ('time', 'z')
