@@ -60,6 +60,7 @@ HEAVY = {
     "pandas": (
         "data",
         "thruster",
+        "systems",
         "discovery",
         "operating",
         "figures",
@@ -68,8 +69,10 @@ HEAVY = {
         "app",
     ),
     "xarray": (
+        "trust.checksum",
         "data",
         "thruster",
+        "systems",
         "discovery",
         "operating",
         "figures",

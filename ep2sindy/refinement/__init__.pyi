@@ -2,9 +2,6 @@
 from ep2sindy.refinement.methods.multiple_shooting import (
     MultipleShooting as MultipleShooting,
 )  # for configs
-from ep2sindy.refinement.methods.single_shooting import (
-    SingleShooting as SingleShooting,
-)  # for configs
 from ep2sindy.refinement.methods.gradient_descent import (
     GradientDescent as GradientDescent,
 )  # for configs
