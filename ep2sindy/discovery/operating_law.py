@@ -15,12 +15,12 @@ from scipy.optimize import nnls
 from scipy.special import ndtri
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.files import read_json, write_text
 
 FORMAT = "ep2sindy.OperatingLaw/1"

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.refinement.kernels import condense, propagate, starts
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import Fit, Iteration, Problem, residual_weights
 from ep2sindy.refinement.shots import largest_defect, least_squares, step_maps, step_share
 from ep2sindy.refinement.weighted_law import Basis
+from ep2sindy.runtime.arrays import read_only
 
 
 @dataclass(frozen=True, eq=False)
