@@ -11,6 +11,7 @@ import xarray as xr
 from scipy.io import savemat
 
 import ep2sindy as ep
+from ep2sindy.app.inspection import experiments
 from ep2sindy.data.conversion import conversion
 from ep2sindy.data.quantities import meant_by
 from ep2sindy.data.readers.registry import open_source
@@ -91,13 +92,17 @@ def test_units_that_are_only_likely_are_asked_and_inspect_takes_them(tmp_path: P
 
 def test_an_inspection_says_what_is_there_and_what_lacks(tmp_path: Path) -> None:
     odd_hdf5(tmp_path / "a.h5", units=False)
-    text = repr(ep.inspect_file(tmp_path / "a.h5"))
+    found = ep.inspect_file(tmp_path / "a.h5")
+    text = repr(found)
     for part in (
         "out/ionDens", "(5, 7, 40)", "n_i in cm^-3", "no time: give the step", "data.dt_s=STEP",
         "R_ion is made by ep2sindy.thruster.ionization_rate from T_e_eV", "z in cm, 0.5 apart",
-        "no length of the channel", "all there for +exp=breathing",
+        "no length of the channel",
     ):  # fmt: skip
         assert part in text, part
+    assert found.lacking(["n_i", "R_ion", "V_d"]) == ("V_d",)  # R_ion can be made
+    (ready,) = experiments(found)
+    assert "all there for +exp=breathing" in ready
     assert "<table>" in ep.inspect_file(tmp_path / "a.h5")._repr_html_()
 
 

@@ -11,8 +11,8 @@ import yaml
 
 import ep2sindy as ep
 from ep2sindy.app import main as program
+from ep2sindy.app.inspection import NEEDS
 from ep2sindy.app.runner import run_config
-from ep2sindy.data.inspection import NEEDS
 from tests.programs import EXPERIMENTS, composed, computed
 
 

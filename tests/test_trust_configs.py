@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.types import RunMode
@@ -134,6 +135,7 @@ ELSEWHERE = [
     ({"hydra": {"overrides": {"task": ["output=/x"]}}}, "must not set hydra.overrides.task"),
     ({"scan": {"cache": ["/elsewhere"]}}, "scan.cache to a folder below"),
     ({"output": "a\0b"}, "output to a folder below"),
+    ({"output": {"a": "../elsewhere"}}, "output must be a folder's name"),  # its text has a ..
     ({"output": "../elsewhere"}, "output to a folder below the one that you start in"),
     ({"output": "${oc.env:PATH}"}, "output to a folder below"),
     ({"data": {"cache": "/elsewhere"}}, "data.cache to a folder below"),
@@ -156,7 +158,7 @@ def test_a_file_cannot_say_what_must_be_typed(
     modes = (RunMode.RUN, RunMode.MULTIRUN) if "hydra" in said else (RunMode.RUN,)
     for mode in modes:
         with pytest.raises(ValueError, match=message):
-            loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], mode)
+            looked_at(tmp_path, ["+exp=theirs"], mode)
 
 
 def test_a_file_may_say_what_need_not_be_typed(tmp_path: Path) -> None:
@@ -165,6 +167,32 @@ def test_a_file_may_say_what_need_not_be_typed(tmp_path: Path) -> None:
     (tmp_path / "exp" / "theirs.yaml").write_text(text)
     found = loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
     assert found.seed == 3
+
+
+def looked_at(folder: Path, overrides: list[str], mode: RunMode) -> None:
+    """As Hydra's loader does, and then a job before all else."""
+    found = loader_of(folder).load_configuration("config", overrides, mode)
+    check_places(resolved(found), overrides)
+
+
+def test_what_is_typed_is_composed_once_for_all_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    composed: list[list[str]] = []
+    whole = ConfigLoaderImpl.load_configuration
+
+    def counted(loader: ConfigLoaderImpl, name: str, overrides: list[str], *how: Any, **more: Any):
+        composed.append(overrides)
+        return whole(loader, name, overrides, *how, **more)
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
+    loader = loader_of(tmp_path)
+    for seed in range(3):
+        loader.load_configuration("config", [f"seed={seed}", "hydra.mode=RUN"], RunMode.RUN)
+    mode = loader.load_configuration("config", ["seed=4"], RunMode.MULTIRUN, True, False)
+    assert mode.hydra.mode is None
+    assert len(composed) == 4
+    assert composed.count(["hydra.mode=RUN"]) == 1
 
 
 def loader_of(folder: Path) -> CheckedLoader:
