@@ -162,8 +162,6 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra
     from ep2sindy.synthetic.systems import pendulum as pendulum
     from ep2sindy.synthetic.systems import van_der_pol as van_der_pol
-    from ep2sindy.thruster.anode import AnodeSheath as AnodeSheath
-    from ep2sindy.thruster.anode import FixedAnode as FixedAnode
     from ep2sindy.thruster.axial.balance import zone_balance as zone_balance
     from ep2sindy.thruster.axial.simulate import simulate as simulate
     from ep2sindy.thruster.axial.starts import ColdStart as ColdStart
@@ -174,7 +172,7 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.thruster.hallthruster_input import (
         read_hallthruster_input as read_hallthruster_input,
     )
-    from ep2sindy.thruster.hallthruster_run import (
+    from ep2sindy.thruster.hallthruster_input import (
         simulate_hallthruster_input as simulate_hallthruster_input,
     )
     from ep2sindy.thruster.ionization import ionization_rate as ionization_rate
@@ -195,7 +193,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.thruster.transport import AnomalousTransport as AnomalousTransport
     from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport
     from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport
+    from ep2sindy.thruster.walls import AnodeSheath as AnodeSheath
     from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall
+    from ep2sindy.thruster.walls import FixedAnode as FixedAnode
     from ep2sindy.thruster.walls import SheathWall as SheathWall
     from ep2sindy.thruster.walls import wall_material as wall_material
 
@@ -281,12 +281,12 @@ _FACE = {
     ),
     "synthetic.regions": "three_regions",
     "synthetic.systems": "System damped_oscillator lotka_volterra van_der_pol lorenz pendulum",
-    "thruster.anode": "AnodeSheath FixedAnode",
     "thruster.axial.balance": "zone_balance",
     "thruster.axial.simulate": "simulate",
     "thruster.axial.starts": "ColdStart GuessedStart Restart SoftStart",
-    "thruster.hallthruster_input": "HallThrusterInput read_hallthruster_input",
-    "thruster.hallthruster_run": "simulate_hallthruster_input",
+    "thruster.hallthruster_input": (
+        "HallThrusterInput read_hallthruster_input simulate_hallthruster_input"
+    ),
     "thruster.ionization": "ionization_rate",
     "thruster.magnetic_field": "MagneticField MagneticFieldTable read_magnetic_field",
     "thruster.parameters": "OPERATING_POINTS OperatingPoint Thruster",
@@ -294,7 +294,7 @@ _FACE = {
     "thruster.propellant_files": "propellant read_propellant",
     "thruster.propellants": "PropellantTable TabulatedRates XenonFits",
     "thruster.transport": "AnomalousTransport GaussianTransport MultiLogTransport",
-    "thruster.walls": "ExponentialWall SheathWall wall_material",
+    "thruster.walls": "AnodeSheath ExponentialWall FixedAnode SheathWall wall_material",
 }
 _MODULES = {name: module for module, names in _FACE.items() for name in names.split()}
 __all__ = ["__version__", *_MODULES]

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from ep2sindy.machine.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial import kernels
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
-from ep2sindy.thruster.axial.grid import cell_faces
-from ep2sindy.thruster.axial.model import CFL, build_model, lengths_and_centres
+from ep2sindy.thruster.axial.model import CFL, build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.output import (
     POWERS,
     as_dataset,
@@ -91,8 +90,8 @@ def simulate(
     ('time', 'z')
     """
     settings = Settings(
-        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl, coldest_T_e_eV,
-    )  # fmt: skip
+        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,
+        coldest_T_e_eV)  # fmt: skip
     start = as_start(initial)
     simulation = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
     parameters = _parameters(settings, thruster, operating_point) | {"initial": start.label}
