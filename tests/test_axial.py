@@ -7,7 +7,7 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.thruster.axial.electron_kernels import solve_from_both_ends
-from ep2sindy.thruster.axial.grid import cell_faces
+from ep2sindy.thruster.axial.model import cell_faces
 from ep2sindy.thruster.verdict import diagnose, judge_status
 
 POINT = ep.thruster.OperatingPoint(300.0, 5.0)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ep2sindy.thruster.anode import Anode, FixedAnode
 from ep2sindy.thruster.checks import check_not_negative, check_positive
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
 from ep2sindy.thruster.propellants import Propellant, XenonFits, named
 from ep2sindy.thruster.transport import AnomalousTransport, Transport
-from ep2sindy.thruster.walls import SheathWall, Wall
+from ep2sindy.thruster.walls import Anode, FixedAnode, SheathWall, Wall
 
 
 @dataclass(frozen=True)
