@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS, GREY, hover, legend_above, panel_grid
+from ep2sindy.figures.style import COLOURS, GREY, hover_spot, legend_above, make_grid
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.search.front import Candidate, Cloud, ParetoFront
 from ep2sindy.selection.rule import selected
@@ -37,15 +37,15 @@ def front_figure(
     on a line at it, those above TOP as marks at the upper edge.
     scores: by state, one per candidate, the lowest selected; label: what they are called.
     """
-    figure, axes = panel_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
+    figure, axes = make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
         chosen = selected(front, scores[state])
         index = front.candidates.index(chosen)
-        _front(ax, front, index)
-        _hovers(ax, front, scores[state], label)
+        _draw_front(ax, front, index)
+        _add_hovers(ax, front, scores[state], label)
         score = f"{_score_label(label)} = {scores[state][index]:.4g}"
-        ax.set_title(f"${latex_derivative(state)}$: {_terms(chosen)}\n{score}", fontsize=9)
-    entries = {line.get_label(): line for ax in axes for line in ax.lines if _labelled(line)}
+        ax.set_title(f"${latex_derivative(state)}$: {_write_terms(chosen)}\n{score}", fontsize=9)
+    entries = {line.get_label(): line for ax in axes for line in ax.lines if _has_label(line)}
     shown = [entries[name] for name in _LAYERS if name in entries]
     legend_above(figure, shown, n_columns=2 if len(axes) == 1 else None, size=9.0)
     return figure
@@ -55,12 +55,12 @@ def front_figure(
 _LAYERS = ("all supports fitted", "runners-up", "best of size", "selected")
 
 
-def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
+def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
     """All supports, runners-up, the best of every size as a line, and the star."""
     every, runners_up, best_of_size, star = _LAYERS
     lowest = front.errors.min()
     if front.cloud is not None:
-        _cloud(ax, front.cloud, label=every)
+        _draw_cloud(ax, front.cloud, label=every)
         lowest = min(lowest, front.cloud.errors.min(initial=np.inf))
     best, errors = front.leading, np.clip(front.errors, FLOOR, TOP)
     if not best.all():
@@ -88,17 +88,16 @@ def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
         )  # fmt: skip
 
 
-def _hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
+def _add_hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
     """Over every candidate something that cannot be seen, and says which it is."""
     errors = np.clip(front.errors, FLOOR, TOP)
     for each, error, score in zip(front.candidates, errors, scores, strict=True):
-        (spot,) = ax.plot(each.n_terms, error, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
         terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
-        text = f"{front.equation}' of {each.n_terms} terms: {terms}"
-        hover(spot, f"{text} | 1 - R2 = {error:.3g} | {label} = {score:.4g}")
+        text = f"{front.equation}' of {each.n_terms} terms: {terms} | 1 - R2 = {error:.3g}"
+        hover_spot(ax, each.n_terms, error, f"{text} | {label} = {score:.4g}")
 
 
-def _cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
+def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
     """Light dots; where the model is worse than none by far, carets at the upper edge."""
     above = cloud.errors > TOP
     style: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
@@ -112,14 +111,14 @@ def _cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
         ax.plot(sizes, at_edge, marker=6, ms=5, clip_on=False, **style)  # 6: a caret up
 
 
-def _terms(candidate: Candidate) -> str:
+def _write_terms(candidate: Candidate) -> str:
     """Of a title; a few in a line."""
     names = [f"${latex_term_name(name)}$" for name in candidate.terms]
     lines = [names[k : k + TERMS_A_LINE] for k in range(0, len(names), TERMS_A_LINE)]
     return ",\n".join(", ".join(line) for line in lines) or "0"
 
 
-def _labelled(line: Line2D) -> bool:
+def _has_label(line: Line2D) -> bool:
     return not str(line.get_label()).startswith("_")
 
 
