@@ -118,9 +118,9 @@ def test_every_panel_of_a_run_shows_something(field: xr.Dataset) -> None:
     assert seconds == pytest.approx(3e-3 / field.attrs["f_kHz"], abs=4e-6)
     drawn = [
         breathing.current_figure(field, window),
-        breathing.spectrum_figure(field, f_kHz=14.0, f_max_Hz=3e5, transit_Hz=6e4),
+        breathing.current_spectrum_figure(field, f_kHz=14.0, f_max_Hz=3e5, transit_Hz=6e4),
         breathing.profile_figure(field),
-        breathing.map_figure(field, window),
+        breathing.space_time_figure(field, window),
     ]
     for figure in drawn:
         assert figure.axes
