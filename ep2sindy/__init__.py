@@ -76,14 +76,14 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.model.stability import LimitCycle as LimitCycle
     from ep2sindy.model.stability import limit_cycle as limit_cycle
     from ep2sindy.model.stability import share_reaching as share_reaching
-    from ep2sindy.operating.fit import LeftOut as LeftOut
+    from ep2sindy.operating.fit import LeaveOneOut as LeaveOneOut
     from ep2sindy.operating.fit import OperatingFit as OperatingFit
     from ep2sindy.operating.fit import Windows as Windows
-    from ep2sindy.operating.fit import left_out as left_out
+    from ep2sindy.operating.fit import leave_one_out as leave_one_out
     from ep2sindy.operating.fit import operating_fit as operating_fit
+    from ep2sindy.operating.law import LawFit as LawFit
     from ep2sindy.operating.law import OperatingLaw as OperatingLaw
-    from ep2sindy.operating.law import TiedFit as TiedFit
-    from ep2sindy.operating.law import tied_fit as tied_fit
+    from ep2sindy.operating.law import fit_law as fit_law
     from ep2sindy.operating.map import MapPoint as MapPoint
     from ep2sindy.operating.map import law_map as law_map
     from ep2sindy.operating.point_fits import Refining as Refining
@@ -228,8 +228,8 @@ _FACE = {
     "data.zones": "ZoneAverage GridPoint zone_average point",
     "discovery.blocks": "Kept",
     "discovery.discover": "Discovery discover",
-    "operating.fit": "LeftOut OperatingFit Windows left_out operating_fit",
-    "operating.law": "OperatingLaw TiedFit tied_fit",
+    "operating.fit": "LeaveOneOut OperatingFit Windows leave_one_out operating_fit",
+    "operating.law": "LawFit OperatingLaw fit_law",
     "operating.map": "MapPoint law_map",
     "operating.quantity_law": "ControlLaw control_law",
     "operating.records": "OperatingRecord branches_of",
