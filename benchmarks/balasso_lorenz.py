@@ -19,10 +19,10 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.machine.parallel import Loky
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, fit_support, fit_supports, front_order
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso, Search
@@ -84,7 +84,7 @@ def drawn(number: int, noise: float, reach: float | None) -> list[Trajectory]:
 
 
 def errors(
-    problem: Regression, candidates: list[Candidate], making: Making
+    problem: RegressionRows, candidates: list[Candidate], making: Making
 ) -> Float[np.ndarray, " candidates"]:
     """1 - R2 of every candidate, as it is made; infinite where there is none."""
     found = np.full(len(candidates), np.inf)

@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from ep2sindy.discovery.last_fit import reweighted
-from ep2sindy.machine.parallel import Loky
+from ep2sindy.discovery.choice import reweighted
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
+from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.front import fit_support
 from ep2sindy.synthetic.draws import DRAWS, realization
 

@@ -28,16 +28,15 @@ from threadpoolctl import threadpool_limits
 from benchmarks.timing import cpu_s
 from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.blocks import blocks_of
-from ep2sindy.discovery.pointwise import PointSearch, pointwise
+from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
-from ep2sindy.machine.parallel import Serial
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s"}
@@ -90,7 +89,7 @@ def read_all(field: xr.Dataset) -> None:
         field.isel(block.slices).load()
 
 
-def rows_at(field: xr.Dataset, iz: int, ir: int) -> Regression:
+def rows_at(field: xr.Dataset, iz: int, ir: int) -> RegressionRows:
     point = field.isel(z=iz, r=ir).load()
     states = np.stack([point[name].values for name in SEARCH.states], axis=1)
     names = SEARCH.variables[len(SEARCH.states) :]
@@ -100,7 +99,7 @@ def rows_at(field: xr.Dataset, iz: int, ir: int) -> Regression:
     return problem
 
 
-def plain_way(problem: Regression, *, once: bool = False) -> None:
+def plain_way(problem: RegressionRows, *, once: bool = False) -> None:
     """Lasso paths of resampled rows, and a fit of every support as it comes up along them.
 
     once: fit none twice, which takes a thought.
@@ -120,7 +119,7 @@ def plain_way(problem: Regression, *, once: bool = False) -> None:
             np.linalg.lstsq(theta[:, list(support)], target)
 
 
-def ensemble_way(problem: Regression) -> None:
+def ensemble_way(problem: RegressionRows) -> None:
     """PySINDy's bagging at ten thresholds, on columns that are scaled."""
     n_terms = len(problem.library)
     theta, targets = problem.train_rows[:, :n_terms], problem.train_rows[:, n_terms:]
@@ -136,7 +135,7 @@ def ensemble_way(problem: Regression) -> None:
             optimizer.fit(theta, targets)
 
 
-def per_point(way: Callable[[Regression], None], problems: list[Regression]) -> float:
+def per_point(way: Callable[[RegressionRows], None], problems: list[RegressionRows]) -> float:
     begin = time.process_time()
     for problem in problems:
         way(problem)
@@ -156,7 +155,7 @@ def compare(path: Path) -> None:
     print(f"  reading and searching     {total_s:8.1f} CPU-s, {1e3 * ours:.2f} ms per point")
     print(f"  peak memory               {peak_GiB:8.2f} GiB")
     problems = [rows_at(field, iz, 20) for iz in (10, 30)]
-    ways: dict[str, Callable[[Regression], None]] = {
+    ways: dict[str, Callable[[RegressionRows], None]] = {
         "scikit-learn": plain_way,
         "the same, no fit twice": partial(plain_way, once=True),
         "PySINDy ensemble": ensemble_way,

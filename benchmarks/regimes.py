@@ -13,22 +13,19 @@ from sklearn.metrics import adjusted_rand_score
 
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.discovery.regimes import Regimes, regimes
-from ep2sindy.machine.parallel import Loky
+from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.regression.differential import Differential
+from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.knees import Knee, LogKnee
-from ep2sindy.selection.resampled import Stability
+from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {
     "ebic": EBIC(),
-    "stability": Stability(),
-    "log_knee": LogKnee(),
+    "log_knee": Knee(scale="log"),
     "knee": Knee(),
 }
 
@@ -47,7 +44,7 @@ def found(truth: RegionField, rule: Selection, *, noise: float, seed: int) -> Re
         seed=seed,
     )
     field = truth.noisy(noise, rng=rng).field
-    return regimes(pointwise(field, search, workers=Loky()), rng=rng)
+    return find_regimes(pointwise(field, search, workers=Loky()), rng=rng)
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import cpu_s
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import AdaptiveLasso
@@ -29,13 +29,13 @@ N_ALPHAS = {
 }
 
 
-def ours(problem: Regression, rng: np.random.Generator) -> list[ParetoFront]:
+def ours(problem: RegressionRows, rng: np.random.Generator) -> list[ParetoFront]:
     supports = pooled_supports(problem, AdaptiveLasso(), BOOTSTRAPS, rng=rng)
     return [pareto_front(problem, found) for found in supports]
 
 
 def plain(
-    problem: Regression, rng: np.random.Generator, *, distinct: bool
+    problem: RegressionRows, rng: np.random.Generator, *, distinct: bool
 ) -> list[dict[int, tuple]]:
     rows = problem.train_rows
     n_terms = len(problem.library)
@@ -58,7 +58,7 @@ def plain(
 
 
 def plain_front(
-    problem: Regression, equation: int, supports: list[tuple[int, ...]]
+    problem: RegressionRows, equation: int, supports: list[tuple[int, ...]]
 ) -> dict[int, tuple]:
     """Best support of every size by its error on the held-out rows."""
     train, test = problem.train_rows, problem.test_rows
@@ -77,7 +77,7 @@ def main() -> None:
     data = system.trajectory(noise=0.05, rng=np.random.default_rng(0))
     library = system.model.library
 
-    def fresh() -> Regression:
+    def fresh() -> RegressionRows:
         # A new value each time, so that no cached Gram matrix flatters us.
         (problem,) = Differential().assemble([data], library, rng=np.random.default_rng(1))
         return problem

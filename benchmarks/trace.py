@@ -28,7 +28,7 @@ from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.signals.embedding import embed
-from ep2sindy.signals.trace import trace
+from ep2sindy.signals.trace import from_one_signal
 from ep2sindy.studies.living import cycle_of
 
 POINTS = ("300/4", "300/5", "300/6", "400/5")
@@ -55,7 +55,7 @@ def as_measured(run: Trajectory, seed: int) -> Trajectory:
 
 def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]:
     begin = time.process_time()
-    chosen = embed(trace(measured))
+    chosen = embed(from_one_signal(measured))
     states = chosen.embedded.run
     n = round(0.75 * states.n_samples)
     bounds = ep.Bounds(frequency=0.005, amplitude=0.05)

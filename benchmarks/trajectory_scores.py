@@ -1,4 +1,4 @@
-"""Selecting by trajectories: refined, free, as the regression left them, and by EBIC beside them.
+"""Selecting by trajectories: refined and free, and by EBIC beside them.
 
     python -m benchmarks.trajectory_scores --n 12 [--systems lotka_volterra lorenz] [--rules EBIC]
 
@@ -15,14 +15,13 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from ep2sindy.machine.parallel import Loky
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.selection.integral import IntegralScore
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import Selection, selected
 from ep2sindy.synthetic.draws import realization
@@ -31,7 +30,6 @@ SYSTEMS = ("lotka_volterra", "van_der_pol", "oscillator", "lorenz")
 NOISES = (0.0, 0.05, 0.2)
 RULES: dict[str, Selection] = {
     "RefinedScore": RefinedScore(),
-    "IntegralScore": IntegralScore(),
     "FreeRunScore": FreeRunScore(),
     "EBIC": EBIC(),
 }
@@ -70,7 +68,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="selection by trajectories")
     parser.add_argument("--n", type=int, default=12, help="realizations per system and noise")
     parser.add_argument("--systems", nargs="*", default=SYSTEMS, help="of these four")
-    parser.add_argument("--rules", nargs="*", default=list(RULES), help="of these four")
+    parser.add_argument("--rules", nargs="*", default=list(RULES), help="of these three")
     given = parser.parse_args()
     n, rules = given.n, given.rules
     for name, noise in product(given.systems, NOISES):

@@ -29,6 +29,7 @@ def rooms() -> dict[str, list[str]]:
 def arrows() -> dict[str, set[str]]:
     """Room -> the rooms that any of its modules imports, at once or later."""
     found: dict[str, set[str]] = {}
+    known = set(rooms())
     for room in rooms():
         trees = [ast.parse(p.read_text("utf-8")) for p in (PACKAGE / room).rglob("*.py")]
         names = {
@@ -38,7 +39,7 @@ def arrows() -> dict[str, set[str]]:
             if isinstance(node, ast.ImportFrom)
         }
         there = {name.split(".")[1] for name in names if name.startswith("ep2sindy.")}
-        found[room] = there - {room}
+        found[room] = there & known - {room}
     return found
 
 

@@ -16,32 +16,8 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from nbclient import NotebookClient
 
-import ep2sindy
+from ep2sindy._stubs import dotted_names
 
-# Page of the reference -> the rooms (or modules) whose names in the face it shows.
-REFERENCE = {
-    "Discover": [
-        "discovery.discover", "discovery.recipe", "estimation.joint", "estimation",
-        "discovery.shared_support",
-    ],
-    "Data": [
-        "data.trajectory", "data.inspection", "data.open", "data.zones", "data", "library.units",
-        "synthetic",
-    ],
-    "Libraries": ["library.library", "library.functions", "library.equations"],
-    "Models": ["model.model", "model"],
-    "Regressions": ["regression", "constraints"],
-    "Searches": ["search"],
-    "Selection": ["selection"],
-    "Refinement": ["refinement"],
-    "Signals": ["signals"],
-    "Operating points": [
-        "operating.fit", "operating.law", "operating.map", "operating.records", "operating",
-    ],
-    "Grids": ["discovery.pointwise", "discovery.blocks", "discovery.regimes", "machine"],
-    "Thruster": ["thruster.parameters", "thruster.axial", "thruster"],
-    "PySINDy": ["studies.pysindy_variants"],
-}  # fmt: skip
 CONTENTS = """# Reference
 
 Every public name, under `import ep2sindy as ep`. Everything is SI unless its name says otherwise;
@@ -54,13 +30,13 @@ NOTEBOOK = "first_steps.ipynb"
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """The reference in the navigation, page by page."""
     (section,) = (part for part in config.nav if "Reference" in part)
-    section["Reference"] = ["reference/index.md", *(f"reference/{_path(t)}" for t in REFERENCE)]
+    section["Reference"] = ["reference/index.md", *(f"reference/{_path(t)}" for t in reference())]
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages: dict[str, str | bytes] = {
-        f"reference/{_path(title)}": _reference(title) for title in REFERENCE
+        f"reference/{_path(title)}": _page(title, names) for title, names in reference().items()
     }
     pages["reference/index.md"] = _contents()
     pages |= notebook_files(Path(config.docs_dir) / NOTEBOOK)
@@ -101,31 +77,27 @@ def _formula(tex: str, display: str) -> str:
     return convert(plain.strip(), display=display)
 
 
-def names_of(title: str) -> list[str]:
-    """The names of the face on a page of the reference, in the order of its places."""
-    return list(
-        dict.fromkeys(
-            name
-            for place in REFERENCE[title]
-            for name, module in ep2sindy._MODULES.items()
-            if f"{module}.".startswith(f"{place}.")
-        )
-    )
+def reference() -> dict[str, list[str]]:
+    """Pages of the reference, the headings of the stubs -> their names, in the stubs' order."""
+    pages: dict[str, list[str]] = {}
+    for name, entry in dotted_names().items():
+        pages.setdefault(entry.heading, []).append(name)
+    return pages
 
 
 def _path(title: str) -> str:
     return title.lower().replace(" ", "_") + ".md"
 
 
-def _reference(title: str) -> str:
-    entries = "\n\n".join(f"::: ep2sindy.{name}" for name in names_of(title))
+def _page(title: str, names: list[str]) -> str:
+    entries = "\n\n".join(f"::: {name}" for name in names)
     return f"# {title}\n\nAll names are those of `import ep2sindy as ep`.\n\n{entries}\n"
 
 
 def _contents() -> str:
     lines = [CONTENTS, "| | names |", "|---|---|"]
-    for title in REFERENCE:
-        links = ", ".join(f"[`{name}`][ep2sindy.{name}]" for name in names_of(title))
+    for title, names in reference().items():
+        links = ", ".join(f"[`{name.removeprefix('ep2sindy.')}`][{name}]" for name in names)
         lines.append(f"| [{title}]({_path(title)}) | {links} |")
     return "\n".join(lines) + "\n"
 

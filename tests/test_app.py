@@ -18,9 +18,9 @@ from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_
 from ep2sindy.app.schema import keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.machine.files import write_json, write_text
+from ep2sindy.runtime.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
-from ep2sindy.studies.kinds import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
+from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
 from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -190,8 +190,8 @@ def test_studies_are_found_by_name() -> None:
     assert study_class("libraries").__name__ == "Study"
     with pytest.raises(ValueError, match=r"study must name a module .* 'librarys' came"):
         study_class("librarys")
-    with pytest.raises(ValueError, match="'ep2sindy.studies.kinds' came"):
-        study_class("ep2sindy.studies.kinds")
+    with pytest.raises(ValueError, match="'ep2sindy.studies.views' came"):
+        study_class("ep2sindy.studies.views")
 
 
 def test_runs_are_compared_by_plain_settings() -> None:

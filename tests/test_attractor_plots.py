@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.figures.attractors import attractor_figure
-from ep2sindy.figures.frames import OFF_SCALE
+from ep2sindy.figures.identified import attractor_figure
+from ep2sindy.figures.style import OFF_SCALE
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.studies.identified import FirstRealizations, first_realizations
-from ep2sindy.studies.variants import Variant
+from ep2sindy.studies.benchmark import FirstRealizations, Variant, first_realizations
 from ep2sindy.synthetic.draws import realization
 
 SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]

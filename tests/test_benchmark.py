@@ -10,13 +10,12 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Finding, Recipe
 from ep2sindy.figures.identified import benchmark_figure, merit_table
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.regression.differential import Differential
+from ep2sindy.runtime.parallel import Loky, Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
-from ep2sindy.selection.knees import Knee
-from ep2sindy.studies.benchmark import Study, cells
-from ep2sindy.studies.variants import Variant, merits
+from ep2sindy.selection.criteria import Knee
+from ep2sindy.studies.benchmark import Study, Variant, cells, merits
 from ep2sindy.synthetic.draws import realization
 from ep2sindy.synthetic.systems import damped_oscillator
 

@@ -10,9 +10,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.app.compare import main as compare
-from ep2sindy.app.sweep import write_index
-from ep2sindy.app.sweep_page import parted
-from ep2sindy.report.words import WORDS, in_words
+from ep2sindy.app.sweep import parted, write_index
+from ep2sindy.report.results import LABELS, in_words
 from tests.browser import seen
 
 CONFIG = "experiment: discover\nseed: 0\nsearch: {_target_: ep2sindy.Joint, max_terms: MOST}\n"
@@ -174,7 +173,7 @@ def test_what_was_varied_is_parted_from_the_rest(tmp_path: Path) -> None:
     ("name", "words"),
     [
         ("simple/n_i/r2_test", "simple, n_i: R2 on held-out rows"),
-        ("simple/living/nrmse", "simple, the model that lives: " + WORDS["nrmse"]),
+        ("simple/living/nrmse", "simple, the model that lives: " + LABELS["nrmse"]),
         ("n_points", "number of points"),
         ("mean_of_it", "mean of it"),
     ],

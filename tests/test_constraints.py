@@ -14,11 +14,11 @@ from ep2sindy.constraints.relations import (
     relations_from_matrix,
 )
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.last_fit import reweighted
+from ep2sindy.discovery.choice import reweighted
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.front import fit_support
@@ -32,12 +32,14 @@ WEAK = Weak(split=RandomSplit(0.0))
 FORMULATIONS = pytest.mark.parametrize("formulation", [DIFFERENTIAL, WEAK], ids=["plain", "weak"])
 
 
-def rows_of(theta: np.ndarray, target: np.ndarray) -> tuple[Regression, ...]:
+def rows_of(theta: np.ndarray, target: np.ndarray) -> tuple[RegressionRows, ...]:
     """Rows of the terms x, y, x*y for the states x and y, as they are."""
     library = named_terms(["x", "y"], ["x", "y", "x*y"])
     n = len(theta)
     return (
-        Regression(theta, target, library, ["x", "y"], np.arange(n), np.zeros(n, dtype=np.bool_)),
+        RegressionRows(
+            theta, target, library, ["x", "y"], np.arange(n), np.zeros(n, dtype=np.bool_)
+        ),
     )
 
 

@@ -12,11 +12,11 @@ from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.correction import Corrected, refine_with_correction
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, pareto_front
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.knees import LogKnee
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.selection.rule import selected
 from ep2sindy.synthetic.systems import lotka_volterra
 
@@ -59,7 +59,7 @@ class Fixed(nn.Module):
 def named(found: Corrected, library: Library) -> list[Candidate]:
     """What the learned term is, equation by equation, at the fitted states."""
     states = found.trajectories.reshape(-1, len(found.model.states))
-    rows = Regression(
+    rows = RegressionRows(
         theta=library.evaluate(states),
         target=found.learned(states),
         library=library,
@@ -73,7 +73,7 @@ def named(found: Corrected, library: Library) -> list[Candidate]:
     fronts = [pareto_front(rows, each) for each in supports]
     return [
         selected(front, score)
-        for front, score in zip(fronts, LogKnee().scores(fronts), strict=True)
+        for front, score in zip(fronts, Knee(scale="log").scores(fronts), strict=True)
     ]
 
 

@@ -9,12 +9,11 @@ from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
-from ep2sindy.selection.criteria import BIC
+from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.selection.knees import Knee
 from ep2sindy.synthetic.systems import lotka_volterra
 
 # Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.
@@ -143,7 +142,11 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: Recipe)
 def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     only_one = polynomial(["x", "y"], degree=0)
-    found = discover(run, only_one, Recipe(Differential(), BestSubset(), Bootstraps(n=0), BIC()))
+    found = discover(
+        run,
+        only_one,
+        Recipe(Differential(), BestSubset(), Bootstraps(n=0), EBIC(gamma=0.0, coarsening=None)),
+    )
     assert {chosen.terms for chosen in found.chosen.values()} == {()}
     assert "x'" in found.misfit
 

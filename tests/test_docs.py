@@ -18,6 +18,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import ep2sindy as ep
+from ep2sindy._stubs import dotted_names
 from ep2sindy.app.runner import check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
@@ -211,22 +212,23 @@ def test_what_is_printed_is_compared(came: str, is_right: bool) -> None:
 
 def has_example(name: str) -> bool:
     """Read from the source: importing all of the face takes long."""
-    source = (ROOT / "ep2sindy" / f"{ep._MODULES[name].replace('.', '/')}.py").read_text("utf-8")
+    entry = dotted_names()[name]
+    source = (ROOT / f"{entry.module.replace('.', '/')}.py").read_text("utf-8")
     if ">>> " not in source:
         return False
-    nodes = [node for node in ast.parse(source).body if getattr(node, "name", None) == name]
+    nodes = [node for node in ast.parse(source).body if getattr(node, "name", None) == entry.name]
     return any(">>> " in (ast.get_docstring(node) or "") for node in nodes)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in ep._MODULES if has_example(n)])
+@pytest.mark.parametrize("name", [n for n in dotted_names() if has_example(n)])
 def test_the_example_of_a_docstring_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a folder that holds run.nc."""
     monkeypatch.chdir(tmp_path)
     write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, tmp_path / "run.nc")
-    text = getattr(ep, name).__doc__
+    text = dotted_names()[name].load().__doc__
     example = doctest.DocTestParser().get_doctest(text, {"ep": ep, "np": np}, name, None, None)
     said: list[str] = []
     doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append)

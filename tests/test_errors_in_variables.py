@@ -5,15 +5,14 @@ import pytest
 
 from benchmarks.intervals import held
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import reweighted
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.last_fit import reweighted
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, fit_support, pareto_front
@@ -25,7 +24,7 @@ from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
 EVERY_ROW = Weak(split=RandomSplit(0.0))
 
 
-def problems_of(system: System, runs: list[Trajectory]) -> tuple[Regression, ...]:
+def problems_of(system: System, runs: list[Trajectory]) -> tuple[RegressionRows, ...]:
     return EVERY_ROW.assemble(runs, system.model.library, rng=np.random.default_rng(0))
 
 
@@ -33,12 +32,12 @@ def noisy_runs(system: System, noise: float, n: int = 1) -> list[Trajectory]:
     return [system.trajectory(noise=noise, rng=np.random.default_rng(k)) for k in range(n)]
 
 
-def fitted(system: System, problem: Regression) -> Candidate:
+def fitted(system: System, problem: RegressionRows) -> Candidate:
     (state,) = problem.equations
     return reweighted(problem, fit_support(problem, state, list(system.model.terms(state))))
 
 
-def mask_and_coef(problem: Regression, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
+def mask_and_coef(problem: RegressionRows, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
     """A candidate as whitened_rows takes it."""
     mask = np.isin(problem.term_names, candidate.terms)
     coef = np.zeros(len(mask))

@@ -12,13 +12,13 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy.constraints.relations import parse_relation
-from ep2sindy.estimation import size
+from ep2sindy.estimation import problem as size
 from ep2sindy.estimation.kernels import departures, eliminated
 from ep2sindy.estimation.likelihood import Fit, Gram, Level, fitted, gram, squares
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import Problem, scaled_problem
 from ep2sindy.estimation.supports import alternatives, best_support, priced, term_prices
-from ep2sindy.machine import memory
+from ep2sindy.trust import memory
 
 
 @pytest.fixture

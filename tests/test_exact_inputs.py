@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import reweighted
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.last_fit import reweighted
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import polynomial
-from ep2sindy.regression.exact_inputs import is_switched
 from ep2sindy.regression.rows import NoisyRows
 from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak, is_switched
 from ep2sindy.search.front import fit_support
 from ep2sindy.signals.smoothers import SavitzkyGolay
 

@@ -10,8 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.app.runner import run_config
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.studies.benchmark_view import published_cells
-from ep2sindy.studies.variants import Variant
+from ep2sindy.studies.benchmark import Variant, published_cells
 from tests import programs
 
 

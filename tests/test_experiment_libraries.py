@@ -11,8 +11,8 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
-from ep2sindy.machine.files import write_json
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
@@ -325,8 +325,8 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
 
 def test_a_library_may_have_a_knee_norm_of_its_own(breathing_run: Path) -> None:
     log = (breathing_run / "run.log").read_text()
-    assert "6 terms in n_i, n_n; selection: Knee(n_norm='library')" in log
-    assert log.count("selection: Knee(n_norm='max_terms')") == 2
+    assert "6 terms in n_i, n_n; selection: Knee(n_norm='library', scale='linear')" in log
+    assert log.count("selection: Knee(n_norm='max_terms', scale='linear')") == 2
 
 
 def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:

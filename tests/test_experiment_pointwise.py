@@ -16,9 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 from ep2sindy.app.runner import run_config, started_run
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.discovery.blocks import Block, Kept
+from ep2sindy.discovery.pointwise import Block, Kept
 from ep2sindy.studies import pointwise
-from ep2sindy.studies.pointwise_view import Outcome
+from ep2sindy.studies.pointwise import Outcome
 from ep2sindy.synthetic.regions import TERMS, three_regions
 from tests import programs
 
@@ -258,7 +258,7 @@ def test_an_interrupted_run_says_how_to_go_on(
 
 KILLED = """
 import os, signal
-from ep2sindy.discovery.blocks import Kept
+from ep2sindy.discovery.pointwise import Kept
 from ep2sindy.app.main import main
 
 write = Kept.write

@@ -16,12 +16,10 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
-from ep2sindy.machine.files import WriteError
+from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import parametric
-from ep2sindy.studies.simulate import Study
-from ep2sindy.studies.simulate_scan import Simulated, compile_kernels, scan_points, value_text
-from ep2sindy.studies.simulate_view import Outcome
-from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, doubts
+from ep2sindy.studies.simulate import Outcome, Simulated, Study, scan_points, value_text
+from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from ep2sindy.studies.source import point_sources
 from tests import programs
 

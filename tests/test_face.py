@@ -1,45 +1,115 @@
 """The face: what users import and configs name."""
 
-import ast
 import subprocess
 import sys
+import warnings
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
 import ep2sindy as ep
-from ep2sindy.app.targets import FOR_CONFIGS
+from ep2sindy._old_names import RENAMED, gone_text
+from ep2sindy._stubs import MARK, PACKAGE, dotted_names, read_stub, rooms
+from ep2sindy.app.targets import FOR_CONFIGS, target_of
 
 ROOT = Path(__file__).resolve().parents[1]
+STUBS = sorted((ROOT / PACKAGE).rglob("*.pyi"))
+N_OLD = 195
 
 
-def test_every_name_of_the_face_is_where_the_table_says() -> None:
-    lost = [
-        f"{name} is not in {module}"
-        for name, module in ep._MODULES.items()
-        if getattr(ep, name) is not getattr(import_module(f"ep2sindy.{module}"), name, None)
-    ]
-    assert not lost, "\n".join(lost)
-    assert set(ep._MODULES) <= set(dir(ep))
+def test_every_name_of_a_stub_is_loaded_as_it_says() -> None:
+    for room in rooms():
+        module = import_module(room)
+        assert dir(module) == sorted(read_stub(room))
+        for name, entry in read_stub(room).items():
+            value = getattr(module, name)
+            assert value is getattr(import_module(entry.module), entry.name)
+            home = value.__module__ if isinstance(value, type) else entry.module
+            assert home == entry.module, f"{room}.{name} is defined elsewhere"
+            assert name == entry.name, f"type checkers take {name} for no name of {room}"
+    assert len(STUBS) == len(rooms())
 
 
-def test_editors_see_the_names_that_are_loaded() -> None:
-    tree = ast.parse(Path(ep.__file__).read_text())
-    (block,) = (n for n in tree.body if isinstance(n, ast.If))
-    seen = {
-        alias.asname: node.module
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    assert seen == {name: f"ep2sindy.{module}" for name, module in ep._MODULES.items()}
+def test_a_name_stands_in_one_stub_and_hides_no_module() -> None:
+    names = [name.rpartition(".")[2] for name in dotted_names()]
+    assert len(names) == len(set(names))
+    places = [ROOT.joinpath(*name.split(".")) for name in dotted_names()]
+    assert not [place for place in places if place.is_dir() or place.with_suffix(".py").exists()]
 
 
-def test_an_unknown_name_says_where_to_look() -> None:
-    with pytest.raises(AttributeError, match=r"no attribute 'Eebic'; see dir\(ep2sindy\)"):
-        ep.Eebic  # noqa: B018
+def test_a_mark_is_written_as_it_is_read() -> None:
+    """Nothing else stands behind a name, so that no mark is misspelt."""
+    lines = [line for path in STUBS for line in path.read_text("utf-8").splitlines()]
+    assert {t[t.index("#") :] for t in lines if "#" in t and not t.startswith("# ")} == {MARK}
+
+
+def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
+    """From the stubs alone: what stands in other modules would take a minute."""
+    for path in STUBS:
+        copy = tmp_path / path.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+    (tmp_path / "code.py").write_text(
+        "import ep2sindy as ep\n"
+        "from ep2sindy.prepare import crop\n"
+        "from ep2sindy.discovery import Estimate\n"
+        "ep.inspect_file, ep.thruster.Thruster, ep.warnings.SlowSearch, ep.__version__\n"
+        "ep.discovre\n"
+        "ep.thruster.Thrster\n"
+        "ep.crop\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-m", "mypy", "--no-site-packages", "--ignore-missing-imports", "code.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    errors = [line for line in result.stdout.splitlines() if ": error: " in line]
+    assert [line.split('"')[1] for line in errors] == ["discovre", "Thrster", "crop"], result.stdout
+
+
+@pytest.mark.parametrize(
+    ("room", "name", "said"),
+    [
+        ("ep2sindy", "Eebic", r"no attribute 'Eebic'; see dir\(ep2sindy\)"),
+        ("ep2sindy", "Trajectry", r"see dir\(ep2sindy\); near it is ep2sindy.Trajectory$"),
+        ("ep2sindy.thruster", "crop", r"see dir\(ep2sindy.thruster\); near it is .*prepare.crop$"),
+        ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
+    ],
+)
+def test_an_unknown_name_says_where_to_look(room: str, name: str, said: str) -> None:
+    with pytest.raises(AttributeError, match=said):
+        getattr(import_module(room), name)
+
+
+def test_every_old_name_is_found_or_says_what_to_use() -> None:
+    old = (ROOT / "tests" / "data" / "names_0_2.txt").read_text().split()
+    assert len(old) == N_OLD
+    for name in old:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            if name in read_stub(PACKAGE):
+                getattr(ep, name)
+                assert not said, name
+            elif gone_text(f"ep2sindy.{name}"):
+                with pytest.raises(AttributeError, match=f"ep2sindy.{name} is gone; "):
+                    getattr(ep, name)
+            else:
+                new = f"ep2sindy.{RENAMED[name]}"
+                assert getattr(ep, name) is dotted_names()[new].load()
+                assert [each.category for each in said] == [FutureWarning]
+                assert str(said[0].message).startswith(f"ep2sindy.{name} is now {new}")
+                assert said[0].filename == __file__
+
+
+def test_a_config_with_an_old_name_is_built_with_a_warning() -> None:
+    node = OmegaConf.create({"_target_": "ep2sindy." + "crop"})
+    with pytest.warns(FutureWarning, match=r"ep2sindy.crop is now ep2sindy.prepare.crop"):
+        assert target_of(node, "here") is ep.prepare.crop
 
 
 def test_the_version_is_the_one_installed() -> None:
@@ -56,18 +126,17 @@ def targets(node: object) -> set[str]:
     return own | {found for each in node.values() for found in targets(each)}
 
 
-def test_configs_name_the_face_and_what_it_has() -> None:
+def test_configs_name_what_is_for_configs() -> None:
     paths = [p for p in (ROOT / "conf").rglob("*.yaml") if "hydra" not in p.parts]
     found = {name for path in paths for name in targets(yaml.safe_load(path.read_text()))}
     assert found
-    assert {name.removeprefix("ep2sindy.") for name in found} <= FOR_CONFIGS
-    assert set(ep._MODULES) >= FOR_CONFIGS
+    assert found <= FOR_CONFIGS
 
 
 def test_torch_and_pandas_are_loaded_by_those_alone_who_use_them() -> None:
     code = (
         "import sys, ep2sindy as ep\n"
-        "ep.discover, ep.EBIC, ep.SparseModel\n"
+        "ep.discover, ep.EBIC, ep.SparseModel, ep.refinement, ep.thruster\n"
         "assert not {'torch', 'pandas', 'xarray', 'matplotlib', 'hydra'} & set(sys.modules)\n"
         "sys.modules['torch'] = None  # whoever asks for it now is told that there is none\n"
         "try:\n"

@@ -9,7 +9,7 @@ from ep2sindy.data.extent import Zone
 from ep2sindy.data.fields import check_field, mask_outside
 from ep2sindy.data.open import read_field, write_field
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.data.zones import GridPoint, point, zone_average
+from ep2sindy.data.zones import GridPoint, point_samples, zone_average
 from ep2sindy.studies.source import Sampling
 
 T = np.linspace(0.0, 1e-4, 11)
@@ -206,7 +206,7 @@ def test_fields_of_different_lengths_give_trajectories_of_theirs() -> None:
 
 def test_a_point_is_the_nearest_cell() -> None:
     field = masked_field()
-    run = point(field, z=0.9, r=1.2, states=["n_i"], inputs=["n_n", "T_e_eV"])
+    run = point_samples(field, z=0.9, r=1.2, states=["n_i"], inputs=["n_n", "T_e_eV"])
     assert run.values[0].tolist() == [3.0, 1.0, 3.0]
     chosen = GridPoint(["n_i"], z=0.9, r=1.2)  # as a config says it
     assert isinstance(chosen, Sampling)
@@ -225,7 +225,7 @@ def test_a_point_is_the_nearest_cell() -> None:
 )
 def test_a_point_without_data_is_refused(place: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        point(masked_field(), **place, states=["n_i"])
+        point_samples(masked_field(), **place, states=["n_i"])
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from ep2sindy.library.equations import equation_html
-from ep2sindy.machine.files import WriteError, fingerprint, replacing, write_text
 from ep2sindy.report.folder import RunFolder
+from ep2sindy.runtime.files import WriteError, fingerprint, replacing, write_text
 
 NOW = datetime(2026, 1, 2, 3, 4, 5)
 

@@ -9,7 +9,7 @@ from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import free_run, samples_in
-from ep2sindy.model.likeness import Bounds, Verdict
+from ep2sindy.model.likeness import FreeRunBounds, Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.synthetic.systems import lorenz
 
@@ -74,9 +74,12 @@ def test_a_transient_does_not_count() -> None:
 
 def test_bounds_are_settings() -> None:
     model = hopf(radius=1.05)
-    assert free_run(model, record(), bounds=Bounds(amplitude=0.03)).verdict is Verdict.WRONG_CYCLE
+    assert (
+        free_run(model, record(), bounds=FreeRunBounds(amplitude=0.03)).verdict
+        is Verdict.WRONG_CYCLE
+    )
     with pytest.raises(ValueError, match="the bound waveform must be positive: 0.0 came"):
-        Bounds(waveform=0.0)
+        FreeRunBounds(waveform=0.0)
 
 
 def test_units_change_nothing() -> None:

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.constraints.relations import parse_relation
-from ep2sindy.constraints.support import binding, completed
+from ep2sindy.constraints.relations import binding, completed, parse_relation
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.selection.folds import folds_of
+from ep2sindy.selection.systems import folds_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
 THRUSTER = [

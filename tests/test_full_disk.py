@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.machine.files import WriteError, replacing, sweep, write_bytes, write_text
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
+from ep2sindy.runtime.files import WriteError, replacing, sweep, write_bytes, write_text
 
 resource = pytest.importorskip("resource", reason="limits of a process need POSIX")
 

@@ -503,7 +503,7 @@ def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "selection", [ep.IntegralScore(), pytest.param(ep.FreeRunScore(), marks=pytest.mark.slow)]
+    "selection", [ep.RefinedScore(), pytest.param(ep.FreeRunScore(), marks=pytest.mark.slow)]
 )
 def test_rules_that_run_models_take_functions(selection: object) -> None:
     run = ep.pendulum().trajectory(noise=0.02, rng=0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from ep2sindy.data.readers import guard
 from ep2sindy.data.readers.registry import open_source
+from ep2sindy.trust import guard
 
 X = np.arange(6.0)
 

@@ -11,17 +11,15 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library, named_terms, polynomial
-from ep2sindy.machine.parallel import Serial
 from ep2sindy.operating.law import fit_law
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Formulation, Regression
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
+from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
-from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection
 from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.synthetic.systems import lotka_volterra
@@ -34,17 +32,18 @@ METHOD = Recipe(
 )
 BEST = BestSubset()
 NAMES = ["a", "b", "c", "d", "e", "f"]
+BIC = EBIC(gamma=0.0, coarsening=None)
 
 
 @dataclass(frozen=True)
 class Given:
     """Rows made by a test, found by the label of their trajectory."""
 
-    rows: Mapping[str, Regression]
+    rows: Mapping[str, RegressionRows]
 
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
-    ) -> tuple[Regression, ...]:
+    ) -> tuple[RegressionRows, ...]:
         return (self.rows[trajectories[0].label],)
 
 
@@ -55,14 +54,14 @@ def rows_of(
     noise: float = 0.0,
     n_rows: int = 60,
     silent: Sequence[str] = (),
-) -> Regression:
+) -> RegressionRows:
     """Rows of six unrelated terms and a target that some of them make up; silent ones are zero."""
     rng = np.random.default_rng(seed)
     theta = rng.normal(size=(n_rows, 6))
     theta[:, [NAMES.index(name) for name in silent]] = 0.0
     error = noise * rng.normal(size=n_rows)
     truth = np.array([coef.get(name, 0.0) for name in NAMES])
-    return Regression(
+    return RegressionRows(
         theta=theta,
         target=(theta @ truth + error)[:, None],
         library=named_terms(NAMES, NAMES),
@@ -73,7 +72,7 @@ def rows_of(
 
 
 def searched(
-    rows: Mapping[str, Regression], *, selection: Selection, search: Search = BEST
+    rows: Mapping[str, RegressionRows], *, selection: Selection, search: Search = BEST
 ) -> JointDiscovery:
     def label(point: str) -> Trajectory:
         ramp = np.arange(3.0)
@@ -90,7 +89,7 @@ def searched(
 
 @pytest.mark.parametrize(
     ("formulation", "selection"),
-    [(Differential(), Knee()), (WeightedWeak(), EBIC()), (Weak(), BIC())],
+    [(Differential(), Knee()), (WeightedWeak(), EBIC()), (Weak(), BIC)],
     ids=lambda value: type(value).__name__,
 )
 def test_one_point_gives_what_discover_does(formulation: Formulation, selection: Selection) -> None:
@@ -172,9 +171,9 @@ def test_a_term_that_some_points_cannot_show_is_found() -> None:
 def test_terms_taken_in_by_chance_at_single_points_are_dropped() -> None:
     truth = {"a": 1.0, "b": -0.6, "c": 0.4}
     rows = {f"P{k}": rows_of(truth, seed=k, noise=0.5, n_rows=30) for k in range(8)}
-    alone = [searched({p: r}, selection=BIC()).chosen["y"] for p, r in rows.items()]
+    alone = [searched({p: r}, selection=BIC).chosen["y"] for p, r in rows.items()]
     assert sum(set(terms) - set(truth) != set() for terms in alone) >= 2
-    assert searched(rows, selection=BIC()).chosen["y"] == ("a", "b", "c")
+    assert searched(rows, selection=BIC).chosen["y"] == ("a", "b", "c")
 
 
 def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -> None:
@@ -189,13 +188,13 @@ def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -
 def test_joint_errors_are_geometric_means_that_fall_with_size() -> None:
     truth = {"a": 1.0, "b": -0.6}
     rows = {f"P{k}": rows_of(truth, seed=k, noise=0.1 * 10.0**k) for k in range(3)}
-    front = searched(rows, selection=BIC()).fronts["y"]
+    front = searched(rows, selection=BIC).fronts["y"]
     assert np.all(np.diff(front.errors) < 0)
     at_points = np.array([each.errors for each in front.points.values()])
     assert front.errors == pytest.approx(np.prod(at_points, axis=0) ** (1 / 3), rel=1e-12)
 
 
-@pytest.mark.parametrize("selection", [AICc(), BIC(), EBIC()], ids=lambda s: s.label)
+@pytest.mark.parametrize("selection", [AICc(), BIC, EBIC()], ids=lambda s: s.label)
 def test_units_and_amplitude_of_one_point_change_nothing(selection: Selection) -> None:
     truth = {"a": 1.0, "b": -0.6, "c": 0.1}
     rows = {f"P{k}": rows_of(truth, seed=k, noise=0.5) for k in range(4)}
@@ -243,7 +242,7 @@ def test_the_count_of_supports_is_paid_once() -> None:
     assert full.scores["y"] == pytest.approx(plain.scores["y"] + 1.4 * counts, rel=1e-12)
 
 
-def law_rows(noise: float, *, seed: int = 0, bend: float = 0.0) -> dict[str, Regression]:
+def law_rows(noise: float, *, seed: int = 0, bend: float = 0.0) -> dict[str, RegressionRows]:
     """a follows 2 - 3 p, b follows p + bend p^2 over four points."""
     return {
         f"p={p}": rows_of(

@@ -6,17 +6,18 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from ep2sindy.discovery.regimes import Regimes, regimes
+from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.figures.maps import (
     ABSENT,
+    COUNTS,
     GAP,
     HALF,
+    SHARES,
     SINK,
     coefficient_maps,
     quality_maps,
     regime_map,
 )
-from ep2sindy.figures.panels import COUNTS, SHARES
 from ep2sindy.thruster.parameters import Thruster
 
 TERMS = ["1", "n_n", "n_i*u_iz"]
@@ -65,7 +66,7 @@ def study() -> xr.Dataset:
 
 
 def grouped(result: xr.Dataset) -> Regimes:
-    return regimes(result, rng=np.random.default_rng(0))
+    return find_regimes(result, rng=np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,7 @@ from torchdiffeq import odeint
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.ode import ODE, Drive
-from ep2sindy.refinement.steps import HermiteSimpson, RungeKutta
-from ep2sindy.refinement.tangents import augmented
+from ep2sindy.refinement.ode import ODE, Drive, HermiteSimpson, RungeKutta, augmented
 from ep2sindy.synthetic.systems import lotka_volterra
 
 SCALE = np.array([2.0, 3.0])

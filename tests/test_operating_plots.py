@@ -7,8 +7,13 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from ep2sindy.figures.operating import frequency_scale, laws_figure, left_out_figure
-from ep2sindy.figures.operating_map import line_figure, map_figure
+from ep2sindy.figures.operating import (
+    frequency_scale,
+    laws_figure,
+    left_out_figure,
+    line_figure,
+    map_figure,
+)
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.operating.law import OperatingLaw
 

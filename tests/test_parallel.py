@@ -12,7 +12,7 @@ import psutil
 import pytest
 from threadpoolctl import threadpool_info
 
-from ep2sindy.machine.parallel import Dask, Loky, Serial, Workers, rows_in_order
+from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, rows_in_order
 
 PATIENCE_S = 300.0  # for what comes at once on an idle machine: only what hangs is longer
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
@@ -172,7 +172,7 @@ def test_a_number_of_processes_must_be_one() -> None:
 
 FAILING = """
 import signal
-from ep2sindy.machine.parallel import Loky
+from ep2sindy.runtime.parallel import Loky
 
 def failing(piece):
     from tqdm import tqdm
@@ -206,7 +206,7 @@ def test_a_piece_that_fails_is_told_in_our_words_alone(tmp_path: Path) -> None:
 
 WITHIN = """
 import threading
-from ep2sindy.machine.parallel import Loky
+from ep2sindy.runtime.parallel import Loky
 
 def n_watches(piece):
     return sum("_watch" in thread.name for thread in threading.enumerate())
@@ -233,8 +233,8 @@ def test_pieces_on_one_core_and_in_workers_come_to_their_end(tmp_path: Path) -> 
 
 KILLED = """
 import os, signal
-from ep2sindy.machine.interruption import end_as_interrupted
-from ep2sindy.machine.parallel import Loky
+from ep2sindy.trust.interruption import end_as_interrupted
+from ep2sindy.runtime.parallel import Loky
 
 def endless(piece):
     PREPARATION

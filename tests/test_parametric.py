@@ -11,7 +11,6 @@ from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.machine.parallel import Loky, Serial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.point_fits import (
     Case,
@@ -33,12 +32,13 @@ from ep2sindy.operating.quantities import (
 from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
 from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.resampling import moving_block_counts
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
+from ep2sindy.runtime.parallel import Loky, Serial
+from ep2sindy.search.bootstraps import moving_block_counts
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
-from ep2sindy.selection.knees import Knee
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.oscillation import oscillation
 from ep2sindy.signals.smoothers import NoSmoothing
 
@@ -347,13 +347,13 @@ def test_draws_of_whitened_rows_spread_as_their_covariance_says(case: Case) -> N
     np.testing.assert_allclose(ratio, 1.0, atol=0.35)
 
 
-def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) -> Regression:
+def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) -> RegressionRows:
     """z' = 2 a - 3 b, with columns and errors that are averages over `memory` rows."""
     white = rng.normal(size=(n_rows + memory, 3))
     kernel = np.ones(memory) / np.sqrt(memory)
     smooth = np.stack([np.convolve(column, kernel, "valid")[:n_rows] for column in white.T], 1)
     theta = smooth[:, :2]
-    return Regression(
+    return RegressionRows(
         theta=theta,
         target=(theta @ [2.0, -3.0] + 0.3 * smooth[:, 2])[:, None],
         library=named_terms(["a", "b"], ["a", "b"]),

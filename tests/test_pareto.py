@@ -4,7 +4,7 @@ import pytest
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.search.bootstraps import Bootstraps, Supports, pooled_supports
 from ep2sindy.search.front import front_order, pareto_front
@@ -21,11 +21,11 @@ SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
 SEARCHES = [AdaptiveLasso(), STLSQ(), BestSubset()]
 
 
-def exact_problem(system: System) -> Regression:
+def exact_problem(system: System) -> RegressionRows:
     """Rows with the true derivative in place of a numerical one."""
     run = system.trajectory()
     nothing = np.empty((run.n_samples, 0))
-    return Regression(
+    return RegressionRows(
         theta=system.model.library.evaluate(run.states),
         target=system.model.derivative(run.states, nothing),
         library=system.model.library,
@@ -120,7 +120,7 @@ def test_ill_conditioned_supports_are_fitted_as_well_as_by_qr() -> None:
     theta = t[:, None] ** np.arange(5)  # the condition number of these columns is 1e7
     truth = np.array([1.0, -2.0, 3.0, -4.0, 5.0])
     names = [f"t{k}" for k in range(5)]
-    problem = Regression(
+    problem = RegressionRows(
         theta=theta,
         target=(theta @ truth)[:, None],
         library=named_terms(names, names),

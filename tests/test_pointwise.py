@@ -9,20 +9,19 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.data.zones import point
-from ep2sindy.discovery.blocks import Kept, blocks_of
+from ep2sindy.data.zones import point_samples
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
+from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
-from ep2sindy.machine.parallel import Dask, Loky, Serial
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
+from ep2sindy.runtime.parallel import Dask, Loky, Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.integral import IntegralScore
+from ep2sindy.selection.refined import RefinedScore
 
 T = np.linspace(0.0, 2.0, 201)
 Z, R = np.array([0.01, 0.02, 0.03, 0.04]), np.array([0.035, 0.04, 0.05])
@@ -109,7 +108,7 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     search = searching(formulation=formulation, search=AdaptiveLasso(), bootstraps=draws)
     field = noisy()
     result = pointwise(field, search, workers=Serial()).isel(z=2, r=1)
-    run = point(field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"])
+    run = point_samples(field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"])
     found = discover(
         [run],
         LIBRARY,
@@ -309,7 +308,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         pointwise(field.assign(x=field["x"].isel(time=0, drop=True)), searching(), workers=Serial())
 
 
-def test_rules_that_integrate_all_equations_serve_every_point() -> None:
+def test_rules_that_refine_all_equations_serve_every_point() -> None:
     field = parabolas(Z[:1], R[:1])
-    result = pointwise(field, searching(selection=IntegralScore()), workers=Serial())
+    result = pointwise(field, searching(selection=RefinedScore()), workers=Serial())
     assert result["n_terms"].item() == 2

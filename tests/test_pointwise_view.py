@@ -6,11 +6,11 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
-from ep2sindy.discovery.regimes import regimes
+from ep2sindy.discovery.regimes import find_regimes
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import drawn
 from ep2sindy.report.screen import WIDTH, Screen
-from ep2sindy.studies.pointwise_view import Outcome
+from ep2sindy.studies.pointwise import Outcome
 
 TERMS = ["1", "n_n", "n_i*u_iz"]
 
@@ -56,7 +56,7 @@ def study() -> xr.Dataset:
 
 
 def outcome(result: xr.Dataset, *, max_regimes: int = 4) -> Outcome:
-    found = regimes(result, rng=np.random.default_rng(0), max_regimes=max_regimes)
+    found = find_regimes(result, rng=np.random.default_rng(0), max_regimes=max_regimes)
     return Outcome(result, found, None, wall_s=1.0, n_before=0)
 
 

@@ -13,11 +13,12 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
+from ep2sindy._stubs import dotted_names
 from ep2sindy.app.runner import started_run, study_class, write
 from ep2sindy.app.schema import study_of
-from ep2sindy.machine.progress import SILENT, Bars, Told, as_progress, counted
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import SILENT, Bars, Told, as_progress, counted
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore
 from tests import programs
@@ -210,9 +211,9 @@ def test_what_fails_leaves_its_stage() -> None:
 def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.CaptureFixture) -> None:
     """Whatever can tell its progress does so on request; simulators ask for themselves."""
     asking = {
-        name: parameter.default
-        for name in ep.__all__
-        if inspect.isfunction(value := getattr(ep, name, None))
+        entry.name: parameter.default
+        for entry in dotted_names().values()
+        if inspect.isfunction(value := entry.load())
         and (parameter := inspect.signature(value).parameters.get("progress"))
     }
     simulators = {name for name, default in asking.items() if default is True}

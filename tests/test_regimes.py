@@ -7,9 +7,9 @@ from sklearn.metrics import adjusted_rand_score
 
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.discovery.regimes import Regimes, group_points, regimes
-from ep2sindy.machine.parallel import Serial
+from ep2sindy.discovery.regimes import Regimes, find_regimes, group_points
 from ep2sindy.regression.differential import Differential
+from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
@@ -49,7 +49,7 @@ def studied(size: str, noise: float, *, seed: int = 0, one_equation: bool = Fals
 @cache
 def grouped(size: str, noise: float, *, seed: int = 0, one_equation: bool = False) -> Regimes:
     result = studied(size, noise, seed=seed, one_equation=one_equation)
-    return regimes(result, rng=np.random.default_rng(seed))
+    return find_regimes(result, rng=np.random.default_rng(seed))
 
 
 def agreement(found: Regimes, truth: RegionField) -> float:
@@ -132,7 +132,7 @@ def patched(**changes: np.ndarray) -> xr.Dataset:
 
 
 def found_in(result: xr.Dataset) -> Regimes:
-    return regimes(result, rng=np.random.default_rng(0))
+    return find_regimes(result, rng=np.random.default_rng(0))
 
 
 def test_a_term_that_turns_from_source_to_sink_parts_two_regimes() -> None:
@@ -212,7 +212,7 @@ def test_axes_may_come_in_any_order() -> None:
 
 def test_regimes_tell_whether_they_are_as_many_as_allowed() -> None:
     limits = {
-        n: regimes(patched(), rng=np.random.default_rng(0), max_regimes=n).at_limit
+        n: find_regimes(patched(), rng=np.random.default_rng(0), max_regimes=n).at_limit
         for n in (1, 2, 3)
     }
     assert limits == {1: True, 2: True, 3: False}

@@ -7,7 +7,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.ambiguity import ambiguities, few_rows, largest_support, usable_terms
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.searches import BestSubset
@@ -15,9 +15,9 @@ from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
 from ep2sindy.synthetic.systems import lotka_volterra
 
 
-def problem_of(theta: np.ndarray, target: np.ndarray, names: list[str]) -> Regression:
+def problem_of(theta: np.ndarray, target: np.ndarray, names: list[str]) -> RegressionRows:
     """Columns named as variables of their own, none held out."""
-    return Regression(
+    return RegressionRows(
         theta=theta,
         target=target,
         library=named_terms(names, names),
@@ -125,7 +125,7 @@ def test_without_smoothing_the_derivative_is_the_plain_difference() -> None:
     assert problem.target[:, 0] == pytest.approx(2 * run.t, abs=1e-12)
 
 
-def degenerate() -> Regression:
+def degenerate() -> RegressionRows:
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 50))
     columns = [np.ones(50), a, np.zeros(50), -3.0 * a, b, a + 2.0 * b, a + 1e-3 * b]

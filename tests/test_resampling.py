@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.resampling import moving_block_counts
-from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.synthetic.systems import lorenz
 
 

@@ -165,7 +165,8 @@ def test_a_model_that_was_stored_runs_to_the_same_bits(x0: float, n: int) -> Non
     np.testing.assert_array_equal(one.states, two.states)
 
 
-RULES = [ep.AICc(), ep.BIC(), ep.EBIC(), ep.Knee(), ep.LogKnee()]
+BIC = ep.EBIC(gamma=0.0, coarsening=None)
+RULES = [ep.AICc(), BIC, ep.EBIC(), ep.Knee(), ep.Knee(scale="log")]
 RECORD = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
 
 

@@ -6,12 +6,11 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.sampling import even_grid, is_even, one_about_each, stretches
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
-from ep2sindy.regression.weak import Weak
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra, van_der_pol
 
@@ -25,7 +24,7 @@ def thinned(run: Trajectory, rng: np.random.Generator, share: float = 0.7) -> Tr
     return replace(run, t=run.t[kept], states=run.states[kept])
 
 
-def assembled(system: System, runs: list[Trajectory]) -> tuple[Regression, ...]:
+def assembled(system: System, runs: list[Trajectory]) -> tuple[RegressionRows, ...]:
     return EVERY_ROW.assemble(runs, system.model.library, rng=np.random.default_rng(0))
 
 

@@ -5,7 +5,7 @@ import pytest
 from sklearn.linear_model import Lasso, lars_path_gram
 
 from ep2sindy.library.library import named_terms
-from ep2sindy.regression.rows import Grams, Regression
+from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.kernels import lasso_supports
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso, BestSubset, Search
@@ -115,13 +115,13 @@ def test_a_column_of_zeros_never_appears(search: Search) -> None:
     assert np.array_equal(whole[:, keep], reduced)
 
 
-def noisy_problem(scale: np.ndarray, *, order: np.ndarray | None = None) -> Regression:
+def noisy_problem(scale: np.ndarray, *, order: np.ndarray | None = None) -> RegressionRows:
     rng = np.random.default_rng(3)
     theta = rng.normal(size=(300, 6))
     target = theta[:, :2] @ [1.5, -0.8] + 0.3 * rng.normal(size=300)
     order = np.arange(6) if order is None else order
     names = np.array(["a", "b", "c", "d", "e", "f"])[order].tolist()
-    return Regression(
+    return RegressionRows(
         theta=(theta * scale)[:, order],
         target=target[:, None] * 1e20,
         library=named_terms(names, names),

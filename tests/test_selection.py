@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.selection.criteria import BIC, EBIC, AICc, log_supports
-from ep2sindy.selection.knees import Knee, LogKnee
+from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection, selected
 from ep2sindy.synthetic.systems import lorenz
 
-RULES = [Knee(), LogKnee(), AICc(), BIC(), EBIC(), EBIC(coarsening=None)]
-CRITERIA = [AICc(), BIC(), EBIC(), EBIC(coarsening=None)]
+BIC, LOG_KNEE = EBIC(gamma=0.0, coarsening=None), Knee(scale="log")
+RULES = [Knee(), LOG_KNEE, AICc(), BIC, EBIC(), EBIC(coarsening=None)]
+CRITERIA = [AICc(), BIC, EBIC(), EBIC(coarsening=None)]
 
 
 def front_of(errors: list[float], n_library: int) -> ParetoFront:
@@ -32,7 +32,7 @@ def front_of(errors: list[float], n_library: int) -> ParetoFront:
         for k, error in enumerate(errors)
     ]
     names = [f"t{i}" for i in range(n_library)]
-    rows = Regression(
+    rows = RegressionRows(
         theta=np.eye(n_library),
         target=np.ones((n_library, 1)),
         library=named_terms(names, names),
@@ -74,18 +74,25 @@ def test_nothing_is_selected_when_nothing_helps() -> None:
     assert n_selected(Knee(), front_of([1.0, 0.999], 2)) == 0
 
 
-@pytest.mark.parametrize("rule", [Knee, LogKnee])
-def test_unknown_normalisation_is_refused(rule: type) -> None:
+def test_unknown_norms_and_scales_are_refused() -> None:
     with pytest.raises(ValueError, match="'library' or 'max_terms': 'libary' came"):
-        rule("libary")
+        Knee("libary")
+    with pytest.raises(ValueError, match="scale must be 'linear' or 'log': 'ln' came"):
+        Knee(scale="ln")
+
+
+def test_a_score_is_called_by_its_own_name() -> None:
+    """Tables of runs with selection=bic and selection=log_knee keep their columns."""
+    assert [rule.label for rule in RULES] == ["d_pareto", "d_log", "AICc", "BIC", "EBIC", "EBIC"]
+    assert BIC.shared_by(6) == BIC
 
 
 def test_the_log_knee_keeps_a_small_term_of_an_exact_law() -> None:
     # The third term lowers the error by 1 % of the whole, but by a factor of a thousand.
     front = front_of([1.0, 0.5, 0.01, 1e-5, 0.9e-5], 10)
     assert n_selected(Knee(), front) == 2
-    assert n_selected(LogKnee(), front) == 3
-    (scores,) = LogKnee().scores([front])
+    assert n_selected(LOG_KNEE, front) == 3
+    (scores,) = LOG_KNEE.scores([front])
     height = np.log([1e5, 0.5e5, 1e3, 1.0, 0.9]) - np.log(0.9)
     height[3:] = [np.log(1e-5 / 0.9e-5), 0.0]
     expected = np.hypot(height / np.log(1.0 / 0.9e-5), np.arange(5) / 10)
@@ -103,7 +110,7 @@ def noisy_front(n_rows: int = 200, *, seed: int = 0, scale: float = 1.0) -> Pare
     theta = rng.normal(size=(n_rows, 6))
     target = theta[:, :2] @ [1.5, -0.8] + 0.5 * rng.normal(size=n_rows)
     names = [f"t{i}" for i in range(6)]
-    problem = Regression(
+    problem = RegressionRows(
         theta=theta,
         target=scale * target[:, None],
         library=named_terms(names, names),
@@ -114,7 +121,7 @@ def noisy_front(n_rows: int = 200, *, seed: int = 0, scale: float = 1.0) -> Pare
     return fronts_from(problem)[0]
 
 
-def fronts_from(problem: Regression) -> list[ParetoFront]:
+def fronts_from(problem: RegressionRows) -> list[ParetoFront]:
     rng = np.random.default_rng(0)
     pooled = pooled_supports(problem, BestSubset(max_terms=6), Bootstraps(n=0), rng=rng)
     return [pareto_front(problem, supports) for supports in pooled]
@@ -137,7 +144,7 @@ def test_criteria_are_their_formulas() -> None:
     ways = np.array([log_supports(front.problem.library, c.terms) for c in front.candidates])
     for rule, penalty in (
         (AICc(), 2 * k + 2 * k * (k + 1) / (60 - k - 1)),
-        (BIC(), k * np.log(60)),
+        (BIC, k * np.log(60)),
         (EBIC(gamma=0.5, coarsening=None), k * np.log(60) + ways),
     ):
         (scores,) = rule.scores([front])
@@ -161,7 +168,7 @@ def test_aicc_refuses_more_terms_than_the_rows_can_bear() -> None:
     assert np.isinf(scores[5:]).all()
 
 
-@pytest.mark.parametrize("rule", [BIC(), EBIC(), EBIC(coarsening=None)], ids=repr)
+@pytest.mark.parametrize("rule", [BIC, EBIC(), EBIC(coarsening=None)], ids=repr)
 def test_criteria_find_two_true_terms_in_white_noise(rule: Selection) -> None:
     found = []
     for seed in range(40):
@@ -179,7 +186,7 @@ def exact_fronts() -> list[ParetoFront]:
     """Of the Lorenz system, with the true derivative in place of a numerical one."""
     system = lorenz()
     run = system.trajectory()
-    problem = Regression(
+    problem = RegressionRows(
         theta=system.model.library.evaluate(run.states),
         target=system.model.derivative(run.states, np.empty((run.n_samples, 0))),
         library=system.model.library,

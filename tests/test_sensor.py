@@ -13,8 +13,7 @@ from benchmarks.spoilt import spoilt
 from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.estimation.lateness import delayed_gram, moved
-from ep2sindy.estimation.likelihood import Fit, Level, gram
-from ep2sindy.estimation.observed import between, seen
+from ep2sindy.estimation.likelihood import Fit, Level, between, gram, seen
 from ep2sindy.estimation.problem import Problem, scaled_problem
 from ep2sindy.synthetic.systems import System
 

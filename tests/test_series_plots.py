@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.frames import OFF_SCALE, STOPS, exits, framing
-from ep2sindy.figures.phase import phase_figure
 from ep2sindy.figures.series import (
     derivative_figure,
+    phase_figure,
     spectrum_figure,
     trajectory_figure,
 )
+from ep2sindy.figures.style import OFF_SCALE, STOPS, exits, framing
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.smoothers import NoSmoothing
-from ep2sindy.studies.shown import Shown, run_figures
+from ep2sindy.studies.views import PlotRange, run_figures
 
 
 @pytest.fixture(scope="module")
@@ -177,5 +177,5 @@ def test_one_state_has_no_phase_portrait(oscillation: Trajectory) -> None:
     one = Trajectory(oscillation.t, oscillation.states[:, :1], ("x",))
     model = SparseModel(named_terms(("x",), ("x",)), ("x",), np.array([[-1.0]]))
     integrated = {"model": free_run(model, one)}
-    figures = run_figures(("phase", "spectra"), one, integrated, Shown(20.0, None))
+    figures = run_figures(("phase", "spectra"), one, integrated, PlotRange(20.0, None))
     assert list(figures) == ["spectra"]

@@ -14,8 +14,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from ep2sindy.app import main as program
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.machine.threads import NUMBERS, one_thread
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.runtime.threads import NUMBERS, one_thread
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.synthetic.systems import lotka_volterra
@@ -95,7 +95,7 @@ def test_a_discovery_runs_on_one_thread() -> None:
 
 def test_a_process_starts_on_one_thread_whatever_the_environment_says() -> None:
     code = (
-        "from ep2sindy.machine.threads import start_on_one_thread as start; start()\n"
+        "from ep2sindy.runtime.threads import start_on_one_thread as start; start()\n"
         "import numpy, scipy.linalg, torch\n"
         "from threadpoolctl import threadpool_info\n"
         "print({p['num_threads'] for p in threadpool_info()}, torch.get_num_threads())"

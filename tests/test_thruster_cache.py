@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.machine import files
+from ep2sindy.runtime import files
 from ep2sindy.thruster import cache
 from ep2sindy.thruster.axial.starts import ColdStart, SoftStart
 from ep2sindy.thruster.cache import simulate_cached

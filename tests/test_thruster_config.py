@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import ep2sindy as ep
-from ep2sindy.app.build import call_of
+from ep2sindy.app.build import bind
 from tests.programs import ROOT, composed
 
 THRUSTERS = sorted(path.stem for path in (ROOT / "conf" / "thruster").glob("*.yaml"))
@@ -18,7 +18,7 @@ THRUSTERS = sorted(path.stem for path in (ROOT / "conf" / "thruster").glob("*.ya
 
 def built(*overrides: str) -> ep.Thruster:
     node = composed("+exp=breathing", *overrides).data.thruster
-    return call_of(node, "data.thruster")()
+    return bind(node, "data.thruster")()
 
 
 @pytest.mark.parametrize("name", THRUSTERS)
@@ -61,7 +61,7 @@ def test_data_from_a_file_have_no_thruster() -> None:
 def test_an_input_of_hallthruster_is_a_data_group(tmp_path: Path) -> None:
     config = composed("+exp=breathing", "data=hallthruster_input", f"data.path={tmp_path}/no.json")
     with pytest.raises(ValueError, match=r"no such input of HallThruster\.jl: .*no\.json"):
-        call_of(config.data, "data")()
+        bind(config.data, "data")()
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_an_input_of_hallthruster_is_a_data_group(tmp_path: Path) -> None:
 def test_a_mistake_is_named_with_its_place(override: str, message: str) -> None:
     node = composed("+exp=breathing", "thruster=example", override).data
     with pytest.raises(ValueError, match=message):
-        call_of(node, "data")()
+        bind(node, "data")()
 
 
 OWN = """\
@@ -113,7 +113,7 @@ def test_a_thruster_of_ones_own_is_found_where_one_stands(tmp_path: Path) -> Non
     here = Path.cwd()
     os.chdir(tmp_path)
     try:
-        made = call_of(node, "data.thruster")()
+        made = bind(node, "data.thruster")()
     finally:
         os.chdir(here)
     assert (made.propellant.name, made.channel_length) == ("rates", 0.02)

@@ -11,9 +11,9 @@ from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.refinement.law import TiedRefinement, refine_tied
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine_many
-from ep2sindy.refinement.tied import TiedRefinement, refine_tied
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from ep2sindy.synthetic.family import LAW, PARAMETERS, TRUTH, realization, system_at
 

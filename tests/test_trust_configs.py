@@ -12,15 +12,13 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from test_face import targets
 
-import ep2sindy as ep
-from ep2sindy.app import yaml_files
-from ep2sindy.app.build import call_of
-from ep2sindy.app.defaults import defaults_of, plain
+from ep2sindy._stubs import dotted_names
+from ep2sindy.app import safety
+from ep2sindy.app.build import as_node, bind, defaults_of
 from ep2sindy.app.runner import run_config, study_class
+from ep2sindy.app.safety import CheckedLoader, check_places, check_references, resolved
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
-from ep2sindy.app.typed_only import CheckedLoader, check_places, resolved
-from ep2sindy.app.yaml_files import check_references
-from ep2sindy.studies.functions import registered
+from ep2sindy.studies.libraries import registered
 from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,9 +30,12 @@ REFUSED = [
     "functools.partial", "importlib.import_module", "hydra.utils.instantiate", "shutil.rmtree",
     "ep2sindy.write_field", "ep2sindy.SparseModel.load", "ep2sindy.SparseModel",
     "ep2sindy.discover", "ep2sindy.register_function", "ep2sindy.for_configs",
-    "ep2sindy.machine.files.write_text", "ep2sindy.app.build.call_of",
-    "ep2sindy.studies.functions._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
-    "ep2sindy._MODULES", "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
+    "ep2sindy.runtime.files.write_text", "ep2sindy.app.build.bind",
+    "ep2sindy.studies.libraries._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
+    "ep2sindy._stubs.dotted_names", "ep2sindy.warnings", "ep2sindy.thruster.zone_balance",
+    "ep2sindy.thruster.parameters.Thruster", "ep2sindy.prepare.import_module", "crop",
+    "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.r2", "prepare.crop",
+    "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
 ]  # fmt: skip
 
 
@@ -42,10 +43,10 @@ REFUSED = [
 def test_only_what_is_for_configs_is_built(name: object) -> None:
     node = OmegaConf.create({"_target_": name})
     with pytest.raises(ValueError, match=r"here must name a _target_ .*came"):
-        call_of(node, "here")
+        bind(node, "here")
     inner = OmegaConf.create({"_target_": "ep2sindy.Weak", "windows": {"_target_": name}})
     with pytest.raises(ValueError, match=r"here\.windows must name a _target_ .*came"):
-        call_of(inner, "here")
+        bind(inner, "here")
     with pytest.raises(ValueError, match=r"a\.b\[0\] must name a _target_ .*came"):
         check_targets(OmegaConf.create({"a": {"b": [{"_target_": name}]}}))
 
@@ -62,13 +63,12 @@ def test_keys_of_hydra_in_a_node_do_nothing_but_are_refused() -> None:
     for key, value in (("_args_", [1]), ("_partial_", True), ("_recursive_", False)):
         node = OmegaConf.create({"_target_": "ep2sindy.EBIC", key: value})
         with pytest.raises(ValueError, match=f"unexpected keyword argument '{key}'"):
-            call_of(node, "rule")
+            bind(node, "rule")
 
 
 @pytest.mark.parametrize("name", sorted(FOR_CONFIGS))
 def test_defaults_that_are_written_out_can_be_built_again(name: str) -> None:
-    written = plain(defaults_of(getattr(ep, name)))
-    assert {each.removeprefix("ep2sindy.") for each in targets(written)} <= FOR_CONFIGS
+    assert targets(as_node(defaults_of(dotted_names()[name].load()))) <= FOR_CONFIGS
 
 
 @pytest.fixture
@@ -87,12 +87,12 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_function_of_ones_own_is_taken_where_it_is_marked(own: Path) -> None:
-    assert call_of(OmegaConf.create({"_target_": "my_steps.half"}), "prepare[0]", None)(4.0) == 2.0
+    assert bind(OmegaConf.create({"_target_": "my_steps.half"}), "prepare[0]", None)(4.0) == 2.0
     for name in ("wipe", "os.system", "os", "nothing"):
         with pytest.raises(ValueError, match=f"'my_steps.{name}' came"):
-            call_of(OmegaConf.create({"_target_": f"my_steps.{name}", "folder": "/"}), "here")
+            bind(OmegaConf.create({"_target_": f"my_steps.{name}", "folder": "/"}), "here")
     with pytest.raises(ValueError, match=r"mark it with @ep\.for_configs where it is defined"):
-        call_of(OmegaConf.create({"_target_": "my_steps.wipe", "folder": "/"}), "here")
+        bind(OmegaConf.create({"_target_": "my_steps.wipe", "folder": "/"}), "here")
     (own / "my_pack").mkdir()
     (own / "my_pack" / "study.py").write_text("class Study:\n    pass\n")
     assert study_class("my_pack.study").__module__ == "my_pack.study"
@@ -225,7 +225,7 @@ def test_references_that_double_are_refused_before_they_are_written_out(
 
 
 def test_a_long_list_is_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yaml_files, "MOST_CHARACTERS", 1000)
+    monkeypatch.setattr(safety, "MOST_CHARACTERS", 1000)
     check_references({"a": [1.5] * 10_000, "b": "${a}", "c": {"d": "${b}", "e": "${.d}"}})
 
 

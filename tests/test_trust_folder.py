@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 import pytest
 
-from ep2sindy.machine.own import leave_folder, own_module, own_packages
-from ep2sindy.machine.parallel import Loky
 from ep2sindy.report import provenance
+from ep2sindy.runtime.parallel import Loky
+from ep2sindy.trust.user_code import leave_folder, load_user_module, own_packages
 
 PROGRAM = Path(sysconfig.get_path("scripts")) / "ep2sindy"
 SPY = "with open({ran!r}, 'a') as file:\n    print(__name__, file=file)\n"
@@ -78,7 +78,7 @@ def test_nothing_of_the_folder_is_imported(run: str, flag: str, folder: Path) ->
 
 
 SETTINGS = """
-import ep2sindy.figures, ep2sindy.machine.compilation, matplotlib, numba
+import ep2sindy.figures, ep2sindy.runtime.compilation, matplotlib, numba
 print(matplotlib.rcParams["font.size"], numba.config.DISABLE_JIT)
 """
 
@@ -105,8 +105,8 @@ def test_a_module_is_made_from_its_source(here: Path) -> None:
     source.write_text("value = 2\n")
     py_compile.compile(str(source), invalidation_mode=PycInvalidationMode.UNCHECKED_HASH)
     source.write_text("value = 1\n")
-    first = own_module("mine")
-    assert first is own_module("mine")
+    first = load_user_module("mine")
+    assert first is load_user_module("mine")
     assert (first.value, first.__file__) == (1, str(here / "mine.py"))
 
 
@@ -114,32 +114,32 @@ def test_modules_of_a_folder_import_each_other_by_its_name(here: Path) -> None:
     (here / "studies").mkdir()
     (here / "studies" / "tools.py").write_text("value = 2\n")
     (here / "studies" / "mine.py").write_text("from studies.tools import value\n")
-    assert own_module("studies.mine").value == 2
+    assert load_user_module("studies.mine").value == 2
     (here / "pack").mkdir()
     (here / "pack" / "__init__.py").write_text("from pack.inner import value\n")
     (here / "pack" / "inner.py").write_text("value = 3\n")
-    assert own_module("pack").value == 3
+    assert load_user_module("pack").value == 3
 
 
 @pytest.mark.parametrize("name", ["json", "numpy", "tabnanny"])
 def test_a_module_by_the_name_of_another_is_refused(name: str, here: Path) -> None:
     (here / f"{name}.py").write_text("raise AssertionError('this ran')\n")
     with pytest.raises(ModuleNotFoundError, match=f"{name!r} is another's; rename it"):
-        own_module(name)
+        load_user_module(name)
 
 
 def test_a_module_that_fails_is_not_kept(here: Path) -> None:
     (here / "mine.py").write_text("raise RuntimeError('half done')\n")
     for _ in range(2):
         with pytest.raises(RuntimeError, match="half done"):
-            own_module("mine")
+            load_user_module("mine")
     assert "mine" not in sys.modules
 
 
 @pytest.mark.slow
 def test_workers_get_the_code_of_ones_own(here: Path) -> None:
     (here / "mine.py").write_text("def double(x):\n    return 2 * x\n")
-    found = Loky(2).run(own_module("mine").double, range(3))
+    found = Loky(2).run(load_user_module("mine").double, range(3))
     assert sorted(found) == [(0, 0), (1, 2), (2, 4)]
 
 

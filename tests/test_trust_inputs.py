@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.app.read_run import read_run
+from ep2sindy.app.compare import read_run
 from ep2sindy.library.names import split_term
-from ep2sindy.machine import memory
 from ep2sindy.thruster.axial.settings import Settings
+from ep2sindy.trust import memory
 
 LAW = {
     "format": "ep2sindy.OperatingLaw/1", "parameters": ["V"], "functions": ["1"],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.machine import memory
+from ep2sindy.trust import memory
 
 MODEL = json.loads(ep.lorenz().model.to_json())
 EQUATIONS = MODEL["equations"]

@@ -17,12 +17,12 @@ import ep2sindy as ep
 from ep2sindy.app import program
 from ep2sindy.app.inspection import commands, config_text
 from ep2sindy.app.sweep import RECORDS, index_text
-from ep2sindy.data.inspection import inspect
-from ep2sindy.machine import progress
-from ep2sindy.machine.files import write_json
-from ep2sindy.machine.screen import in_line, one_screen, plain, say
+from ep2sindy.data.inspection import inspect_file
 from ep2sindy.report.document import Section, Table, Text
 from ep2sindy.report.screen import Screen
+from ep2sindy.runtime import progress
+from ep2sindy.runtime.files import write_json
+from ep2sindy.runtime.screen import in_line, one_screen, plain, say
 from ep2sindy.studies.source import say_data
 from ep2sindy.thruster import cache
 from tests.test_trust_folder import CSV
@@ -57,14 +57,14 @@ def test_what_steers_a_terminal_is_written_out() -> None:
 
 
 def test_an_inspection_shows_odd_names_in_full_and_steers_nothing(odd: Path) -> None:
-    lines = inspect(odd).lines()
+    lines = inspect_file(odd).lines()
     assert all(line.isprintable() for line in lines)
     assert any(r"\x1b[31mred\x1b[0m" in line for line in lines)
 
 
 def test_a_config_for_odd_names_reads_back_as_they_are(odd: Path) -> None:
     """None becomes an interpolation, a line of YAML, or part of one."""
-    found = inspect(odd)
+    found = inspect_file(odd)
     config = OmegaConf.create(config_text([found], [str(odd)]))
     assert config.path == str(odd)
     assert config._target_ == "ep2sindy.open_field"

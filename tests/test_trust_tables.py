@@ -14,12 +14,12 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.app.read_run import read_run
+from ep2sindy.app.compare import read_run
 from ep2sindy.data.readers import csv
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.readers.source import leaves
 from ep2sindy.library.library import named_terms
-from ep2sindy.machine.files import read_json
+from ep2sindy.runtime.files import read_json
 from ep2sindy.thruster.ionization import read_rate_table
 from tests.test_trust_inputs import RUN
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from ep2sindy.app import warm
-from ep2sindy.machine import compilation
+from ep2sindy.runtime import compilation
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import split_factors
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
 from ep2sindy.regression.test_functions import Boxes, Bumps
 from ep2sindy.regression.weak import Weak
@@ -37,7 +37,7 @@ RAW_BOXES = Weak(
 
 def assembled(
     form: Weak, runs: list[Trajectory], library: Library | None = None
-) -> tuple[Regression, ...]:
+) -> tuple[RegressionRows, ...]:
     library = polynomial(list(runs[0].state_names), degree=2) if library is None else library
     return form.assemble(runs, library, rng=np.random.default_rng(0))
 
@@ -55,7 +55,7 @@ def noisy(system: System, noise: float = 0.01) -> Trajectory:
     return system.trajectory(noise=noise, rng=np.random.default_rng(0))
 
 
-def dense(problem: Regression) -> tuple[np.ndarray, np.ndarray]:
+def dense(problem: RegressionRows) -> tuple[np.ndarray, np.ndarray]:
     """Weights of the training rows on the samples: of the terms, and of the state."""
     assert problem.noisy is not None
     return problem.noisy.mean.toarray(), problem.noisy.slope.toarray()

@@ -1,78 +1,197 @@
-"""From nodes of a config that name a `_target_` to objects."""
+"""From nodes of a config to values: the one place where a setting is held to its kind.
+
+A setting's kind stands in the signature that it goes to: a field of a study, or an argument of what
+a `_target_` names. Of an argument only what must be plain is checked here, for a class or function
+says best itself what is wrong with the rest.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from ep2sindy.app.defaults import write_defaults
+from ep2sindy._stubs import place_of
 from ep2sindy.app.targets import target_of
 from ep2sindy.studies.source import Step
+from ep2sindy.studies.study import Check, Deferred
 
 PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 
 
-def is_plain(value: object, kind: type) -> bool:
+def value_of(kind: Any, node: Any, place: str) -> Any:
+    """A value of this kind from a node of the config; place: its dotted path, for errors."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        value = contents(node)
+        if isinstance(parts[1], Check) and not parts[1].test(value):
+            raise ValueError(f"{place} must be {parts[1].message}: {value!r} came")
+        return value_of(parts[0], node, place)
+    if kind is Any:
+        return contents(node)
+    if kind is Deferred:
+        return Configured(node, place)
+    if kind == Step:
+        return bind_step(node, place)
+    if origin in (Union, UnionType):
+        return _one_of(parts, node, place)
+    if isinstance(node, DictConfig) and "_target_" in node:
+        return instantiate(node, origin or kind, place)
+    if isinstance(kind, type) and is_dataclass(kind):
+        return _dataclass(kind, node, place)
+    if origin is not None:
+        return _container(origin, parts, node, place)
+    return _scalar(kind, node, place)
+
+
+def _container(origin: type, parts: Sequence[Any], node: Any, place: str) -> Any:
+    if issubclass(origin, Mapping):
+        if not OmegaConf.is_dict(node):
+            raise ValueError(f"{place} must be like {{name: ...}}: {contents(node)!r} came")
+        if parts[1] is Deferred or is_dataclass(parts[1]):
+            check_names(map(str, node), place)
+        places = {key: f"{place}.{key}" for key in node}
+        return {str(k): value_of(parts[1], child(node, k, at), at) for k, at in places.items()}
+    if not OmegaConf.is_list(node):
+        raise ValueError(f"{place} must be a list: {contents(node)!r} came")
+    places = {k: f"{place}[{k}]" for k in range(len(node))}
+    return [value_of(parts[0], child(node, k, at), at) for k, at in places.items()]
+
+
+def check_names(names: Iterable[str], place: str) -> None:
+    """Raise ValueError for a name, of what files and headings are called by, that is more."""
+    for name in names:
+        if not re.fullmatch(r"\w[\w .,+-]{,99}", name):
+            raise ValueError(
+                f"{place} must be named by words, for files are named so: letters, digits and "
+                f"_ . , + -, not {name!r}"
+            )
+
+
+def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
+    """A value of the first kind that it fits; the last says what is wrong."""
+    if node is None and type(None) in kinds:
+        return None
+    kinds = [kind for kind in kinds if kind is not type(None)]
+    for kind in kinds[:-1]:
+        try:
+            return value_of(kind, node, place)
+        except ValueError:
+            continue
+    return value_of(kinds[-1], node, place)
+
+
+def _scalar(kind: Any, node: Any, place: str) -> Any:
+    """A plain value. One that names no `_target_` is never of a type that is not plain."""
+    value = check_plain((kind,), node, place)
+    return float(value) if kind is float else value
+
+
+def check_plain(kinds: Collection[type], node: Any, place: str) -> Any:
+    """The value of a node; raises ValueError for one that is of none of these kinds."""
+    value = contents(node)
+    if not any(_is_plain(value, kind) for kind in kinds):
+        wanted = [PLAIN.get(kind, f"a {kind.__name__}, named by its _target_") for kind in kinds]
+        raise ValueError(f"{place} must be {' or '.join(wanted)}: {value!r} came")
+    return value
+
+
+def _is_plain(value: object, kind: type) -> bool:
     """Whether a value is of a plain kind; a whole number is a number too, true is none."""
     return type(value) is kind or (kind, type(value)) == (float, int)
 
 
-def check_set(node: DictConfig) -> None:
-    """Raise ValueError for a value, at any depth, that a config leaves to its user."""
-    if missing := sorted(OmegaConf.missing_keys(node)):
-        raise ValueError(f"{missing[0]} must be set: it is still '???'")
+def _dataclass(kind: type, node: Any, place: str) -> Any:
+    """A mapping as a dataclass: no key may be missing, and none be there that does nothing."""
+    names = [f.name for f in fields(kind) if f.init]
+    needed = [name for name in names if is_required(kind, name)]
+    given = set(map(str, node)) if isinstance(node, DictConfig) else None
+    if given is None or given - set(names) or set(needed) - given:
+        came = sorted(given) if given is not None else contents(node)
+        if len(needed) == len(names):
+            raise ValueError(f"{place} must have {_listed(needed)}: {came} came")
+        raise ValueError(
+            f"{place} may have {sorted(names)} and needs {_listed(needed)}: {came} came"
+        )
+    hints = hints_of(kind)
+    return kind(
+        **{
+            name: value_of(hints[name], child(node, name, at), at)
+            for name, at in ((name, f"{place}.{name}") for name in names)
+            if name in given
+        }
+    )
 
 
-def check_arguments(node: Any, place: str) -> None:
-    """Raise ValueError for an argument, at any depth, that is not of the plain kind it must be."""
-    if isinstance(node, ListConfig):
-        for k in range(len(node)):
-            check_arguments(node[k], f"{place}[{k}]")
-    if not isinstance(node, DictConfig):
-        return
-    kinds = _plain_kinds(node, place) if "_target_" in node else {}
-    for name in map(str, node):
-        value, wanted = node[name], kinds.get(name, ())
-        if wanted and value is not None and not any(is_plain(value, kind) for kind in wanted):
-            words = " or ".join(PLAIN[kind] for kind in wanted)
-            raise ValueError(f"{place}.{name} must be {words}: {value!r} came")
-        check_arguments(value, f"{place}.{name}")
+def _listed(names: Sequence[str]) -> str:
+    """`a, b and c`."""
+    return " and ".join([", ".join(names[:-1]), *names[-1:]] if len(names) > 1 else names) or "none"
 
 
-def _plain_kinds(node: DictConfig, place: str) -> dict[str, tuple[type, ...]]:
-    """Arguments of a target that can only be plain values, or None: by name, their kinds."""
-    target = target_of(node, place)
-    try:
-        hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
-    except Exception:  # an annotation that is not there while the program runs; no annotations
-        return {}
-    found = {name: _alternatives(hint) for name, hint in hints.items()}
-    return {name: kinds for name, kinds in found.items() if set(kinds) <= set(PLAIN)}
+def hints_of(kind: type) -> dict[str, Any]:
+    """Field of a dataclass that it is made with -> its annotation."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {f.name: hints[f.name] for f in fields(kind) if f.init}
 
 
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    """The kinds of a union but None; of another hint itself."""
-    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return tuple(part for part in parts if part is not type(None))
+def is_required(kind: type, name: str) -> bool:
+    (field,) = (f for f in fields(kind) if f.name == name)
+    return field.default is MISSING and field.default_factory is MISSING
 
 
-def call_of(node: DictConfig, place: str, *first: Any) -> partial[Any]:
+def child(parent: Any, key: Any, place: str) -> Any:
+    """A child, interpolations resolved."""
+    if OmegaConf.is_missing(parent, key):
+        raise ValueError(f"{place} must be set: it is still '???'")
+    return parent[key]
+
+
+def contents(node: Any) -> Any:
+    """The plain value of a node, interpolations resolved."""
+    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+
+
+def instantiate(node: DictConfig, kind: type, place: str) -> Any:
+    """The object that a node names, if it is of this kind."""
+    value = bind(node, place)()
+    if not isinstance(value, kind):
+        raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: {value!r} came")
+    return value
+
+
+def bind_step(node: Any, place: str) -> Step:
+    """A step of `prepare`; an argument that it does not know is refused here."""
+    if not isinstance(node, DictConfig) or "_target_" not in node:
+        raise ValueError(
+            f"{place} must be like {{_target_: ep2sindy.crop, start_s: 0}}: {node!r} came"
+        )
+    return bind(node, place, None)
+
+
+def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     """What a node's `_target_` names, with the rest of the node, built, as its arguments.
 
     place: the node's dotted path, for errors. first: arguments that it is given when called.
     Raises ValueError where it cannot be called so, or what a nested target raised itself.
     """
-    check_set(node)
-    check_arguments(node, place)
+    settings = {name: child(node, name, f"{place}.{name}") for name in map(str, node)}
     target = target_of(node, place)
-    call = partial(target, **_arguments(node, place))
+    kinds = _plain_arguments(target)
+    call = partial(
+        target,
+        **{
+            name: _argument(kinds.get(name, ()), value, f"{place}.{name}")
+            for name, value in settings.items()
+            if name != "_target_"
+        },
+    )
     try:
         takes = inspect.signature(target)
     except ValueError:  # compiled, it does not say what it takes
@@ -86,40 +205,45 @@ def call_of(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     return call
 
 
-def _arguments(node: DictConfig, place: str) -> dict[str, Any]:
-    return {k: _built(node[k], f"{place}.{k}") for k in map(str, node) if k != "_target_"}
+def _plain_arguments(target: Any) -> dict[str, tuple[type, ...]]:
+    """Arguments of a target that can only be plain values, or None: by name, their kinds."""
+    try:
+        hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
+    except Exception:  # an annotation that is not there while the program runs; no annotations
+        return {}
+    alternatives = {name: _alternatives(hint) for name, hint in hints.items()}
+    return {name: kinds for name, kinds in alternatives.items() if set(kinds) <= set(PLAIN)}
 
 
-def _built(node: Any, place: str) -> Any:
-    """A value of a config, with what it names at any depth made."""
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    """The kinds of a union but None; of another hint itself."""
+    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return tuple(part for part in parts if part is not type(None))
+
+
+def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
+    """An argument of a target, with what it names at any depth made. kinds: empty for any."""
+    if kinds and node is not None:
+        return check_plain(kinds, node, place)
     if isinstance(node, ListConfig):
-        return [_built(each, f"{place}[{k}]") for k, each in enumerate(node)]
+        places = [f"{place}[{k}]" for k in range(len(node))]
+        return [_argument((), child(node, k, at), at) for k, at in enumerate(places)]
     if not isinstance(node, DictConfig):
         return node
-    if "_target_" not in node:
-        return {key: _built(node[key], f"{place}.{key!s}") for key in node}
-    call = call_of(node, place)
+    if "_target_" not in set(node):  # a DictConfig itself denies one that is still to be set
+        named = {key: f"{place}.{key!s}" for key in node}
+        return {key: _argument((), child(node, key, at), at) for key, at in named.items()}
+    call = bind(node, place)
     try:
         return call()
     except TypeError as error:
         raise ValueError(f"{place} cannot be made: {error}") from error
 
 
-def instance_of(node: DictConfig, kind: type, place: str) -> Any:
-    """The object that a node names, if it is of this kind."""
-    value = call_of(node, place)()
-    if not isinstance(value, kind):
-        raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: {value!r} came")
-    return value
-
-
-def step_of(node: Any, place: str) -> Step:
-    """A step of `prepare`; an argument that it does not know is refused here."""
-    if not isinstance(node, DictConfig) or "_target_" not in node:
-        raise ValueError(
-            f"{place} must be like {{_target_: ep2sindy.crop, start_s: 0}}: {node!r} came"
-        )
-    return call_of(node, place, None)
+def check_set(node: DictConfig) -> None:
+    """Raise ValueError for a value, at any depth, that a config leaves to its user."""
+    if missing := sorted(OmegaConf.missing_keys(node)):
+        raise ValueError(f"{missing[0]} must be set: it is still '???'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +264,7 @@ class Configured:
         return {str(key): value for key, value in plain.items()}
 
     def build(self) -> Any:
-        return call_of(self.node, self.place)()
+        return bind(self.node, self.place)()
 
     def changed(
         self, places: Mapping[str, Any], more: Mapping[str, Any] | None = None
@@ -148,7 +272,7 @@ class Configured:
         node = deepcopy(self.node)
         missing = object()
         for place, value in places.items():
-            write_defaults(node, place, partial(target_of, place=self.place))
+            write_defaults(node, place, root=self.place)
             if OmegaConf.select(node, place, default=missing) is missing:
                 raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
             OmegaConf.update(node, place, value)
@@ -158,3 +282,55 @@ class Configured:
 
     def __str__(self) -> str:
         return OmegaConf.to_yaml(self.node, resolve=True, sort_keys=True)
+
+
+def write_defaults(node: DictConfig, place: str, *, root: str) -> None:
+    """Add what stands at a dotted place by default, if the targets on the way have it.
+
+    root: where the node itself stands, for errors. `thruster.transport.c_plume` in a thruster that
+    says nothing of its transport becomes all of the transport that it has by default.
+    """
+    *outer, last = place.split(".")
+    for name in (*outer, last):
+        if not isinstance(node, DictConfig):
+            return
+        if name not in node and "_target_" in node:
+            values = defaults_of(target_of(node, root))
+            if name in values:
+                OmegaConf.update(node, name, as_node(values[name]), force_add=True)
+        if name not in node:
+            return
+        node = node[name]
+
+
+def defaults_of(call: Any) -> dict[str, Any]:
+    """Arguments of a class or function that have a default, with it."""
+    if is_dataclass(call):
+        found = {}
+        for each in fields(call):
+            if each.init and each.default is not MISSING:
+                found[each.name] = each.default
+            elif each.init and each.default_factory is not MISSING:
+                found[each.name] = each.default_factory()
+        return found
+    try:
+        takes = inspect.signature(call).parameters.values()
+    except (TypeError, ValueError):  # compiled, it does not say what it takes
+        return {}
+    return {each.name: each.default for each in takes if each.default is not each.empty}
+
+
+def as_node(value: Any) -> Any:
+    """A value as a config has it: a dataclass as a node that names its class."""
+    if is_dataclass(value) and not isinstance(value, type):
+        members = {each.name: as_node(getattr(value, each.name)) for each in fields(value)}
+        taken = {each.name for each in fields(value) if each.init}
+        return {"_target_": _name(type(value))} | {n: m for n, m in members.items() if n in taken}
+    if isinstance(value, Mapping):
+        return {str(name): as_node(member) for name, member in value.items()}
+    return [as_node(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def _name(kind: type) -> str:
+    """By the package's stubs where they have it: modules may move."""
+    return place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"  # a user's

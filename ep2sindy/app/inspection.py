@@ -12,11 +12,11 @@ from typing import Any
 import yaml
 
 from ep2sindy.data.conversion import KNOWN_UNITS
-from ep2sindy.data.inspection import Inspection, check_alike, inspect
+from ep2sindy.data.inspection import Inspection, check_alike, inspect_file
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import files_of
-from ep2sindy.machine.files import write_text
-from ep2sindy.machine.screen import in_line, say
+from ep2sindy.runtime.files import write_text
+from ep2sindy.runtime.screen import in_line, say
 
 ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks like time, z and r,
 and what is missing for which experiment. Several files, or a pattern in quotes, are several
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     )
     given = parser.parse_args(arguments)
     paths = files_of(given.path)
-    found = [inspect(path) for path in paths]
+    found = [inspect_file(path) for path in paths]
     for each in found:
         say("\n".join(each.lines()) + "\n")
     name = re.sub(r"\W+", "_", given.write or Path(paths[0]).stem).strip("_")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from ep2sindy.machine.own import leave_folder
+from ep2sindy.trust.user_code import leave_folder
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -30,11 +30,11 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ep2sindy.app.typed_only import check_places, checked_loader, resolved
-from ep2sindy.machine.interruption import end_as_interrupted
-from ep2sindy.machine.own import PACKAGE, isolated_children
-from ep2sindy.machine.screen import plain, say
-from ep2sindy.machine.threads import start_on_one_thread
+from ep2sindy.app.safety import check_places, checked_loader, resolved
+from ep2sindy.runtime.screen import plain, say
+from ep2sindy.runtime.threads import start_on_one_thread
+from ep2sindy.trust.interruption import end_as_interrupted
+from ep2sindy.trust.user_code import PACKAGE, isolated_children
 
 USUAL_WARNING = warnings.formatwarning
 
@@ -158,8 +158,6 @@ def prepare_arguments(conf: Path) -> None:
 
 def run_job(config: DictConfig, conf: Path) -> list[str]:
     """One run, and why it ended early, if it did; a sweep notes that and goes on."""
-    from ep2sindy.app.sweep import noted_job
-
     with noted_job() as (done, ended_early):
         try:
             if config.experiment is None:
@@ -179,6 +177,41 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
         done(finished.folder, finished.headline)
     say(str(finished.folder))
     return []
+
+
+@contextmanager
+def noted_job() -> Iterator[
+    tuple[Callable[[Path, Mapping[str, float]], None], Callable[[BaseException], None]]
+]:
+    """In a sweep: say which job begins, and note how it ended; otherwise do nothing.
+
+    The first of what comes is told the run folder and the headline figures of a job that came to
+    its end, the second the error of one that did not.
+    """
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        yield (lambda folder, headline: None), (lambda error: None)
+        return
+    job, overrides = HydraConfig.get().job.num, list(HydraConfig.get().overrides.task)
+    sweep = Path(HydraConfig.get().sweep.dir)
+    record: dict[str, Any] = {"job": job, "overrides": overrides, "status": "failed"}
+    say(f"job {job}: {' '.join(overrides)}")
+
+    def done(folder: Path, headline: Mapping[str, float]) -> None:
+        record.update(status="done", folder=str(folder), headline=dict(headline))
+
+    def ended_early(error: BaseException) -> None:
+        record["error"] = f"{error}" or type(error).__name__
+        say(f"job {job} failed: {record['error']}")
+
+    try:
+        yield done, ended_early
+    except BaseException as error:
+        ended_early(error)
+        raise
+    finally:
+        from ep2sindy.app.sweep import note_end  # pandas and more, when a job has ended
+
+        note_end(sweep, record)
 
 
 def first_word(config: DictConfig) -> str:

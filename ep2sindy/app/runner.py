@@ -20,8 +20,6 @@ import ep2sindy.studies
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
-from ep2sindy.machine.own import own_module
-from ep2sindy.machine.progress import Bars, counted
 from ep2sindy.report.about import ASIDE, About, asked_of, by_place
 from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
@@ -29,7 +27,9 @@ from ep2sindy.report.picture import drawn
 from ep2sindy.report.run import Run
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
+from ep2sindy.runtime.progress import Bars, counted
 from ep2sindy.studies.study import Experiment, Outcome
+from ep2sindy.trust.user_code import load_user_module
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def study_class(name: object) -> type:
     text = str(name)
     inside = "." not in text or text.startswith("ep2sindy.")
     module = text if "." in text else f"ep2sindy.studies.{text}"
-    load = import_module if inside else own_module
+    load = import_module if inside else load_user_module
     try:
         found = load(module)
         if hasattr(found, "__path__") and not hasattr(found, "Study"):

@@ -1,58 +1,42 @@
 """A sweep's index: every job with its overrides, how it ended, its headline figures and folder.
 
 Each job writes a record of its own, so that jobs may run side by side or on a cluster, and the
-index is made anew from all records there are.
+index and its page are made anew from all records there are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from io import StringIO
+import os
+from collections.abc import Mapping, Sequence
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.table import Table as Grid
 
-from ep2sindy.machine.files import read_json, write_json, write_text
-from ep2sindy.machine.screen import in_line, say
+from ep2sindy.figures.trends import sweep_figure
+from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
+from ep2sindy.report.folder import freeze_layout
+from ep2sindy.report.page import page_html
+from ep2sindy.report.picture import DPI, Drawn, drawn
+from ep2sindy.report.results import in_words, value_text
+from ep2sindy.runtime.files import read_json, write_json, write_text
+from ep2sindy.runtime.screen import in_line
 
 RECORDS = "jobs"
+MOST_PANELS = 12
+CAPTION = "Headline figures of the jobs that came to their end."
+
+Records = Sequence[Mapping[str, Any]]
 
 
-@contextmanager
-def noted_job() -> Iterator[
-    tuple[Callable[[Path, Mapping[str, float]], None], Callable[[BaseException], None]]
-]:
-    """In a sweep: say which job begins, and note how it ended; otherwise do nothing.
-
-    The first of what comes is told the run folder and the headline figures of a job that came to
-    its end, the second the error of one that did not.
-    """
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        yield (lambda folder, headline: None), (lambda error: None)
-        return
-    job, overrides = HydraConfig.get().job.num, list(HydraConfig.get().overrides.task)
-    sweep = Path(HydraConfig.get().sweep.dir)
-    record: dict[str, Any] = {"job": job, "overrides": overrides, "status": "failed"}
-    say(f"job {job}: {' '.join(overrides)}")
-
-    def done(folder: Path, headline: Mapping[str, float]) -> None:
-        record.update(status="done", folder=str(folder), headline=dict(headline))
-
-    def ended_early(error: BaseException) -> None:
-        record["error"] = f"{error}" or type(error).__name__
-        say(f"job {job} failed: {record['error']}")
-
-    try:
-        yield done, ended_early
-    except BaseException as error:
-        ended_early(error)
-        raise
-    finally:
-        write_json(sweep / RECORDS / f"{job}.json", record)
-        write_index(sweep)
+def note_end(sweep: Path, record: Mapping[str, Any]) -> None:
+    """Write how a job ended, and the index with it."""
+    write_json(sweep / RECORDS / f"{record['job']}.json", record)
+    write_index(sweep)
 
 
 def records_of(sweep: Path) -> list[dict[str, Any]]:
@@ -66,8 +50,6 @@ def write_index(sweep: Path) -> None:
 
     Written again if another job has noted its end meanwhile: the last to write knows them all.
     """
-    from ep2sindy.app.sweep_page import write_sweep_page  # pandas and more, when a job has ended
-
     records: list[dict[str, Any]] = []
     while len(now := records_of(sweep)) > len(records):
         records = now
@@ -75,9 +57,7 @@ def write_index(sweep: Path) -> None:
         write_sweep_page(sweep, records)
 
 
-def _index(records: Sequence[Mapping[str, Any]]) -> str:
-    import pandas as pd
-
+def _index(records: Records) -> str:
     rows = [
         {
             "job": record["job"],
@@ -95,17 +75,96 @@ def _index(records: Sequence[Mapping[str, Any]]) -> str:
     return table[ordered].to_csv(index=False)
 
 
+def write_sweep_page(sweep: Path, records: Records) -> None:
+    """`index.html` beside `index.csv`; links go to the pages of the jobs, and are relative."""
+    varied, shared = parted(records)
+    jobs = [Table(_jobs(sweep, records, varied), note=f"In all jobs: {' '.join(shared) or '-'}.")]
+    figures = _figures(records, varied)
+    errors: list[Block] = [
+        Text(f"Job {record['job']}: {record['error']}", warning=True)
+        for record in records
+        if record.get("error")
+    ]
+    sections = [Section("Jobs", [*jobs, *errors])]
+    if figures:
+        sections.append(Section("What they found", [Picture(name) for name in figures]))
+    write_text(sweep / "index.html", page_html(f"Sweep of {len(records)} jobs", sections, figures))
+
+
+def parted(records: Records) -> tuple[dict[str, list[str]], list[str]]:
+    """What differs between jobs, as values by key, one per job; and what all have in common."""
+    everywhere = set.intersection(*(set(record["overrides"]) for record in records))
+    keys = dict.fromkeys(
+        text.partition("=")[0] for r in records for text in r["overrides"] if text not in everywhere
+    )
+    values = [dict(text.partition("=")[::2] for text in record["overrides"]) for record in records]
+    shared = [text for text in records[0]["overrides"] if text in everywhere]
+    return {key: [value.get(key, "") for value in values] for key in keys}, shared
+
+
+def _jobs(sweep: Path, records: Records, varied: Mapping[str, Sequence[str]]) -> pd.DataFrame:
+    """A row per job. Figures are headed by words."""
+    figures = _headlines(records)
+    rows = []
+    for k, record in enumerate(records):
+        page = Path(record.get("folder", "")) / "report.html"
+        name = str(record["job"])
+        link = Link(name, os.path.relpath(page, sweep)) if "folder" in record else name
+        found = record.get("headline", {})
+        values = {in_words(n): value_text(n, _number(found.get(n))) for n in figures}
+        given = {key: texts[k] for key, texts in varied.items()}
+        rows.append({"job": link, **given, "status": record["status"], **values})
+    return pd.DataFrame(rows)
+
+
+def _headlines(records: Records) -> list[str]:
+    return list(dict.fromkeys(name for record in records for name in record.get("headline", {})))
+
+
+def _figures(records: Records, varied: Mapping[str, Sequence[str]]) -> dict[str, Drawn]:
+    """Over the one number that was varied, or over the jobs."""
+    values = {
+        in_words(name) + (" (kHz)" if name.endswith("f_kHz") else ""): np.array(
+            [_number(record.get("headline", {}).get(name)) for record in records]
+        )
+        for name in _headlines(records)
+    }
+    shown = {name: v for name, v in values.items() if np.isfinite(v).sum() > 1}
+    if not shown:
+        return {}
+    label, x = "job", np.array([float(record["job"]) for record in records])
+    if len(varied) == 1:
+        ((key, texts),) = varied.items()
+        numbers = np.array([_number(text) for text in texts])
+        if np.isfinite(numbers).all():
+            label, x = key, numbers
+    jobs = [
+        f"job {record['job']}: {', '.join(f'{key}={v[k]}' for key, v in varied.items())}"
+        for k, record in enumerate(records)
+    ]
+    chosen = dict(list(shown.items())[:MOST_PANELS])
+    figure = sweep_figure(x, chosen, x_label=label, jobs=jobs)
+    freeze_layout(figure)
+    png = BytesIO()
+    figure.savefig(png, format="png", dpi=DPI)
+    return {"headline": drawn(figure, png.getvalue(), CAPTION)}
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
+
+
 def index_text(sweep: Path, *, n_figures: int = 4) -> str:
     """The index for the terminal: what differs between jobs, and the first headline figures."""
-    from rich.console import Console
-    from rich.table import Table
-
     records = records_of(sweep)
     if not records:
         return f"no job of the sweep noted its end in {sweep}"
     everywhere = set.intersection(*(set(record["overrides"]) for record in records))
     figures = list(dict.fromkeys(name for r in records for name in r.get("headline", {})))
-    table = Table(title=f"sweep of {len(records)} jobs", title_justify="left", show_edge=False)
+    table = Grid(title=f"sweep of {len(records)} jobs", title_justify="left", show_edge=False)
     for name in ("job", "overrides", "status", *figures[:n_figures], "folder or error"):
         table.add_column(in_line(name), overflow="fold")
     for record in records:

@@ -1,4 +1,4 @@
-"""What a config may call: nothing but what is written here, and what users mark as theirs.
+"""What a config may call: nothing but what the stubs mark for configs, and what users mark.
 
 A config can come from anybody. Values, readers and simulators are offered; what writes where it
 is told, or runs what it is given, is not.
@@ -9,53 +9,40 @@ from __future__ import annotations
 from collections.abc import Callable
 from difflib import get_close_matches
 from typing import Any
+from warnings import warn
 
 from omegaconf import DictConfig, OmegaConf
 
-import ep2sindy
-from ep2sindy.machine.own import is_for_configs, own_module
+from ep2sindy._old_names import gone_text, moved_text, new_name
+from ep2sindy._stubs import dotted_names
+from ep2sindy.trust.user_code import is_for_configs, load_user_module
 
-# Names of the package's face.
-_NAMES = """
-Variable open_field read_field simulate simulate_cached simulate_2d simulate_2d_cached
-simulate_hallthruster_input three_regions
-crop decimate low_pass derive radial_from_middle keep_where ionization_rate
-Zone ZoneAverage GridPoint LogRate Rate Delays
-Recipe Differential Weak WeightedWeak Bumps Boxes RandomSplit BlockSplit
-KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing
-AdaptiveLasso STLSQ BestSubset Joint Bootstraps
-AICc BIC EBIC Evidence FreeRunScore Bounds IntegralScore Knee LogKnee RefinedScore
-Stability CrossValidation
-Serial Loky Dask
-GradientDescent MultipleShooting NelderMead SingleShooting RungeKutta HermiteSimpson
-Refining Quantity TimeBootstrap Windows
-PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm PySINDySmoothing
-damped_oscillator lotka_volterra van_der_pol lorenz pendulum
-Thruster OperatingPoint landmark_thruster MagneticField MagneticFieldTable
-read_magnetic_field propellant read_propellant PropellantTable TabulatedRates XenonFits
-AnomalousTransport GaussianTransport MultiLogTransport ExponentialWall SheathWall
-wall_material AnodeSheath FixedAnode ColdStart GuessedStart Restart SoftStart
-"""
-FOR_CONFIGS = frozenset(_NAMES.split())
+# Names in full: `ep2sindy.EBIC`, `ep2sindy.thruster.Thruster`.
+FOR_CONFIGS = frozenset(name for name, entry in dotted_names().items() if entry.for_configs)
 
 
 def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
-    """What the `_target_` of a node names.
+    """What the `_target_` of a node names; of the version before, too, with a warning.
 
     Raises ValueError for all that configs may not name, before anything of it is imported.
     """
     name = str(node["_target_"])
+    new = new_name(name) or name
+    if new in FOR_CONFIGS:
+        if new != name:
+            warn(moved_text(name), FutureWarning, stacklevel=2)
+        return dotted_names()[new].load()
     module, _, last = name.rpartition(".")
     room = module.partition(".")[0]
-    if module == "ep2sindy" and last in FOR_CONFIGS:
-        return getattr(ep2sindy, last)
     if room and room != "ep2sindy":
         return _own(name, place)
-    near = get_close_matches(last, FOR_CONFIGS)
-    there = [f"ep2sindy.{each}" for each in near or sorted(FOR_CONFIGS)]
+    near = get_close_matches(last, {each.rpartition(".")[2] for each in FOR_CONFIGS})
+    there = sorted(each for each in FOR_CONFIGS if not near or each.rpartition(".")[2] in near)
+    gone = gone_text(name)
     raise ValueError(
         f"{place} must name a _target_ that there is, such as ep2sindy.EBIC, and that is for "
-        f"configs: {name!r} came; {'near it are' if near else 'there are'} {', '.join(there)}"
+        f"configs: {name!r} came; {gone and f'{gone}; '}"
+        f"{'near it are' if near else 'there are'} {', '.join(there)}"
     )
 
 
@@ -63,7 +50,7 @@ def _own(name: str, place: str) -> Callable[..., Any]:
     """What a user has marked; only a file below the current folder is imported."""
     module, _, last = name.rpartition(".")
     try:
-        target = getattr(own_module(module), last)
+        target = getattr(load_user_module(module), last)
     except (ModuleNotFoundError, AttributeError) as error:
         raise ValueError(
             f"{place} must name a _target_ of ep2sindy that is for configs, such as "

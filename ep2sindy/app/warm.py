@@ -17,11 +17,11 @@ from hashlib import sha256
 import numpy as np
 
 import ep2sindy as ep
-from ep2sindy.machine.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
-from ep2sindy.machine.own import isolated
-from ep2sindy.machine.progress import Bars
-from ep2sindy.machine.screen import say
 from ep2sindy.model.many import DrivenWindows, Ensemble
+from ep2sindy.runtime.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
+from ep2sindy.runtime.progress import Bars
+from ep2sindy.runtime.screen import say
+from ep2sindy.trust.user_code import isolated
 
 ABOUT = """Compiles all kernels of the package, once after installation: half a minute on two cores.
 Runs of the command line do so by themselves; in Python, a call compiles what it uses."""

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from ep2sindy.constraints.relations import ROUNDING, Constraint, place_of
 from ep2sindy.data.scales import column_norms
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
 
 LEAST_RESIDUAL = 1e-6  # of the target's RMS: no equation weighs more, however exact its fit
@@ -21,7 +21,7 @@ N_PASSES = 4  # then a fifth moves nothing by 1e-6 of its error, at 20 % noise
 
 
 def constrained_fit(
-    problems: Sequence[Regression],
+    problems: Sequence[RegressionRows],
     constraint: Constraint,
     *,
     signs: Mapping[tuple[str, str], int] | None = None,
@@ -111,7 +111,7 @@ class WeightedEquation:
     std: of the residuals of that fit, in units of the target's scale.
     """
 
-    problem: Regression
+    problem: RegressionRows
     number: int
     at: Int[np.ndarray, " own"]
     terms: Int[np.ndarray, " own"]
@@ -131,7 +131,7 @@ class WeightedEquation:
 
 
 def _whitened(
-    problem: Regression, terms: np.ndarray, coef: np.ndarray, *, n_steps: int
+    problem: RegressionRows, terms: np.ndarray, coef: np.ndarray, *, n_steps: int
 ) -> WhitenedRows:
     mask, full = np.zeros(len(problem.library), dtype=np.bool_), np.zeros(len(problem.library))
     mask[terms], full[terms] = True, coef
@@ -139,7 +139,7 @@ def _whitened(
 
 
 def weighted_equations(
-    problems: Sequence[Regression], constraint: Constraint
+    problems: Sequence[RegressionRows], constraint: Constraint
 ) -> list[WeightedEquation]:
     """Those of the constraint's equations that free coefficients have a part in."""
     places = {name: (p, k) for p in problems for k, name in enumerate(p.equations)}
@@ -157,7 +157,7 @@ def weighted_equations(
 
 
 def _fitted_alone(
-    problem: Regression, number: int, at: np.ndarray, terms: np.ndarray
+    problem: RegressionRows, number: int, at: np.ndarray, terms: np.ndarray
 ) -> WeightedEquation:
     theta, target = problem.train_theta[:, terms], problem.train_target(number)
     start = np.linalg.lstsq(theta, target, rcond=None)[0]

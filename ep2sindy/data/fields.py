@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.library.units import Clock
-from ep2sindy.machine.files import read_json
+from ep2sindy.runtime.files import read_json
 
 DIMS = ("time", "z", "r")
 

@@ -14,7 +14,7 @@ from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.recognition import Recognised, recognised
-from ep2sindy.machine.screen import WIDTH, html_table, in_line, one_screen, text_table
+from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
 
 # What the experiments need beside time; those that take any variables are not here.
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -167,7 +167,7 @@ class Inspection:
         return roles
 
 
-def inspect(path: str | Path) -> Inspection:
+def inspect_file(path: str | Path) -> Inspection:
     """Look into a file: what it holds, and what that is by names, units, shapes and sizes.
 
     Reads every array once. The result prints as a table and says what is missing for which

@@ -8,7 +8,7 @@ from typing import Any
 
 import xarray as xr
 
-from ep2sindy.machine.files import write_bytes
+from ep2sindy.runtime.files import write_bytes
 
 
 def write_netcdf(

@@ -15,7 +15,7 @@ import xarray as xr
 
 from ep2sindy.data.fields import SPACE, check_field, grid_points, mask_outside
 from ep2sindy.library.names import check_variable
-from ep2sindy.machine.screen import cut
+from ep2sindy.runtime.screen import cut
 
 OPERATORS: Mapping[type, Callable] = {
     ast.Add: operator.add,

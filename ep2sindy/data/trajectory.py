@@ -15,7 +15,7 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.machine.screen import html_table, one_screen, text_table
+from ep2sindy.runtime.screen import html_table, one_screen, text_table
 
 
 def fixed(values: dict) -> MappingProxyType:

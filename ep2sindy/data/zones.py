@@ -121,7 +121,9 @@ class GridPoint:
     products: ClassVar[tuple[str, ...]] = ()
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
-        return point(field, z=self.z, r=self.r, states=self.states, inputs=inputs, label=label)
+        return point_samples(
+            field, z=self.z, r=self.r, states=self.states, inputs=inputs, label=label
+        )
 
     def place(self, field: xr.Dataset) -> str:
         """The grid point that it takes, in words."""
@@ -130,7 +132,7 @@ class GridPoint:
         return f"the grid point at {', '.join(texts)}" if texts else ""
 
 
-def point(
+def point_samples(
     field: xr.Dataset,
     *,
     z: float | None = None,

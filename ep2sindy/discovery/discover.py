@@ -9,26 +9,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Relation
-from ep2sindy.constraints.support import relations_of
+from ep2sindy.constraints.relations import Relation, relations_of
 from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choose
+from ep2sindy.discovery.choice import Choice, choose, judged, misfit_of
 from ep2sindy.discovery.estimated import estimated
-from ep2sindy.discovery.last_fit import judged, misfit_of
 from ep2sindy.discovery.recipe import Asked, Recipe, check_asked, check_kind
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.estimation.joint import Joint
+from ep2sindy.estimation.solver import Joint
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.progress import Progress, as_progress
-from ep2sindy.machine.screen import N_LINES, one_screen
-from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.progress import Progress, as_progress
+from ep2sindy.runtime.screen import N_LINES, one_screen
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.rule import SystemSelection
 
@@ -167,7 +165,7 @@ def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
 
 
 def _findings(
-    problems: Sequence[Regression], recipe: Recipe, asked: Asked
+    problems: Sequence[RegressionRows], recipe: Recipe, asked: Asked
 ) -> tuple[Ambiguity, ...]:
     """What is to be said of the rows, each once; those of a joint search hold nothing down."""
     found: list[Ambiguity] = []

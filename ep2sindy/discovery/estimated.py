@@ -10,10 +10,10 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Asked, Recipe
 from ep2sindy.estimation.estimate import Estimate, Weighed, estimate
-from ep2sindy.estimation.joint import Joint
+from ep2sindy.estimation.solver import Joint
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront, fit_supports
 
 
@@ -48,7 +48,9 @@ def estimated(
     return found, fronts
 
 
-def _front(problem: Regression, state: str, weighed: Sequence[Weighed], depth: int) -> ParetoFront:
+def _front(
+    problem: RegressionRows, state: str, weighed: Sequence[Weighed], depth: int
+) -> ParetoFront:
     """The likeliest `depth` candidates of every size, the empty one first."""
     kept = [w for k, w in enumerate(weighed) if _rank(weighed, k) < depth or w.deviance == 0.0]
     if not kept or kept[0].coef:

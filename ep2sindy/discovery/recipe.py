@@ -8,20 +8,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool
 
-from ep2sindy.constraints.relations import Relation
-from ep2sindy.constraints.support import completed
+from ep2sindy.constraints.relations import Relation, completed
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.estimate import Estimate, estimate
-from ep2sindy.estimation.joint import Joint
+from ep2sindy.estimation.solver import Joint
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, pooled, resamples
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset, Search
-from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.evidence import Evidence
+from ep2sindy.selection.criteria import EBIC, Evidence
 from ep2sindy.selection.rule import Selection, SystemSelection, selected
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 from sklearn.mixture import GaussianMixture
 
 from ep2sindy.data.fields import SPACE
-from ep2sindy.machine.threads import one_thread
+from ep2sindy.runtime.threads import one_thread
 
 N_STARTS = 20  # of the mixture's iteration, which may end in a poor optimum
 
@@ -73,7 +73,7 @@ class Regimes:
         }
 
 
-def regimes(
+def find_regimes(
     result: xr.Dataset,
     *,
     rng: np.random.Generator | int,

@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
-from ep2sindy.discovery.last_fit import assemble_model, last_fit
+from ep2sindy.discovery.choice import assemble_model, last_fit
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import Progress, as_progress, counted
-from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
-from ep2sindy.regression.rows import Regression
-from ep2sindy.regression.weighted_weak import WeightedWeak
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.runtime.progress import Progress, as_progress, counted
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.search.front import ParetoFront, errors_of, fit_supports, front_order
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
@@ -104,7 +104,7 @@ def discover_jointly(
 
 
 def _joint_fronts(
-    problems: Mapping[str, Sequence[Regression]],
+    problems: Mapping[str, Sequence[RegressionRows]],
     search: BestSubset,
     depth: int,
     progress: Progress,
@@ -176,7 +176,7 @@ def _check_points(points: Mapping[str, Sequence[Trajectory]], library: Library) 
 
 
 def _joint_front(
-    problems: Mapping[str, Regression], equation: str, search: BestSubset, depth: int
+    problems: Mapping[str, RegressionRows], equation: str, search: BestSubset, depth: int
 ) -> JointFront:
     """Search the Gram matrices of all points at once, and fit what is found at each of them."""
     any_problem = next(iter(problems.values()))
@@ -208,7 +208,7 @@ def _joint_front(
 
 
 def _determined(
-    problem: Regression, masks: Bool[np.ndarray, "supports terms"]
+    problem: RegressionRows, masks: Bool[np.ndarray, "supports terms"]
 ) -> Bool[np.ndarray, "supports terms"]:
     """The terms of each support that the rows of one point determine, earlier terms first."""
     found = masks.copy()

@@ -10,7 +10,7 @@ Loops in place of array expressions: those take seconds more to compile.
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 
 
 @compiled

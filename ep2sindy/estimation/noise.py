@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.estimation.kernels import eliminated
-from ep2sindy.estimation.likelihood import FREE_START, Fit, Level, fitted
+from ep2sindy.estimation.likelihood import FREE_START, Fit, Level, fitted, seen
 from ep2sindy.estimation.likelihood import squares as squares_of
-from ep2sindy.estimation.observed import seen
 from ep2sindy.estimation.problem import Problem
 
 FLOOR = 1e-3  # of the RMS: no model and no integration is exact

@@ -1,7 +1,11 @@
-"""What is estimated: records in scaled variables, and all coefficients that a model may have."""
+"""What is estimated: records in scaled variables, and all coefficients that a model may have.
+
+What an estimation costs is known before it begins (`check_size`).
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,7 +19,8 @@ from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.kernels import sensitivity_stage, term_values
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import Advance, nothing
+from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.trust.memory import check_memory
 
 # Where each Runge-Kutta stage stands in its step, and the share of its slope in the sum.
 STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
@@ -296,3 +301,38 @@ def _record(run: Trajectory, size: np.ndarray, step_s: float) -> Record:
 def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:
     found = bounds_of(run.states, run.state_names)
     return found and replace(found, lower=found.lower / size, upper=found.upper / size)
+
+
+NUMBERS = 3.5  # held at once for each pair of coefficients, and for each coefficient and state
+
+SOON = 300  # coefficients that are searched within a minute or so
+
+
+class SlowSearch(UserWarning):
+    """So much is to be searched at once that it takes long."""
+
+
+def check_size(
+    runs: Sequence[Trajectory], library: Library, terms: Mapping[str, Sequence[str]]
+) -> None:
+    """Raise ValueError for more coefficients than memory holds; warn of a long search.
+
+    terms: by state, all the terms of an equation that is known but for its coefficients.
+    """
+    states = runs[0].state_names
+    n = sum(len(terms.get(state, library)) for state in states)
+    n_samples = sum(run.n_samples for run in runs)
+    what = f"{n} coefficients ({len(library)} terms, {len(states)} states)"
+    check_memory(
+        8.0 * NUMBERS * n * (n + n_samples * len(states)),
+        f"{what} that are estimated together from {n_samples} samples",
+        way_out="take fewer terms or a lower degree, every second sample (ep2sindy.decimate), or a "
+        "search equation by equation: Recipe(WeightedWeak()), or search=best_subset selection=ebic",
+    )
+    if n > SOON:
+        warnings.warn(
+            f"{what} are searched together, which may take many minutes: fewer "
+            "terms, or a search equation by equation, Recipe(WeightedWeak()), take seconds",
+            SlowSearch,
+            stacklevel=2,
+        )

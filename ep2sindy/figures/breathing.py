@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.fields import cell_edges
-from ep2sindy.figures.panels import CM
+from ep2sindy.figures.maps import CM
 from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above, unit_text
 from ep2sindy.signals.spectrum import power_spectrum
 

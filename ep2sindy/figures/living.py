@@ -10,8 +10,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.frames import framing
-from ep2sindy.figures.style import COLOURS, DATA, GREY, axis_label, legend_above, panel_grid
+from ep2sindy.figures.style import (
+    COLOURS,
+    DATA,
+    GREY,
+    axis_label,
+    framing,
+    legend_above,
+    panel_grid,
+)
 from ep2sindy.model.likeness import LONG
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle

@@ -1,31 +1,34 @@
-"""Figures of time series: data, and models beside them, each in a row or panel of its own."""
+"""Figures of time series: data, and models beside them, each in a row or panel of its own.
+
+Also phase portraits, models beside the data in the plane of two states; and the curves to draw:
+what a figure shows of runs, between which limits, under which names.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle
 from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.curves import (
-    Curves,
-    diverged_within,
-    first_part,
-    limits_of,
-    run_labels,
-)
-from ep2sindy.figures.frames import legend_marks, mark_exits
 from ep2sindy.figures.style import (
     COLOURS,
     DATA,
     GREY,
     MORE_COLOURS,
+    Limits,
     axis_label,
+    framing,
     legend_above,
+    legend_marks,
+    mark_exits,
+    panel_grid,
     slope_label,
     unit_text,
 )
@@ -229,3 +232,101 @@ def _power_unit(run: Trajectory, name: str) -> str:
     if run.clock.unit == "s":
         return unit_product([(run.units[name], 2), ("Hz", -1)])
     return f"{unit_product([(run.units[name], 2)])} {run.clock.unit}".removeprefix("1 ")
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """One curve per state over a shared abscissa, in the axis's own prefix."""
+
+    x: Float[np.ndarray, " points"]
+    y: Float[np.ndarray, "points n_states"]
+
+
+def first_part(
+    t: Float[np.ndarray, " samples"],
+    values: Float[np.ndarray, "samples n_states"],
+    duration_s: float,
+    clock: Clock,
+) -> Curves:
+    """What lies in the first `duration_s`, over a time that the clock shows."""
+    since = t - t[:1]
+    shown = since <= duration_s
+    return Curves(clock.scale(duration_s)[0] * since[shown], values[shown])
+
+
+def limits_of(data: Curves, models: Mapping[str, Curves], rare: float = 0.0) -> list[Limits]:
+    together = np.concatenate([curves.y for curves in models.values()])
+    return [framing(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
+
+
+def diverged_within(rollouts: Mapping[str, Rollout], duration_s: float) -> set[str]:
+    """Names of the runs that stop before the end of what is shown."""
+    return {name for name, r in rollouts.items() if r.diverged and r.lasted_s <= duration_s}
+
+
+def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> dict[str, str]:
+    """A name, and below it what becomes of the run where that is known.
+
+    verdicts: by name; a run that diverged says itself when, counted from its start.
+    """
+    found = {}
+    for name, rollout in rollouts.items():
+        verdict = when_it_diverges(rollout) if rollout.diverged else verdicts.get(name)
+        found[name] = f"{name}\n({verdict})" if verdict else name
+    return found
+
+
+def when_it_diverges(rollout: Rollout) -> str:
+    """`diverges at 182 µs`, counted from its start."""
+    return f"diverges at {rollout.lasted_text or 'once'}"
+
+
+def phase_figure(
+    run: Trajectory,
+    rollouts: Mapping[str, Rollout],
+    *,
+    plane: Sequence[str],
+    duration_s: float,
+    verdicts: Mapping[str, str] = MappingProxyType({}),
+) -> Figure:
+    """A panel per model in the plane of two states: its run (colour) over the data (grey).
+
+    The dot is where it starts; other marks and verdicts as in `trajectory_figure`.
+    """
+    pair = [run.state_names.index(name) for name in plane]
+    data = first_part(run.t, run.states[:, pair], duration_s, run.clock)
+    models = {
+        n: first_part(r.t, r.states[:, pair], duration_s, run.clock) for n, r in rollouts.items()
+    }
+    diverged, labels = diverged_within(rollouts, duration_s), run_labels(rollouts, verdicts)
+    figure, axes = panel_grid(len(models), width=2.75, height=2.75, extra=0.7, shared=True)
+    limits = dict(enumerate(limits_of(data, models)))
+    for ax, colour, (name, curves) in zip(axes, cycle(MORE_COLOURS), models.items(), strict=False):
+        ax.plot(*data.y.T, color=GREY, lw=1.4, label="data")
+        ax.plot(*curves.y.T, color=colour, lw=1.1)
+        ax.plot(*curves.y[:1].T, "o", color=colour, ms=4)
+        ax.set_title(labels[name], fontsize=9, pad=13.0)  # above the ordinate's factor
+        mark_exits(
+            ax, *curves.y.T, colour=colour, limits=(limits[0], limits[1]),
+            diverged=name in diverged,
+        )  # fmt: skip
+    axes[0].set(xlim=limits[0], ylim=limits[1])
+    _label_plane(axes, run, plane)
+    legend_above(figure, [*axes[0].lines[:1], *legend_marks(axes)], size=9.0)
+    return figure
+
+
+def _label_plane(axes: Sequence[Axes], run: Trajectory, plane: Sequence[str]) -> None:
+    """Names at the left of rows and below columns; the first panel's factor is everyone's."""
+    labels = [axis_label(name, run.units[name]) for name in plane]
+    for ax in axes:
+        place = ax.get_subplotspec()
+        assert place is not None
+        n_columns = place.get_gridspec().ncols
+        if place.is_first_col():
+            ax.set_ylabel(labels[1])
+            ax.yaxis.get_offset_text().set_visible(place.is_first_row())
+        if axes.index(ax) + n_columns >= len(axes):  # none below it
+            ax.tick_params(labelbottom=True)
+            ax.xaxis.get_offset_text().set_visible(True)
+            ax.set_xlabel(labels[0])

@@ -1,4 +1,7 @@
-"""Figures of the parametric study: tables of estimates and laws in, a matplotlib Figure out."""
+"""Figures of the parametric study: tables of estimates and laws in, a matplotlib Figure out.
+
+Also of a sweep: what its jobs found, by what they were given.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS, equals_label, legend_above
+from ep2sindy.figures.style import COLOURS, equals_label, hover, legend_above, panel_grid
 from ep2sindy.library.equations import latex_name
 from ep2sindy.operating.quantity_law import ControlLaw
 
@@ -198,3 +203,30 @@ def _legend(signs: Signs, labels: Mapping[str, str], *, published: bool) -> list
     if published:
         entries.append(entry(labels.get("published", "published"), marker="o", mfc="none", ms=7))
     return entries + ([entry("lines: control laws")] if signs.lines else [])
+
+
+def sweep_figure(
+    x: Float[np.ndarray, " jobs"],
+    values: Mapping[str, Float[np.ndarray, " jobs"]],
+    *,
+    x_label: str,
+    jobs: Sequence[str],
+) -> Figure:
+    """A panel per headline figure: a dot per job that has it, which says under the mouse which.
+
+    x: what the jobs were given, or their numbers. values: NaN where a job has none.
+    """
+    figure, axes = panel_grid(len(values), width=3.4, height=2.5, extra=0.2, most=3)
+    for ax, (name, numbers) in zip(axes, values.items(), strict=True):
+        there = np.isfinite(numbers)
+        ax.plot(x[there], numbers[there], "o", color=COLOURS[0], ms=6)
+        for k in np.flatnonzero(there).tolist():
+            (spot,) = ax.plot(x[k], numbers[k], "o", ms=13, alpha=0.0)
+            hover(spot, f"{jobs[k]} | {name}: {numbers[k]:.4g}")
+        ax.set_title(name.replace(": ", ":\n"), fontsize=9)
+        ax.set_xlabel(x_label, fontsize=9)
+        ax.tick_params(labelsize=8)
+        ax.xaxis.set_major_locator(MaxNLocator(5, integer=bool((x == np.round(x)).all())))
+        ax.margins(x=0.08, y=0.12)
+        ax.grid(axis="y", alpha=0.25)
+    return figure

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from jaxtyping import Int
 from numpy import ndarray
 
-from ep2sindy.machine.screen import N_LINES, cut, html_table, one_screen, wrapped
+from ep2sindy.runtime.screen import N_LINES, cut, html_table, one_screen, wrapped
 
 
 def library_text(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import comb, prod
 
-from ep2sindy.machine.memory import check_memory
+from ep2sindy.trust.memory import check_memory
 
 LARGEST_DEGREE = 100
 MOST_TERMS = 20_000  # whose products with each other take 3 GB

@@ -10,8 +10,8 @@ import numpy as np
 
 from ep2sindy.library.equations import equation_html, equation_parts
 from ep2sindy.library.units import unit_product
-from ep2sindy.machine.screen import N_LINES, cut, wrapped
 from ep2sindy.model.rollout import Equations
+from ep2sindy.runtime.screen import N_LINES, cut, wrapped
 
 MOST_TERMS = 40  # of one equation in a notebook
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.likeness import Bounds, Record, Verdict, record_of
+from ep2sindy.model.likeness import FreeRunBounds, Record, Verdict, record_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import phase_along
@@ -59,7 +59,7 @@ def free_run(
     *,
     n_samples: int | None = None,
     initial: Float[np.ndarray, " n_states"] | None = None,
-    bounds: Bounds | None = None,
+    bounds: FreeRunBounds | None = None,
     judged: Sequence[str] | None = None,
 ) -> FreeRun:
     """Run a model over a record, or its first samples, and compare the attractors.
@@ -71,7 +71,7 @@ def free_run(
     n_samples = run.n_samples if n_samples is None else min(n_samples, run.n_samples)
     rollout = model.rollout(run, n_samples=n_samples, initial=initial)
     record = record_of(run.window(0, n_samples), model.states)
-    bounds = bounds or Bounds()
+    bounds = bounds or FreeRunBounds()
     likeness = ours = record.likeness(rollout.states, bounds)
     if judged is not None:
         columns = columns_of(model.states, judged)

@@ -14,7 +14,7 @@ run differs from one of SciPy's by rounding alone.
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 
 FINISHED, LOOK, CROSSED, FAILED = 0, 1, 2, 3  # why `advance` returns
 

@@ -40,7 +40,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Bounds:
+class FreeRunBounds:
     """How close a model that lives stays to the data.
 
     frequency, amplitude: relative error of the frequency and of each state's standard deviation.
@@ -76,7 +76,7 @@ def deviation(
     f_error: float,
     amplitude_ratio: Float[np.ndarray, " n_states"],
     waveform_error: Float[np.ndarray, " n_states"],
-    bounds: Bounds,
+    bounds: FreeRunBounds,
 ) -> float:
     """The largest from the data's cycle, in units of its bound; NaN where there is none."""
     return float(
@@ -119,7 +119,7 @@ class Record:
     def excursion(self, states: Float[np.ndarray, "_ n_states"]) -> float:
         return float((np.abs(states - self.states.mean(axis=0)) / self.std).max())
 
-    def likeness(self, states: Float[np.ndarray, "_ n_states"], bounds: Bounds) -> Likeness:
+    def likeness(self, states: Float[np.ndarray, "_ n_states"], bounds: FreeRunBounds) -> Likeness:
         """Of a run at the times t; one with fewer samples has diverged."""
         nothing = np.full(states.shape[1], np.nan)
         by_state = dict.fromkeys(("amplitude_ratio", "waveform_error", "distribution"), nothing)
@@ -155,13 +155,13 @@ class Record:
         return self._repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
     def _with_period(
-        self, f_error: float, amplitude: np.ndarray, waveform: np.ndarray, bounds: Bounds
+        self, f_error: float, amplitude: np.ndarray, waveform: np.ndarray, bounds: FreeRunBounds
     ) -> Verdict:
         if deviation(0.0, amplitude, waveform, bounds) > 1.0:
             return Verdict.WRONG_CYCLE
         return Verdict.LIVES if abs(f_error) <= bounds.frequency else Verdict.SLIPS
 
-    def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: Bounds) -> bool:
+    def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: FreeRunBounds) -> bool:
         """Whether a run is about as near to the record as its quarters are to each other."""
         apart, apart_spectrum = statistics_wander(self.t, self.states)
         near = (distribution <= np.maximum(bounds.distribution, apart)).all()

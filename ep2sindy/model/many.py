@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -18,34 +18,26 @@ from ep2sindy.model.runge_kutta import rk4_step
 # `systems`: its error stays below 1e-9 variances; the second is for sparser samples.
 N_SUBSTEPS = 2
 
-# A window's error at most, in variances: a model that always gives the mean has 1.
-MAX_ERROR = 10.0
-
 # A state this many standard deviations from its mean has diverged.
 BLOW_UP = 20.0
-
-# Runs that advance together: more, and their terms leave the cache.
-RUN_BLOCK = 2560
 
 
 @dataclass(frozen=True, eq=False)
 class DrivenWindows:
-    """Windows of one trajectory: where they start, what they should follow, what drives them.
+    """Windows of one trajectory: where they start, what drives them, and for how long.
 
-    steps_s: (steps, windows), of the integration. drive: inputs at the start, middle and end of
-    every step. start: smoothed. truth: the samples that follow, each N_SUBSTEPS steps apart.
+    steps_s: (steps, windows), of the integration, N_SUBSTEPS from one sample to the next. drive:
+    inputs at the start, middle and end of every step. start: smoothed.
     """
 
     steps_s: Float[np.ndarray, "steps windows"]
     drive: Float[np.ndarray, "n_inputs steps 3 windows"]
     start: Float[np.ndarray, "n_states windows"]
-    truth: Float[np.ndarray, "n_states samples windows"]
 
     @staticmethod
     def of(
         run: Trajectory,
         smoothed: Float[np.ndarray, "_ n_states"],
-        states: Sequence[str],
         inputs: Sequence[str],
         starts: Int[np.ndarray, " windows"],
         n_steps: int,
@@ -61,21 +53,18 @@ class DrivenWindows:
 
             spline = make_interp_spline(run.t, run.columns(inputs), k=min(3, run.n_samples - 1))
             drive = np.moveaxis(spline(nodes), -1, 0)
-        return DrivenWindows(
-            steps_s, drive, smoothed[starts].T, run.columns(states).T[:, samples[1:]]
-        )
+        return DrivenWindows(steps_s, drive, smoothed[starts].T)
 
     @staticmethod
     def free(
         start: Float[np.ndarray, "n_states windows"], *, step_s: float, n_samples: int
     ) -> DrivenWindows:
-        """Equal steps from any starts, nothing driven and no samples to follow."""
+        """Equal steps from any starts, with nothing driven."""
         n_steps = N_SUBSTEPS * (n_samples - 1)
         return DrivenWindows(
             np.full((n_steps, start.shape[1]), step_s / N_SUBSTEPS),
             np.empty((0, n_steps, 3, start.shape[1])),
             start,
-            np.empty((len(start), 0, start.shape[1])),
         )
 
 
@@ -108,47 +97,19 @@ class Ensemble:
         used[0] |= not used.any()  # a library needs a term
         return self.library.take(used), self.coef[used]
 
-    def errors(
-        self,
-        windows: DrivenWindows,
-        *,
-        centre: Float[np.ndarray, " n_states"],
-        spread: Float[np.ndarray, " n_states"],
-    ) -> Float[np.ndarray, "models windows"]:
-        """Mean over samples and states of the squared error, in variances; at most MAX_ERROR.
-
-        Runge-Kutta of fourth order. A run whose state leaves centre by BLOW_UP times spread has
-        diverged: it stops, and its error is MAX_ERROR.
-        """
-        n_models, n_together = self.coef.shape[2], max(1, RUN_BLOCK // windows.start.shape[1])
-        blocks = [self.coef[:, :, k : k + n_together] for k in range(0, n_models, n_together)]
-        centre, spread = centre[:, None, None], spread[:, None, None]
-        return np.concatenate(
-            [replace(self, coef=block)._errors(windows, centre, spread) for block in blocks]
-        )
-
     def paths(
         self, windows: DrivenWindows, *, centre: np.ndarray, spread: np.ndarray
     ) -> Float[np.ndarray, "models windows samples n_states"]:
         """Where every model runs from every start, the start included; NaN once it diverged.
 
-        As `errors` for the rest. As many samples as the steps of the windows reach.
+        Runge-Kutta of fourth order, over as many samples as the steps of the windows reach. A run
+        whose state leaves centre by BLOW_UP times spread has diverged, and stops.
         """
         start = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)
         found = [start]
         for x, bounded in self._run(windows, centre[:, None, None], spread[:, None, None]):
             found.append(np.where(bounded, x, np.nan))
         return np.stack(found).transpose(2, 3, 0, 1)
-
-    def _errors(self, windows: DrivenWindows, centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        n_samples = windows.truth.shape[1]
-        shape = (self.coef.shape[2], windows.start.shape[1])
-        total, bounded = np.zeros(shape), np.ones(shape, dtype=np.bool_)
-        for k, (x, inside) in enumerate(self._run(windows, centre, spread)):
-            with np.errstate(over="ignore"):
-                total += np.square((x - windows.truth[:, k, None]) / spread).mean(axis=0)
-            bounded = inside
-        return np.where(bounded, np.minimum(total / n_samples, MAX_ERROR), MAX_ERROR)
 
     def _run(
         self, windows: DrivenWindows, centre: np.ndarray, spread: np.ndarray

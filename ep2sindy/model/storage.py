@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.readers.limits import check_kind
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.machine.files import read_json
+from ep2sindy.runtime.files import read_json
+from ep2sindy.trust.limits import check_kind
 
 FORMAT = "ep2sindy.SparseModel/1"
 

@@ -1,1 +1,5 @@
-"""Records at operating points, and laws of the parameters between them."""
+"""Operating points: records, laws of the operating point, and maps of what they predict."""
+
+from ep2sindy._stubs import attach
+
+__getattr__, __dir__ = attach(__name__)

@@ -13,8 +13,6 @@ from jaxtyping import Float
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Serial, Workers, collect
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.operating.fit import (
     LeaveOneOut,
     OperatingFit,
@@ -31,8 +29,10 @@ from ep2sindy.operating.records import (
     check_records,
     interpolation_errors,
 )
-from ep2sindy.refinement.tied import TiedRefinement
+from ep2sindy.refinement.law import TiedRefinement
 from ep2sindy.regression.differential import Differential
+from ep2sindy.runtime.parallel import Serial, Workers, collect
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.searches import BestSubset
 
 MOST_PARAMETERS = 2  # of a map that can be drawn

@@ -12,10 +12,8 @@ from jaxtyping import Float
 from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.parallel import Serial, Workers, collect
-from ep2sindy.machine.progress import Progress, as_progress
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds, deviation
+from ep2sindy.model.likeness import FreeRunBounds, deviation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
 from ep2sindy.operating.records import (
@@ -23,12 +21,14 @@ from ep2sindy.operating.records import (
     check_records,
     values_of,
 )
+from ep2sindy.refinement.law import TiedRefinement, refine_tied
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many
-from ep2sindy.refinement.tied import TiedRefinement, refine_tied
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
+from ep2sindy.runtime.parallel import Serial, Workers, collect
+from ep2sindy.runtime.progress import Progress, as_progress
 
 MOST = 10.0  # deviations count no more, however far a run is off, or where there is none
 
@@ -218,7 +218,7 @@ class LeaveOneOut:
         amplitude, waveform = (
             np.array(list(each.values())) for each in (run.amplitude_ratio, run.waveform_error)
         )
-        found = deviation(run.f_error, amplitude, waveform, Bounds())
+        found = deviation(run.f_error, amplitude, waveform, FreeRunBounds())
         return MOST if np.isnan(found) else min(found, MOST)
 
 

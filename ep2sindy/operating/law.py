@@ -22,13 +22,13 @@ from ep2sindy.discovery.shared_support import JointDiscovery, JointFront
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.machine.files import read_json, write_text
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, point_label
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.rule import FLOOR
 

@@ -17,8 +17,6 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Workers, collect
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.law import LawFit, fit_law
@@ -36,9 +34,10 @@ from ep2sindy.operating.records import OperatingRecord, check_alike, naming
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.resampling import moving_block_counts
-from ep2sindy.regression.rows import Regression
-from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.parallel import Workers, collect
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency
@@ -160,7 +159,7 @@ def _point_result(
 
 def _least_squares(
     run: Trajectory,
-    problems: Sequence[Regression],
+    problems: Sequence[RegressionRows],
     case: Case,
     study: PointStudy,
     period_s: float,
@@ -194,7 +193,7 @@ def _least_squares(
 
 def _refined(
     run: Trajectory,
-    problems: Sequence[Regression],
+    problems: Sequence[RegressionRows],
     case: Case,
     study: PointStudy,
     period_s: float,
@@ -231,7 +230,7 @@ def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -
     return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))
 
 
-def _r2(problems: Sequence[Regression], model: SparseModel) -> dict[str, float]:
+def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
     """Of the derivative, by state, on training rows as they are."""
     found = {}
     for problem in problems:
@@ -259,7 +258,7 @@ class TimeBootstrap:
 
 
 def resampled_coefficients(
-    problems: Sequence[Regression],
+    problems: Sequence[RegressionRows],
     constraint: Constraint,
     model: SparseModel,
     *,

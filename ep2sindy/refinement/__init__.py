@@ -1,1 +1,5 @@
 """Refinement: coefficients fitted to integrated trajectories; PyTorch lives here."""
+
+from ep2sindy._stubs import attach
+
+__getattr__, __dir__ = attach(__name__)

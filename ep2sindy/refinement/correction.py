@@ -13,8 +13,6 @@ from torch import nn
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.machine.progress import Progress, as_progress
-from ep2sindy.machine.threads import one_thread
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import FLAT
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
@@ -23,6 +21,8 @@ from ep2sindy.refinement.ode import ODE, unconstrained
 from ep2sindy.refinement.problem import Fit, Iteration, Problem, recorder
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
+from ep2sindy.runtime.progress import Progress, as_progress
+from ep2sindy.runtime.threads import one_thread
 
 # A step is fine enough when half of it moves the trajectories by less than either of these.
 ERROR_PER_RESIDUAL, LEAST_ERROR = 0.1, 1e-3  # rms, the second in std

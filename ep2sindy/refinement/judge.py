@@ -11,8 +11,8 @@ from scipy.special import ndtri, stdtrit
 from torchdiffeq import odeint
 
 from ep2sindy.refinement.kernels import condense, propagate
+from ep2sindy.refinement.methods.multiple_shooting import least_change, step_maps
 from ep2sindy.refinement.problem import Fit, Problem
-from ep2sindy.refinement.shots import least_change, step_maps
 from ep2sindy.refinement.windows import WindowBatch
 
 FLAT = 0.95  # share of the loss of a constant from which on a model follows nothing

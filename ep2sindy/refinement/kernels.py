@@ -9,7 +9,7 @@ scalings, the right-hand side.
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 
 
 @compiled(fastmath={"reassoc", "contract"})

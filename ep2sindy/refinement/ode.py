@@ -1,17 +1,22 @@
-"""A sparse model as a torch module: scaled states, scaled time, scalings of free coefficients."""
+"""Sparse models in torch: right-hand sides, derivatives by states and scalings, time steps."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
+from torchdiffeq import odeint
 
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.constraints.relations import constraint as build_constraint
+from ep2sindy.library.library import Library, library_of
 from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.kernels import propagate
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,3 +177,297 @@ def _coef(model: SparseModel, relations: Constraint) -> np.ndarray:
             "cannot move them; start from a small value"
         )
     return coef
+
+
+@dataclass(frozen=True, eq=False)
+class Augmented:
+    """Right-hand sides of many points with their derivatives by state and scaling, in one batch.
+
+    One gather and product gives every distinct product of `library`; one matmul of them gives the
+    rate, its derivative by the states and its derivative by the scalings, column by column.
+    factors: (degree, products); basis: (points, rows, products, free); offset: the same without
+    `free`, for rows = n_states * columns.
+    """
+
+    library: Library
+    factors: torch.Tensor
+    basis: torch.Tensor
+    offset: torch.Tensor
+    n_states: int
+
+    @property
+    def n_free(self) -> int:
+        return self.basis.shape[-1]
+
+    @property
+    def n_columns(self) -> int:
+        """The rate, its derivatives by each state, then by each scaling."""
+        return 1 + self.n_states + self.n_free
+
+    def take(self, points: torch.Tensor) -> Augmented:
+        return replace(self, basis=self.basis[points], offset=self.offset[points])
+
+    def weights(self, scaling: torch.Tensor) -> torch.Tensor:
+        """(points, rows, products) of scaling (points, free)."""
+        return (self.basis @ scaling[:, None, :, None])[..., 0] + self.offset
+
+    def fields(self, weights: torch.Tensor, x: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+        """(points, n_states, columns, batch) of x (points, n_states, batch)."""
+        columns = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
+        columns = self.library.with_functions(columns, axis=1)
+        products = columns.index_select(1, self.factors[0])
+        for rows in self.factors[1:]:
+            products = products * columns.index_select(1, rows)
+        return torch.bmm(weights, products).view(len(x), self.n_states, -1, x.shape[-1])
+
+    def rhs(
+        self, scaling: torch.Tensor, drive: Drive
+    ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+        """d/dt of the state and its derivatives by its start and by the scalings.
+
+        The function takes and gives (points, n_states, columns, batch).
+        """
+        weights, n = self.weights(scaling), self.n_states
+
+        def rate(t: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+            steps, inputs = drive.at(t)
+            out = self.fields(weights, z[:, :, 0], inputs)
+            tangents = out[:, :, 1:2] * z[:, 0:1, 1:]
+            for v in range(1, n):
+                tangents.addcmul_(out[:, :, 1 + v : 2 + v], z[:, v : v + 1, 1:])
+            tangents[:, :, n:] += out[:, :, 1 + n :]
+            whole = torch.cat([out[:, :, :1], tangents], dim=2)
+            return whole if steps is None else whole.mul_(steps[:, None])
+
+        return rate
+
+    def value_rhs(
+        self, scaling: torch.Tensor, drive: Drive
+    ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+        """d/dt of the state alone, (points, n_states, batch)."""
+        weights = self.weights(scaling)[:, :: self.n_columns]
+
+        def rate(t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+            steps, inputs = drive.at(t)
+            out = self.fields(weights, x, inputs)[:, :, 0]
+            return out if steps is None else out * steps
+
+        return rate
+
+
+def augmented(odes: Sequence[ODE]) -> Augmented:
+    """Modules of the same variables as one batch of points, on the device of the first.
+
+    Terms may differ: products are those that any module needs, and columns of zeros stand for
+    the scalings that a module has fewer of than the others.
+    Raises ValueError for modules that differ in variables, or hold a correction, whose
+    derivatives only autograd knows.
+    """
+    first = odes[0]
+    if any(ode.correction is not None for ode in odes):
+        raise ValueError("a learned correction has no tangents here; refine by GradientDescent")
+    if any((ode.variables, ode.n_states) != (first.variables, first.n_states) for ode in odes):
+        raise ValueError(
+            "models refined in one batch must share their states and inputs: "
+            f"{sorted({ode.variables for ode in odes})} came"
+        )
+    n, n_free = first.n_states, max(len(ode.free0) for ode in odes)
+    terms = library_of(first.variables, (term for ode in odes for term in ode.library.terms))
+    products, transfer = terms.with_derivatives(n)
+    size = (len(odes), n, 1 + n + n_free, len(products))
+    basis, offset = np.zeros((*size, n_free)), np.zeros(size)
+    for ode, by_point, fixed_point in zip(odes, basis, offset, strict=True):
+        with torch.no_grad():
+            by_scaling, fixed = (part.cpu().numpy() for part in ode.linear_parts())
+        spread = transfer[terms.places(ode.library)]
+        own = by_scaling.shape[-1]
+        by_point[:, : 1 + n, :, :own] = np.einsum("tcm,tji->jcmi", spread, by_scaling)
+        fixed_point[:, : 1 + n] = np.einsum("tcm,tj->jcm", spread, fixed)
+        fixed_point[:, 1 + n : 1 + n + own] = np.einsum("tm,tji->jim", spread[:, 0], by_scaling)
+    device = first.C.device
+    factors = torch.tensor(products.table.T, device=device)
+    return Augmented(
+        library=products,
+        factors=factors.contiguous(),
+        basis=torch.tensor(basis, device=device).flatten(1, 2),
+        offset=torch.tensor(offset, device=device).flatten(1, 2),
+        n_states=n,
+    )
+
+
+NEWTON_STEPS = 20  # for two implicit half steps, from what one whole step gives
+
+
+@runtime_checkable
+class Step(Protocol):
+    """What the alternatives share.
+
+    nodes: (points, windows, samples, n_states); scaling: (points, free); drive: one segment and
+    a batch of (windows * segments).
+    """
+
+    def maps(
+        self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
+    ) -> np.ndarray:
+        """End of each step and its derivatives, as the kernels take them."""
+        ...
+
+    def finer(
+        self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
+    ) -> np.ndarray:
+        """End of each step taken in two: (points, n_states, windows, segments)."""
+        ...
+
+    def halved(self) -> Step | None:
+        """The same with twice as many steps, None where there is no such thing."""
+        ...
+
+
+@dataclass(frozen=True)
+class RungeKutta:
+    """torchdiffeq's `rk4` (the 3/8 rule), `n_substeps` equal steps per sample, explicit."""
+
+    n_substeps: int = 1
+
+    def __post_init__(self) -> None:
+        if self.n_substeps < 1:
+            raise ValueError(f"n_substeps must be one or more: {self.n_substeps} came")
+
+    def maps(
+        self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
+    ) -> np.ndarray:
+        x = _batch(nodes[:, :, :-1], system)
+        n = system.n_states
+        z = x.new_zeros((len(x), n, system.n_columns, x.shape[-1]))
+        z[:, :, 0] = x
+        for j in range(n):
+            z[:, j, 1 + j] = 1.0
+        with torch.inference_mode():
+            end = _end(system.rhs(_tensor(scaling, system), drive), z, self.n_substeps)
+        return end.cpu().numpy().reshape(*end.shape[:3], nodes.shape[1], -1)
+
+    def finer(
+        self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
+    ) -> np.ndarray:
+        x = _batch(nodes[:, :, :-1], system)
+        with torch.inference_mode():
+            rhs = system.value_rhs(_tensor(scaling, system), drive)
+            end = _end(rhs, x, 2 * self.n_substeps)
+        return end.cpu().numpy().reshape(*end.shape[:2], nodes.shape[1], -1)
+
+    def halved(self) -> RungeKutta | None:
+        return RungeKutta(2 * self.n_substeps) if self.n_substeps < 8 else None
+
+
+ONE_RUNGE_KUTTA = RungeKutta()
+
+
+@dataclass(frozen=True)
+class HermiteSimpson:
+    """Implicit collocation of order four over one sample, for stiff models.
+
+    A-stable: a fast mode that has died out does not limit the step. Not torchdiffeq's.
+    Source: Hargraves & Paris 1987, doi:10.2514/3.20223.
+    """
+
+    def maps(
+        self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
+    ) -> np.ndarray:
+        with torch.inference_mode():
+            left = _batch(nodes[:, :, :-1], system)
+            right = _batch(nodes[:, :, 1:], system)
+            end = _collocate(system, drive, _tensor(scaling, system), left, right)
+        return end.cpu().numpy().reshape(*end.shape[:3], nodes.shape[1], -1)
+
+    def finer(
+        self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
+    ) -> np.ndarray:
+        points, _, _, n = nodes.shape
+        left, right = (nodes[:, :, cut].reshape(points, -1, n) for cut in (np.s_[:-1], np.s_[1:]))
+        halves = np.stack([left, 0.5 * (left + right), right], axis=2)
+        half_drive = _half(drive)
+        for _ in range(NEWTON_STEPS):
+            maps = self.maps(system, half_drive, scaling, halves)
+            start, still = np.zeros((points, left.shape[1], 1, n)), np.zeros_like(scaling)
+            change = propagate(maps, halves, start, still, 3)
+            halves = halves + change
+            if not np.abs(change).max() > 1e-12:
+                break
+        shape = (points, n, nodes.shape[1], -1)
+        return halves[:, :, 2].transpose(0, 2, 1).reshape(shape)
+
+    def halved(self) -> None:
+        return None
+
+
+def _tensor(values: np.ndarray, system: Augmented) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64, device=system.offset.device)
+
+
+def _batch(nodes: np.ndarray, system: Augmented) -> torch.Tensor:
+    """(points, windows, samples, n_states) to (points, n_states, batch)."""
+    flat = nodes.reshape(len(nodes), -1, nodes.shape[-1]).transpose(0, 2, 1)
+    return _tensor(np.ascontiguousarray(flat), system)
+
+
+def _end(
+    rhs: Callable[[torch.Tensor, torch.Tensor], torch.Tensor], start: torch.Tensor, n_steps: int
+) -> torch.Tensor:
+    """Integrate over one unit of time by torchdiffeq; its clock stays on the CPU."""
+    grid = torch.linspace(0.0, 1.0, n_steps + 1, dtype=torch.float64)
+    options = {"grid_constructor": lambda func, y0, t: grid}
+    return odeint(rhs, start, grid[[0, -1]], method="rk4", options=options)[-1]
+
+
+def _half(drive: Drive) -> Drive:
+    """The same batch with each step cut in two, one after the other."""
+    steps = torch.repeat_interleave(0.5 * drive.steps, 2, dim=-1)
+    powers = 0.5 ** torch.arange(3, -1, -1, dtype=torch.float64, device=steps.device)
+    a, b, c, d = drive.inputs.unbind(1)
+    # The same cubics, expanded about the middle of the step.
+    about = [a, 1.5 * a + b, 0.75 * a + b + c, 0.125 * a + 0.25 * b + 0.5 * c + d]
+    halves = torch.stack([drive.inputs, torch.stack(about, dim=1)], dim=-1)
+    return Drive(steps, (halves * powers.view(1, 4, 1, 1, 1, 1)).flatten(-2))
+
+
+def _collocate(
+    system: Augmented,
+    drive: Drive,
+    scaling: torch.Tensor,
+    left: torch.Tensor,
+    right: torch.Tensor,
+) -> torch.Tensor:
+    """One Newton step for the end of each step, with its derivatives, from nodes at both ends.
+
+    g = right - left - h/6 (f_left + 4 f_mid + f_right), where
+    mid = (left + right)/2 + h/8 (f_left - f_right).
+    """
+    n, weights = system.n_states, system.weights(scaling)
+
+    def fields(t: float, x: torch.Tensor) -> torch.Tensor:
+        """h * (rate, derivatives by state, by scaling): (points, batch, n_states, columns)."""
+        steps, inputs = drive.at(t)
+        out = system.fields(weights, x, inputs)
+        return (out if steps is None else out * steps[:, None]).permute(0, 3, 1, 2)
+
+    at_left, at_right = fields(0.0, left), fields(1.0, right)
+    x_left, x_right = left.transpose(1, 2), right.transpose(1, 2)
+    middle = 0.5 * (x_left + x_right) + 0.125 * (at_left - at_right)[..., 0]
+    at_middle = fields(0.5, middle.transpose(1, 2))
+    by_middle = at_middle[..., 1 : 1 + n]
+    one = torch.eye(n, dtype=left.dtype, device=left.device)
+    g = (x_right - x_left) - (at_left + 4.0 * at_middle + at_right)[..., 0] / 6.0
+    left_x, right_x = at_left[..., 1 : 1 + n], at_right[..., 1 : 1 + n]
+    by_left = -one - (left_x + 4.0 * by_middle @ (0.5 * one + 0.125 * left_x)) / 6.0
+    by_right = one - (4.0 * by_middle @ (0.5 * one - 0.125 * right_x) + right_x) / 6.0
+    left_s, right_s = at_left[..., 1 + n :], at_right[..., 1 + n :]
+    by_scaling = (
+        -(left_s + 4.0 * (at_middle[..., 1 + n :] + by_middle @ (left_s - right_s) / 8.0) + right_s)
+        / 6.0
+    )
+    whole = torch.cat([g[..., None], by_left, by_scaling], dim=-1)
+    # Singular where two trajectories of the implicit step meet: not finite, so a result.
+    solution, failed = torch.linalg.solve_ex(by_right, whole)
+    end = torch.where(failed[..., None, None] == 0, -solution, torch.nan)
+    end[..., 0] += x_right
+    return end.permute(0, 2, 3, 1)

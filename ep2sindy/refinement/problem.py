@@ -11,11 +11,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ep2sindy.machine.progress import Advance, nothing
-from ep2sindy.refinement.ode import ODE, Drive
-from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
-from ep2sindy.refinement.tangents import Augmented, augmented
+from ep2sindy.refinement.ode import ODE, ONE_RUNGE_KUTTA, Augmented, Drive, Step, augmented
 from ep2sindy.refinement.windows import WindowBatch
+from ep2sindy.runtime.progress import Advance, nothing
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.regression.gram_fits import independent_terms
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 
 # One minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
 SAME = 1e-10
@@ -40,7 +40,7 @@ class Ambiguity:
     exact: bool
 
 
-def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
+def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and are no combination of a few simpler ones on the training rows.
 
     Simpler is of lower degree, or earlier in the library.
@@ -52,13 +52,13 @@ def usable_terms(problem: Regression) -> Bool[np.ndarray, " terms"]:
     return usable
 
 
-def largest_support(problem: Regression) -> int:
+def largest_support(problem: RegressionRows) -> int:
     """How many terms an equation may have: all that are usable, unless the rows are few."""
     n_terms, n_rows = int(usable_terms(problem).sum()), len(problem.train_rows)
     return n_terms if n_rows >= FEW * n_terms else max(1, n_rows // ROWS_PER_COEFFICIENT)
 
 
-def few_rows(problem: Regression) -> tuple[Ambiguity, ...]:
+def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     """What is said where `largest_support` holds equations down."""
     largest, n_terms = largest_support(problem), int(usable_terms(problem).sum())
     if largest == n_terms:
@@ -70,12 +70,12 @@ def few_rows(problem: Regression) -> tuple[Ambiguity, ...]:
     return (Ambiguity((), message, True),)
 
 
-def _simplest_first(problem: Regression) -> Int[np.ndarray, " terms"]:
+def _simplest_first(problem: RegressionRows) -> Int[np.ndarray, " terms"]:
     return np.argsort(problem.library.degrees, kind="stable")
 
 
 def _distinct(
-    problem: Regression, xx: Float[np.ndarray, "terms terms"]
+    problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]
 ) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and do not repeat a simpler one."""
     order = _simplest_first(problem)
@@ -86,13 +86,13 @@ def _distinct(
     return distinct
 
 
-def ambiguities(problem: Regression) -> tuple[Ambiguity, ...]:
+def ambiguities(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     """Everything that keeps terms from being told apart, over the training rows."""
     xx = problem.train_gram.xx[0]
     return (*_zero(problem, xx), *_alike(problem, xx), *_dependent(problem, xx))
 
 
-def _zero(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def _zero(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     return [
         Ambiguity((name,), f"{name!r} is zero on every row and is left out", True)
         for name, square in zip(problem.term_names, np.diag(xx), strict=True)
@@ -100,7 +100,7 @@ def _zero(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Amb
     ]
 
 
-def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def _alike(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     """Pairs of terms that are proportional, the simpler one first; what is left out only once."""
     names, order = problem.term_names, _simplest_first(problem)
     kept = _distinct(problem, xx)
@@ -122,7 +122,7 @@ def _alike(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Am
     return found
 
 
-def _dependent(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def _dependent(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     """Each term that is a combination of simpler ones, with the terms that make it up."""
     names = problem.term_names
     found = []
@@ -135,7 +135,7 @@ def _dependent(problem: Regression, xx: Float[np.ndarray, "terms terms"]) -> lis
 
 
 def _combinations(
-    problem: Regression, xx: Float[np.ndarray, "terms terms"]
+    problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]
 ) -> list[tuple[int, list[int]]]:
     """Distinct terms that depend on simpler ones, each with those that it is made of."""
     order = _simplest_first(problem)

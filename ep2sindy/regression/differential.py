@@ -10,7 +10,7 @@ import numpy as np
 from ep2sindy.data.domain import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
@@ -33,7 +33,7 @@ class Differential:
         library: Library,
         *,
         rng: np.random.Generator,
-    ) -> tuple[Regression, ...]:
+    ) -> tuple[RegressionRows, ...]:
         """Rows of all trajectories below one another; every row uses one trajectory alone.
 
         All equations share their rows, so there is one regression.
@@ -45,7 +45,7 @@ class Differential:
         parts = [self._rows(run, library) for run in trajectories]
         test = [self.split.held_out(run.n_samples, rng) for run in trajectories]
         n_rows = sum(run.n_samples for run in trajectories)
-        problem = Regression(
+        problem = RegressionRows(
             theta=np.concatenate([theta for theta, _ in parts]),
             target=np.concatenate([target for _, target in parts]),
             library=library,
@@ -60,5 +60,5 @@ class Differential:
         values = run.columns(library.variables)
         if self.smooth_library:
             values = kept_inside(library, self.smoother.smooth(run.t, values), values)
-        with np.errstate(over="ignore"):  # Regression names a term that is not finite
+        with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
             return library.evaluate(values), self.smoother.derivative(run.t, run.states)

@@ -6,7 +6,7 @@ support.
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 
 # A column counts as dependent on others when what they leave of its square falls below this.
 DEPENDENT = 1e-11

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, read_only
 from ep2sindy.library.library import Library
-from ep2sindy.machine.memory import check_memory
+from ep2sindy.trust.memory import check_memory
 
 ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the cache
 
@@ -50,7 +50,7 @@ class NoisyRows:
 
 
 @dataclass(frozen=True, eq=False)
-class Regression:
+class RegressionRows:
     """Rows of library terms and targets, in SI units, ready for a search.
 
     theta: (rows, terms). target: (rows, equations).
@@ -212,4 +212,4 @@ class Formulation(Protocol):
         library: Library,
         *,
         rng: np.random.Generator,
-    ) -> tuple[Regression, ...]: ...
+    ) -> tuple[RegressionRows, ...]: ...

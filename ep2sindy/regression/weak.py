@@ -1,4 +1,8 @@
-"""The weak form: regress integrals against test functions, so that no noise is differentiated."""
+"""The weak form: regress integrals against test functions, so that no noise is differentiated.
+
+`WeightedWeak` makes the rows white under the whole library. Inputs that are known exactly, because
+they were set and not measured, have no noise to be followed.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +16,12 @@ from scipy.sparse import block_diag, csr_array
 from ep2sindy.data.domain import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
-from ep2sindy.regression.exact_inputs import exact_columns
-from ep2sindy.regression.rows import NoisyRows, Regression
+from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, Windows
+from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 from ep2sindy.signals.smoothers import Smoother
 
@@ -65,7 +70,7 @@ class Weak:
         library: Library,
         *,
         rng: np.random.Generator,
-    ) -> tuple[Regression, ...]:
+    ) -> tuple[RegressionRows, ...]:
         """One regression per state, since every state has windows of its own.
 
         Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
@@ -84,7 +89,7 @@ class Weak:
         segment = np.arange(run.n_samples) * n_segments // run.n_samples
         names = tuple(dict.fromkeys([*library.variables, *run.state_names]))
         at_hand, estimate = self._smoothed(run, names, library)
-        with np.errstate(over="ignore"):  # Regression names a term that is not finite
+        with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
             terms = library.evaluate(at_hand[:, : len(library.variables)])
         return _Sampled(
             run=run,
@@ -126,13 +131,13 @@ class Weak:
         runs: Sequence[_Sampled],
         library: Library,
         trajectories: Sequence[Trajectory],
-    ) -> Regression:
+    ) -> RegressionRows:
         name = runs[0].run.state_names[state]
         parts = [run.rows(state) for run in runs]
         test = np.concatenate([part.test for part in parts])
         mean, slope = _stacked(p.mean for p in parts), _stacked(p.slope for p in parts)
         n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
-        return Regression(
+        return RegressionRows(
             theta=mean @ np.concatenate([run.terms for run in runs]),
             target=(slope @ np.concatenate([run.run.states[:, state] for run in runs]))[:, None],
             library=library,
@@ -215,3 +220,98 @@ def _noisy_rows(
             [np.broadcast_to(e.noise_std, e.smoothed.shape) for e in estimates]
         ),
     )
+
+
+@dataclass(frozen=True)
+class WeightedWeak:
+    """Weak rows that are white under the whole library: the sharpest rows for a search in noise.
+
+    The rows of `weak` are weighted by their covariance and linearised about samples corrected by
+    `n_steps` steps with all terms, so that no support is favoured; then a support's residual says
+    how likely it is, and the true one leads its size far more often (docs/benchmark.md). Assumes
+    that the samples hold white noise, and that the library holds the law: fast dynamics that no
+    term follows would be taken for noise. Rows are in the unit of the derivative, up to a factor.
+    Raises ValueError for held-out rows, which have no part in the weights.
+    """
+
+    weak: Weak = field(default_factory=lambda: Weak(split=RandomSplit(0.0)))
+    n_steps: int = 2
+
+    def __post_init__(self) -> None:
+        if not self.weak.errors_in_variables:
+            raise ValueError("weights need the noise: set weak.errors_in_variables to true")
+        if self.n_steps < 0:
+            raise ValueError(f"n_steps must be zero or more: {self.n_steps} came")
+
+    @property
+    def smoother(self) -> Smoother:
+        return self.weak.smoother
+
+    def assemble(
+        self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> tuple[RegressionRows, ...]:
+        """One regression per state, as `Weak.assemble` gives it, with white rows."""
+        problems = self.weak.assemble(trajectories, library, rng=rng)
+        return tuple(self._weighted(problem) for problem in problems)
+
+    def _weighted(self, problem: RegressionRows) -> RegressionRows:
+        if problem.test.any():
+            raise ValueError(
+                "weighted rows cannot be held out: set weak.split.test_fraction to 0, or use Weak"
+            )
+        everything = usable_terms(problem)
+        coef = np.zeros(len(problem.library))
+        theta, target = problem.train_theta[:, everything], problem.train_target(0)
+        coef[everything] = np.linalg.lstsq(theta, target)[0]
+        white = whitened_rows(problem, everything, coef, n_steps=self.n_steps)
+        # White rows are many standard deviations long; back to about the unit of the derivative.
+        size = 1.0 / np.linalg.norm(white.target)
+        return replace(
+            problem,
+            theta=white.theta * (problem.theta_scale * size),
+            target=white.target[:, None] * (problem.target_scale * size),
+            groups=np.arange(len(white.target)),
+        )
+
+
+# Less noise than this share of an input's own deviation is lost beside that of any state.
+NEGLIGIBLE = 1e-3
+
+# Noise above half a step of its digits lets a record repeat its last value less often than this.
+HELD = 0.5
+
+MOST_LEVELS = 8  # that a switch has; a record of noise has more, however coarse its digits
+
+
+def exact_columns(
+    run: Trajectory,
+    names: Sequence[str],
+    declared: Sequence[str] | None,
+    noise_std: Float[np.ndarray, " variables"] | None,
+) -> Bool[np.ndarray, " variables"]:
+    """Which of some variables are exact: never a state, and of the inputs those declared.
+
+    None declared: inputs that are switched, held or constant, or of negligible noise as far as
+    that was estimated.
+    Raises ValueError for a declared name that is no input.
+    """
+    unknown = [name for name in declared or () if name not in run.input_names]
+    if unknown:
+        raise ValueError(
+            f"exact_inputs must name inputs: {unknown} came; this trajectory has the inputs "
+            f"{list(run.input_names)}"
+        )
+    if declared is not None:
+        return np.isin(names, list(declared))
+    exact = np.zeros(len(names), dtype=np.bool_)
+    for k, (name, column) in enumerate(zip(names, run.columns(names).T, strict=True)):
+        if name in run.input_names:
+            noise = np.inf if noise_std is None else noise_std[k]
+            exact[k] = is_switched(column) or bool(noise <= NEGLIGIBLE * column.std())
+    return exact
+
+
+def is_switched(samples: Float[np.ndarray, " samples"]) -> bool:
+    """Whether a signal holds its value over most steps, or jumps between a few levels."""
+    held = np.mean(np.diff(samples) == 0.0)
+    return bool(held >= HELD) or len(np.unique(samples)) <= MOST_LEVELS

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from ep2sindy.data.domain import kept_inside
 from ep2sindy.data.scales import column_norms
-from ep2sindy.regression.rows import NoisyRows, Regression
+from ep2sindy.regression.rows import NoisyRows, RegressionRows
 
 # No sample is moved by more standard deviations of its noise: a wrong model would never end.
 LARGEST_CORRECTION = 4.0
@@ -46,7 +46,7 @@ class WhitenedRows:
 
 
 def whitened_rows(
-    problem: Regression,
+    problem: RegressionRows,
     terms: Bool[np.ndarray, " terms"],
     coef: Float[np.ndarray, " terms"],
     *,
@@ -79,7 +79,7 @@ def whitened_rows(
 
 
 def _following(
-    problem: Regression, rows: _Linearised, terms: Bool[np.ndarray, " terms"], *, limit: float
+    problem: RegressionRows, rows: _Linearised, terms: Bool[np.ndarray, " terms"], *, limit: float
 ) -> _Linearised | None:
     """One step of Gauss-Newton, or halves of it until the misfit falls; None if it never does.
 
@@ -120,7 +120,7 @@ class _Linearised:
 
     @staticmethod
     def at(
-        problem: Regression,
+        problem: RegressionRows,
         x: Float[np.ndarray, "samples variables"],
         coef: Float[np.ndarray, " terms"],
         *,
@@ -186,7 +186,7 @@ class _Linearised:
 
 
 def _lift(
-    problem: Regression, x: Float[np.ndarray, "samples variables"]
+    problem: RegressionRows, x: Float[np.ndarray, "samples variables"]
 ) -> Float[np.ndarray, "samples terms"]:
     """What the noise left in samples adds to terms with functions on average, to second order.
 

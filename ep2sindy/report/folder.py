@@ -7,23 +7,28 @@ models/*.json  tables/*.csv  figures/*.png  tensorboard/
 from __future__ import annotations
 
 import platform
+import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ep2sindy.machine.files import sweep, write_bytes, write_json, write_text
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.picture import DPI
-from ep2sindy.report.provenance import commit, versions
+from ep2sindy.runtime.files import sweep, write_bytes, write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+VERSIONED = (
+    "ep2sindy", "numpy", "scipy", "numba", "scikit-learn", "xarray", "torch", "hydra-core",
+    "pysindy",
+)  # fmt: skip
 # What a figure can be written as, and what its file says: without a date it is the same each time.
 FORMATS: Mapping[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}}
 
@@ -110,3 +115,31 @@ def freeze_layout(figure: Figure) -> None:
         figure.set_dpi(DPI)
         engine.execute(figure)
         figure.set_layout_engine(None)  # not "none": that placeholder still draws twice
+
+
+def commit(folder: Path) -> str:
+    """Git commit of a checkout's folder, with "+changes" if some are not committed."""
+    if not (folder / ".git").exists():
+        return "unknown: not a git checkout"  # git would take that of a folder around it
+    try:
+        head = _git(folder, "rev-parse", "HEAD")
+        return head + ("+changes" if _git(folder, "status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown: not a git checkout"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    result = subprocess.run(
+        ["git", *arguments], cwd=folder, capture_output=True, text=True, check=True
+    )
+    return result.stdout.strip()
+
+
+def versions() -> dict[str, str]:
+    found = {}
+    for name in VERSIONED:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found

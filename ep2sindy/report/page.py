@@ -1,15 +1,20 @@
-"""A page of results in one file of HTML that needs no other, and no network: it can be mailed."""
+"""A page of results in one file of HTML that needs no other, and no network: it can be mailed.
+
+Equations stand in it as browsers typeset them: MathML, from the LaTeX that the package writes.
+"""
 
 from __future__ import annotations
 
+import html
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
+from ep2sindy.library.equations import latex_name, sum_latex
 from ep2sindy.report.about import About
 from ep2sindy.report.document import Equation, Link, Section, Table, cell_text
-from ep2sindy.report.mathml import equation_mathml
 from ep2sindy.report.picture import Drawn
 
 if TYPE_CHECKING:
@@ -124,3 +129,20 @@ def _kind(block: object) -> str:
 def _classes(table: Table, row: int) -> str:
     kinds = {"bold": table.bold, "italic": table.italic, "break": table.breaks}
     return " ".join(name for name, rows in kinds.items() if row in rows)
+
+
+def equation_mathml(equation: Equation) -> str:
+    """The equation alone, without what stands before and behind it."""
+    slope = rf"\mathrm{{d}} {latex_name(equation.state)} / \mathrm{{d}} t"
+    return mathml(f"{slope} = {sum_latex(equation.terms)}")
+
+
+def mathml(latex: str) -> str:
+    """LaTeX as a `math` element; whatever names it holds end as text, never as markup."""
+    from latex2mathml.converter import convert_to_element  # only when a page is written
+
+    element = convert_to_element(latex)
+    for each in element.iter():
+        if each.text:
+            each.text = html.unescape(each.text)  # it writes signs as entities, as in `&#x02212;`
+    return ElementTree.tostring(element, encoding="unicode")

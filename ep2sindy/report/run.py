@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ep2sindy.machine.files import replacing
-from ep2sindy.machine.progress import Advance, Bars, Progress
 from ep2sindy.report.document import Text
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.screen import Screen, renderables
 from ep2sindy.report.tensorboard import Board
+from ep2sindy.runtime.files import replacing
+from ep2sindy.runtime.progress import Advance, Bars, Progress
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from ep2sindy.machine.files import writing
-from ep2sindy.machine.screen import on_screen, plain
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, cell_text
+from ep2sindy.runtime.files import writing
+from ep2sindy.runtime.screen import on_screen, plain
 
 WIDTH = 120  # columns of run.log, and of output that goes to a file
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from textwrap import indent
 from typing import Any
 
-from ep2sindy.machine.files import writing
+from ep2sindy.runtime.files import writing
 
 
 class Board:

@@ -1,4 +1,7 @@
-"""Bootstraps: a search repeated on resampled rows, its supports pooled and their terms counted."""
+"""Bootstraps: a search repeated on resampled rows, its supports pooled and their terms counted.
+
+Rows are drawn with replacement, in blocks of neighbours where neighbours are alike.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from ep2sindy.machine.progress import Advance, nothing
 from ep2sindy.regression.ambiguity import largest_support, usable_terms
 from ep2sindy.regression.gram_fits import solve_masks
-from ep2sindy.regression.resampling import moving_block_counts
-from ep2sindy.regression.rows import Grams, Regression
+from ep2sindy.regression.rows import Grams, RegressionRows
+from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.search.searches import Search
 
 
@@ -48,7 +50,7 @@ class Bootstraps:
             raise ValueError(f"block must be a whole number, one or more: {self.block!r} came")
 
     def draw(
-        self, problem: Regression, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
+        self, problem: RegressionRows, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
     ) -> tuple[Grams, Bool[np.ndarray, "draws terms"]]:
         """Gram matrices and kept terms of every bootstrap, out of the terms that may be used."""
         if self.n == 0:
@@ -147,7 +149,7 @@ class Resamples:
 
 
 def resamples(
-    problem: Regression, bootstraps: Bootstraps, *, rng: np.random.Generator
+    problem: RegressionRows, bootstraps: Bootstraps, *, rng: np.random.Generator
 ) -> Resamples:
     """Draw bootstraps of the training rows, once for all equations.
 
@@ -175,7 +177,7 @@ def resamples(
 
 
 def pooled_supports(
-    problem: Regression,
+    problem: RegressionRows,
     search: Search,
     bootstraps: Bootstraps,
     *,
@@ -218,3 +220,25 @@ def pooled(
         share=np.full_like(supports.share, np.nan),
         inclusion=np.full_like(supports.inclusion, np.nan),
     )
+
+
+def moving_block_counts(
+    n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
+) -> Int[np.ndarray, " rows"]:
+    """How often each row comes in one draw of `n_drawn` rows, taken as runs of `block` rows.
+
+    A row may stand for a group of rows, which come together.
+    Every run lies within the rows; the last one is cut to length. block: 1 draws single rows;
+    for a time series, long enough that rows farther apart are unrelated.
+    Raises ValueError for a block that is not between one row and all of them.
+    Source: Kuensch 1989, doi:10.1214/aos/1176347265.
+    """
+    if not 1 <= block <= n_rows:
+        raise ValueError(
+            f"a block must hold between one and all {n_rows} groups of training rows: {block} "
+            "came; shorten it, or use more data"
+        )
+    n_blocks = -(-n_drawn // block)
+    first = rng.integers(n_rows - block + 1, size=n_blocks)
+    drawn = (first[:, None] + np.arange(block)).ravel()[:n_drawn]
+    return np.bincount(drawn, minlength=n_rows)

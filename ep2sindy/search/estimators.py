@@ -1,7 +1,7 @@
-"""The searches as scikit-learn regressors, to be plugged into other tools such as PySINDy.
+"""The adaptive lasso as a scikit-learn regressor, to be plugged into other tools such as PySINDy.
 
-scikit-learn asks for what the rest of the package does without: classes that inherit, and that
-must be fitted before they predict. They stay in this module. There is no intercept, since a
+scikit-learn asks for what the rest of the package does without: a class that inherits, and that
+must be fitted before it predicts. It stays in this module. There is no intercept, since a
 library of terms holds the constant itself.
 
 In PySINDy: SINDy(optimizer=WrappedOptimizer(AdaptiveLassoRegressor(), unbias=False)). The
@@ -11,7 +11,6 @@ below 1e-14, where the rate coefficients of a plasma in SI lie.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, no_type_check
 
 import numpy as np
@@ -21,11 +20,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.regression.gram_fits import solve_masks
-from ep2sindy.search.kernels import thresholded_supports
 from ep2sindy.search.searches import AdaptiveLasso
-
-# From xx, xy and the number of rows, the columns and the target of unit norm, to one support.
-_Choice = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 
 
 class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -57,71 +52,35 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         search = AdaptiveLasso(gamma=self.gamma, max_terms=self.max_terms)
         if not 0.0 < self.tolerance < 1.0:
             raise ValueError(f"tolerance must lie in (0, 1): {self.tolerance} came")
-
-        def choose(xx: np.ndarray, xy: np.ndarray, n_rows: int) -> np.ndarray:
-            masks = search.supports(xx, xy, 1.0)
-            residual = np.maximum(_residual_shares(xx, xy, masks), self.tolerance)
-            bic = n_rows * np.log(residual) + masks.sum(axis=1) * np.log(n_rows)
-            return masks[np.nanargmin(bic)]
-
-        _fit(self, X, y, choose)
+        X, y = validate_data(self, X, y, dtype=np.float64, y_numeric=True, multi_output=True)
+        columns, column_norms = _unit_columns(X)
+        targets, target_norms = _unit_columns(y.astype(np.float64).reshape(len(y), -1))
+        xx, xy = columns.T @ columns, targets.T @ columns
+        support = np.array([self._choose(search, xx, products, len(X)) for products in xy])
+        coef = np.zeros(support.shape)
+        for mask, row, target in zip(support, coef, targets.T, strict=True):
+            # Solved on the rows: the Gram matrix squares their condition.
+            row[mask] = np.linalg.lstsq(columns[:, mask], target, rcond=None)[0]
+        coef *= target_norms[:, None] / column_norms
+        self.coef_ = coef if y.ndim == 2 else coef[0]
+        self.support_ = support if y.ndim == 2 else support[0]
+        self.intercept_ = 0.0
         return self
 
     def predict(self, X: Any) -> np.ndarray:
         """X: (rows, terms). Returns (rows,) or (rows, targets), as y was."""
-        return _predict(self, X)
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
+        return X @ self.coef_.T
 
-
-class STLSQRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
-    """Sequentially thresholded least squares, iterated until no term falls to the threshold.
-
-    threshold: a term goes when |coef| times the norm of its column is no more than this share
-    of the norm of the target. `pysindy.STLSQ` compares |coef| itself, and so depends on units,
-    and adds a ridge; its value of threshold means something else there.
-    Once fitted: coef_ and support_, its mask: (terms,) for y of (rows,), else (targets, terms).
-    Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113.
-    """
-
-    threshold: float
-
-    @no_type_check  # scikit-learn's rule: it stores anything, and `fit` refuses
-    def __init__(self, *, threshold: float = 0.1) -> None:
-        self.threshold = threshold
-
-    def fit(self, X: Any, y: Any) -> STLSQRegressor:
-        """X: (rows, terms). y: (rows,) or (rows, targets); each target gets its own support."""
-        if not self.threshold >= 0.0:
-            raise ValueError(f"threshold must not be negative: {self.threshold} came")
-        thresholds = np.array([self.threshold], dtype=np.float64)
-        _fit(self, X, y, lambda xx, xy, _: thresholded_supports(xx, xy, thresholds)[0])
-        return self
-
-    def predict(self, X: Any) -> np.ndarray:
-        """X: (rows, terms). Returns (rows,) or (rows, targets), as y was."""
-        return _predict(self, X)
-
-
-def _fit(estimator: BaseEstimator, X: Any, y: Any, choose: _Choice) -> None:
-    """Choose a support for every target, fit it, and set the fitted attributes."""
-    X, y = validate_data(estimator, X, y, dtype=np.float64, y_numeric=True, multi_output=True)
-    columns, column_norms = _unit_columns(X)
-    targets, target_norms = _unit_columns(y.astype(np.float64).reshape(len(y), -1))
-    xx, xy = columns.T @ columns, targets.T @ columns
-    support = np.array([choose(xx, products, len(X)) for products in xy])
-    coef = np.zeros(support.shape)
-    for mask, row, target in zip(support, coef, targets.T, strict=True):
-        # Solved on the rows: the Gram matrix squares their condition.
-        row[mask] = np.linalg.lstsq(columns[:, mask], target, rcond=None)[0]
-    coef *= target_norms[:, None] / column_norms
-    estimator.coef_ = coef if y.ndim == 2 else coef[0]
-    estimator.support_ = support if y.ndim == 2 else support[0]
-    estimator.intercept_ = 0.0
-
-
-def _predict(estimator: BaseEstimator, X: Any) -> np.ndarray:
-    check_is_fitted(estimator)
-    X = validate_data(estimator, X, dtype=np.float64, reset=False)
-    return X @ estimator.coef_.T
+    def _choose(
+        self, search: AdaptiveLasso, xx: np.ndarray, xy: np.ndarray, n_rows: int
+    ) -> np.ndarray:
+        """One support, from Gram matrices of columns and a target of unit norm."""
+        masks = search.supports(xx, xy, 1.0)
+        residual = np.maximum(_residual_shares(xx, xy, masks), self.tolerance)
+        bic = n_rows * np.log(residual) + masks.sum(axis=1) * np.log(n_rows)
+        return masks[np.nanargmin(bic)]
 
 
 def _unit_columns(

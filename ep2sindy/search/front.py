@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.equations import equation_html, equation_text
-from ep2sindy.machine.screen import html_table, one_screen, text_table
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.gram_fits import solve_masks
-from ep2sindy.regression.rows import Regression
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.search.bootstraps import Supports
 
 
@@ -78,7 +78,7 @@ class ParetoFront:
 
     equation: str
     candidates: Sequence[Candidate]
-    problem: Regression = field(repr=False)
+    problem: RegressionRows = field(repr=False)
     cloud: Cloud | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ def _score(candidate: Candidate) -> float:
     return candidate.r2_train if np.isnan(candidate.r2_test) else candidate.r2_test
 
 
-def fit_support(problem: Regression, equation: str, terms: Sequence[str]) -> Candidate:
+def fit_support(problem: RegressionRows, equation: str, terms: Sequence[str]) -> Candidate:
     """Fit one given support of one equation to the training rows; no bootstrap stands behind it.
 
     Raises ValueError for an unknown term, or terms that depend on each other on these rows.
@@ -139,7 +139,7 @@ def fit_support(problem: Regression, equation: str, terms: Sequence[str]) -> Can
 
 
 def fit_supports(
-    problem: Regression, equation: str, masks: Bool[np.ndarray, "supports terms"]
+    problem: RegressionRows, equation: str, masks: Bool[np.ndarray, "supports terms"]
 ) -> list[Candidate]:
     """Fit given supports, as `fit_support`; coefficients of dependent terms are NaN."""
     unknown = np.full(len(masks), np.nan)
@@ -147,7 +147,7 @@ def fit_supports(
     return _candidates(problem, Supports(equation, masks, unknown, nothing))
 
 
-def pareto_front(problem: Regression, supports: Supports, *, depth: int = 1) -> ParetoFront:
+def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1) -> ParetoFront:
     """Fit every support on all training rows and keep the `depth` best of each size.
 
     "Best" is by held-out rows, as in the thesis, or by the training rows where none are held out.
@@ -193,7 +193,7 @@ def front_order(
     return front
 
 
-def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
+def _candidates(problem: RegressionRows, supports: Supports) -> list[Candidate]:
     """Every support fitted to the training rows and scored on both kinds of rows."""
     equation = problem.equations.index(supports.equation)
     coef = _fit(problem, equation, supports.masks)
@@ -215,7 +215,7 @@ def _candidates(problem: Regression, supports: Supports) -> list[Candidate]:
 
 
 def _explained(
-    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"]
+    problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
 ) -> Float[np.ndarray, " supports"]:
     """By how much each support lowers the target's squares on the rows that judge.
 
@@ -239,7 +239,7 @@ def _best_of_each_size(
 
 
 def _cloud(
-    problem: Regression,
+    problem: RegressionRows,
     equation: int,
     sizes: Int[np.ndarray, " supports"],
     explained: Float[np.ndarray, " supports"],
@@ -253,7 +253,7 @@ def _cloud(
 
 
 def _fit(
-    problem: Regression, equation: int, masks: Bool[np.ndarray, "supports terms"]
+    problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
 ) -> Float[np.ndarray, "supports terms"]:
     """Least squares on the training rows, in scaled columns.
 

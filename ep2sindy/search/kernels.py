@@ -6,8 +6,8 @@ xy: (terms,) their products with one target; a mask: (terms,) of bool is a suppo
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
 from ep2sindy.regression.gram_fits import DEPENDENT, ROUNDING, independent_terms, solve, solve_masks
+from ep2sindy.runtime.compilation import compiled
 
 
 @compiled

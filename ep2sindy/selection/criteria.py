@@ -1,4 +1,4 @@
-"""Information criteria: likelihood against size."""
+"""Rules that score candidates one by one: by information, by evidence, by the knee of the front."""
 
 from __future__ import annotations
 
@@ -41,24 +41,6 @@ class AICc:
 
 
 @dataclass(frozen=True)
-class BIC:
-    """Schwarz's criterion: which model is most likely, all being equally likely before.
-
-    Assumes what `AICc` does of the residuals. There are many more models of middle size than
-    small ones, so with a library of any size it keeps too many terms.
-    Source: Schwarz 1978, doi:10.1214/aos/1176344136.
-    """
-
-    label: ClassVar[str] = "BIC"
-
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        return [_criterion(front, self._penalty) for front in fronts]
-
-    def _penalty(self, candidate: Candidate, n_rows: float) -> float:
-        return candidate.n_terms * log(n_rows)
-
-
-@dataclass(frozen=True)
 class EBIC:
     """The extended criterion: sizes are equally likely before, not models.
 
@@ -68,13 +50,15 @@ class EBIC:
     Assumes what `AICc` does of the residuals. coarsening: no model is exact, and with n rows any
     discrepancy becomes significant; the likelihood is raised to the power 1 / (1 + n/coarsening),
     so that evidence stops growing at about that many rows. None: trust the residuals to the end.
+    With gamma=0 and coarsening=None it is Schwarz's criterion, BIC: which model is most likely,
+    all being equally likely before. There are many more models of middle size than small ones, so
+    with a library of any size BIC keeps too many terms.
     Source: Chen & Chen 2008, doi:10.1093/biomet/asn034; Miller & Dunson 2019,
-    doi:10.1080/01621459.2018.1469995.
+    doi:10.1080/01621459.2018.1469995; Schwarz 1978, doi:10.1214/aos/1176344136.
     """
 
     gamma: float = 1.0
     coarsening: float | None = 60.0
-    label: ClassVar[str] = "EBIC"
 
     def __post_init__(self) -> None:
         if not self.gamma >= 0.0:
@@ -84,6 +68,10 @@ class EBIC:
                 f"coarsening counts rows, and must be above 1: {self.coarsening} came; None "
                 "trusts the residuals to the end"
             )
+
+    @property
+    def label(self) -> str:
+        return "BIC" if self.gamma == 0.0 and self.coarsening is None else "EBIC"
 
     def shared_by(self, n_points: int) -> EBIC:
         """The rule at one of n points that share a support: together they pay its count once."""
@@ -153,3 +141,72 @@ def _fits(
         fit[mask] = np.linalg.lstsq(columns[:, mask], right)[0]
     squares = np.square(right - coef @ columns.T).sum(axis=1)
     return np.maximum(squares, FLOOR * (right @ right)), coef
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The candidate under which the trajectories are most likely, its terms' prices paid.
+
+    What a `Joint` search weighs its own candidates by; fronts of other searches have none.
+    """
+
+    label: ClassVar[str] = "deviance"
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
+        for front in fronts:
+            if any(candidate.deviance is None for candidate in front.candidates):
+                raise ValueError(
+                    "Evidence weighs what a joint search found: these fronts come from rows; set "
+                    "search=Joint() (search=joint), or select by EBIC"
+                )
+        return [
+            np.array([candidate.deviance for candidate in front.candidates], dtype=np.float64)
+            for front in fronts
+        ]
+
+
+@dataclass(frozen=True)
+class Knee:
+    """Select the candidate closest to no error and no terms: the thesis's rule.
+
+    score = sqrt((1 - R2)^2 + (n_terms / n_norm)^2), where n_norm is the number of terms in
+    the library (the thesis's Eq. 9), or for "max_terms" the largest candidate's plus one (what
+    the thesis's Tables II and III were made with). Assumes that a term worth having raises R2 by
+    about one step of n_terms / n_norm: any other is dropped, by construction.
+    scale: "log" takes the logarithm of the error, so that a small term of an exact law counts:
+    score = sqrt(((log e - log e_min) / (log e_max - log e_min))^2 + (n_terms / n_norm)^2).
+    That assumes that errors span orders of magnitude: the largest fall sets the scale, and a true
+    term that lowers the error by less than one step of it is dropped.
+    """
+
+    n_norm: str = "library"
+    scale: str = "linear"
+
+    def __post_init__(self) -> None:
+        if self.n_norm not in ("library", "max_terms"):
+            raise ValueError(f"n_norm must be 'library' or 'max_terms': {self.n_norm!r} came")
+        if self.scale not in ("linear", "log"):
+            raise ValueError(f"scale must be 'linear' or 'log': {self.scale!r} came")
+
+    @property
+    def label(self) -> str:
+        return "d_log" if self.scale == "log" else "d_pareto"
+
+    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
+        return [
+            np.hypot(self._height(front), front.sizes / _norm_of_sizes(front, self.n_norm))
+            for front in fronts
+        ]
+
+    def _height(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
+        """Errors, or their logarithms from 0 to 1."""
+        if self.scale == "linear":
+            return front.errors
+        height = np.log(np.maximum(front.errors, FLOOR))
+        return (height - height.min()) / max(float(np.ptp(height)), np.finfo(float).tiny)
+
+
+def _norm_of_sizes(front: ParetoFront, n_norm: str) -> float:
+    if n_norm == "library":
+        return float(len(front.problem.library))
+    return float(front.sizes.max()) + 1.0

@@ -11,16 +11,22 @@ from jaxtyping import Float, Int
 
 from ep2sindy.constraints.relations import Constraint, Relation
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.machine.progress import SILENT, Advance, Progress, nothing
-from ep2sindy.model.many import MAX_ERROR, Ensemble
+from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.many import follow_together, refine_together
+from ep2sindy.refinement.refine import follow_together, refine_together
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
+from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.search.front import ParetoFront
-from ep2sindy.selection.combinations import admissible, combinations, joint_scores, smallest
-from ep2sindy.selection.integral import ensemble_of, records_of
-from ep2sindy.selection.rule import FLOOR, Decision
-from ep2sindy.selection.systems import budget, system_of
+from ep2sindy.selection.rule import (
+    FLOOR,
+    MAX_ERROR,
+    Decision,
+    admissible,
+    combinations,
+    joint_scores,
+    smallest,
+)
+from ep2sindy.selection.systems import budget, records_of, system_of
 
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
 LEAST_PAIRS = 3
@@ -112,7 +118,8 @@ class RefinedScore:
         records = records_of(fronts)
         systems = [system_of(fronts, choice, relations) for choice in places]
         coef = np.stack([system.model.coef for system in systems], axis=2)
-        ensemble = replace(ensemble_of(fronts, places), coef=coef)
+        states = [front.equation for front in fronts]
+        ensemble = Ensemble(fronts[0].problem.library, states, coef)
         constraints = [system.constraint for system in systems]
         spread = np.concatenate(records.smoothed).std(axis=0)
         folds = self._folds(records.runs, ensemble)

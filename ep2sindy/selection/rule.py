@@ -1,22 +1,27 @@
-"""What a selection rule is: scores for the candidates of every front, the lowest selected."""
+"""What a selection rule is: scores of candidates, alone or combined, the lowest selected."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from math import prod
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Relation
-from ep2sindy.machine.progress import SILENT, Progress
+from ep2sindy.constraints.relations import Relation, binding
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront
 
 # What no noise-free fit can fall below, as a share of the target's squares: beneath it a
 # criterion would select terms that explain the discretisation.
 FLOOR = 1e-6
+
+# Error of a system at most, which one has that dies, diverges or cannot be refined: in variances
+# (always the mean has 1) or in bounds of a free run.
+MAX_ERROR = 10.0
 
 
 @runtime_checkable
@@ -26,7 +31,8 @@ class Selection(Protocol):
     label: what the score is called in tables.
     """
 
-    label: ClassVar[str]
+    @property
+    def label(self) -> str: ...
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]: ...
 
@@ -64,3 +70,78 @@ class SystemSelection(Selection, Protocol):
         *,
         progress: Progress = SILENT,
     ) -> Decision: ...
+
+
+def combinations(
+    fronts: Sequence[ParetoFront], most: int
+) -> Int[np.ndarray, "combinations fronts"]:
+    """Every choice of one candidate per front, by index. Raises ValueError for more than `most`."""
+    counts = [len(front.candidates) for front in fronts]
+    if prod(counts) > most:
+        raise ValueError(
+            f"at most {most} combinations of candidates are integrated: {counts} candidates make "
+            f"{prod(counts)}; lower depth or the search's max_terms, or raise max_combinations"
+        )
+    return np.indices(counts).reshape(len(counts), -1).T
+
+
+def joint_scores(
+    fronts: Sequence[ParetoFront],
+    places: Int[np.ndarray, "combinations fronts"],
+    errors: Float[np.ndarray, " combinations"],
+    *,
+    limit: float,
+    winner: int | None = None,
+) -> list[Float[np.ndarray, " _candidates"]]:
+    """Scores of candidates from the errors of their combinations.
+
+    limit: errors up to there cannot be told from the least; of these the combination of fewest
+    terms wins, unless `winner` names another. A candidate's score is the least error of all
+    combinations with it, no less than the limit, and MAX_ERROR without any; the winner's are a
+    hair below.
+    """
+    winner = smallest(fronts, places, errors, limit=limit) if winner is None else winner
+    scores = np.maximum(errors, limit)
+    scores[winner] = np.nextafter(limit, 0.0)
+    return [
+        np.array([scores[column == k].min(initial=MAX_ERROR) for k in range(len(front.candidates))])
+        for front, column in zip(fronts, places.T, strict=True)
+    ]
+
+
+def smallest(
+    fronts: Sequence[ParetoFront],
+    places: Int[np.ndarray, "combinations fronts"],
+    errors: Float[np.ndarray, " combinations"],
+    *,
+    limit: float,
+) -> int:
+    """Of the combinations with errors up to the limit, that of fewest terms, and least error."""
+    n_terms = sum(f.sizes[k] for f, k in zip(fronts, places.T, strict=True))
+    return int(np.lexsort((errors, n_terms, errors > limit))[0])
+
+
+def support_of(
+    fronts: Sequence[ParetoFront], choice: Int[np.ndarray, " fronts"]
+) -> dict[str, tuple[str, ...]]:
+    """The terms of every state in one combination."""
+    pairs = zip(fronts, choice, strict=True)
+    return {front.equation: front.candidates[k].terms for front, k in pairs}
+
+
+def admissible(
+    fronts: Sequence[ParetoFront],
+    places: Int[np.ndarray, "combinations fronts"],
+    relations: Sequence[Relation],
+) -> Int[np.ndarray, "_ fronts"]:
+    """The combinations that have the terms that the relations name.
+
+    Raises ValueError where none has.
+    """
+    kept = [binding(relations, support_of(fronts, choice)) is not None for choice in places]
+    if not any(kept):
+        raise ValueError(
+            f"the relations {[r.text for r in relations]} name terms that no combination of "
+            "candidates has; raise the search's max_terms, or depth"
+        )
+    return places[np.array(kept)]

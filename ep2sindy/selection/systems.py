@@ -1,4 +1,4 @@
-"""Combinations of candidates as systems of equations that obey relations, ready to be refined."""
+"""Candidates as systems of equations, the records that they are judged by, and folds of these."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Constraint, Relation, constraint
-from ep2sindy.constraints.support import binding
+from ep2sindy.constraints.relations import Constraint, Relation, binding, constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
-from ep2sindy.refinement.windows import WindowBatch
+from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.search.front import ParetoFront
-from ep2sindy.selection.combinations import support_of
+from ep2sindy.selection.rule import support_of
+from ep2sindy.signals.kalman import KalmanSmoother
 
 # Steps of all windows of all systems that are refined together: more leave the cache.
 BATCH_STEPS = 6000
@@ -88,3 +88,98 @@ def budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:
     """
     method = MultipleShooting(first_block=batch.data.shape[1], tolerance=1e-3, max_iter=10)
     return method, max(1, BATCH_STEPS // batch.steps.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """The trajectories that equations are judged by, and their states smoothed."""
+
+    runs: Sequence[Trajectory]
+    smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
+
+
+def records_of(fronts: Sequence[ParetoFront]) -> Records:
+    """What stands behind the rows, states in the order of the fronts.
+
+    Raises ValueError for rows without trajectories or a state without a front.
+    """
+    runs = fronts[0].problem.trajectories
+    if not runs:
+        raise ValueError(
+            "to integrate, the rows must know their trajectories: none came with the regression; "
+            "pass them as Regression(trajectories=...)"
+        )
+    equations = [front.equation for front in fronts]
+    if sorted(equations) != sorted(runs[0].state_names):
+        raise ValueError(
+            f"to integrate, every state needs one front: {equations} came for the states "
+            f"{list(runs[0].state_names)}"
+        )
+    return Records(runs, [KalmanSmoother().smooth(run.t, run.columns(equations)) for run in runs])
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Samples start to stop (exclusive) of one of the runs."""
+
+    run: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """What is held out of the runs, and the pieces of them that are left."""
+
+    held: Sequence[Stretch]
+    fitted: Sequence[Stretch]
+
+    def windows(
+        self,
+        runs: Sequence[Trajectory],
+        states: Sequence[str],
+        inputs: Sequence[str],
+        *,
+        window: int,
+        n_windows: int,
+        rng: np.random.Generator,
+    ) -> WindowBatch:
+        """Windows of the pieces that are left, no longer than the longest piece."""
+        pieces = [runs[part.run].window(part.start, part.stop) for part in self.fitted]
+        longest = max(piece.n_samples for piece in pieces)
+        return cut_windows(
+            pieces,
+            states=states,
+            inputs=inputs,
+            n_windows=n_windows,
+            window=min(window, longest),
+            rng=rng,
+        )
+
+
+def folds_of(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
+    """Every run in turn where there are enough, else every run cut in blocks.
+
+    Raises ValueError for runs too short to be cut.
+    """
+    lengths = [run.n_samples for run in runs]
+    if len(runs) >= n_folds:
+        whole = [Stretch(k, 0, length) for k, length in enumerate(lengths)]
+        return [
+            Fold(whole[k::n_folds], [part for part in whole if part.run % n_folds != k])
+            for k in range(n_folds)
+        ]
+    if max(lengths) < 2 * MIN_SAMPLES * n_folds:
+        raise ValueError(
+            f"runs must hold {2 * MIN_SAMPLES * n_folds} samples to be parted in {n_folds}: at "
+            f"most {max(lengths)} came; use longer records"
+        )
+    found = []
+    for k in range(n_folds):
+        held, fitted = [], []
+        for run, length in enumerate(lengths):
+            first, last = k * length // n_folds, (k + 1) * length // n_folds
+            held.append(Stretch(run, first, last))
+            fitted += [Stretch(run, 0, first), Stretch(run, last, length)]
+        found.append(Fold(held, [part for part in fitted if part.stop - part.start >= MIN_SAMPLES]))
+    return found

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 
 # Values scaled to unit range carry rounding of this variance: less noise cannot be told apart.
 ROUNDING = np.finfo(np.float64).eps ** 2

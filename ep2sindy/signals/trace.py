@@ -57,7 +57,7 @@ class Trace:
         return is_positive(self.t, self.x)
 
 
-def trace(
+def from_one_signal(
     run: Trajectory,
     signal: str | None = None,
     *,

@@ -10,15 +10,21 @@ import numpy as np
 
 from ep2sindy.constraints.relations import Constraint, constraint
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import counted
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.run import Run
-from ep2sindy.studies.held_out import first_and_last, fit_and_judge
-from ep2sindy.studies.held_out_view import Outcome, judged_summary
-from ep2sindy.studies.kinds import Kind, Share
-from ep2sindy.studies.known_terms import Relations, Terms, terms_of
-from ep2sindy.studies.shown import Shown
+from ep2sindy.runtime.progress import counted
+from ep2sindy.studies.fits import (
+    Outcome,
+    Relations,
+    Terms,
+    first_and_last,
+    fit_and_judge,
+    judged_summary,
+    terms_of,
+)
 from ep2sindy.studies.source import Source
+from ep2sindy.studies.study import Check, Share
+from ep2sindy.studies.views import PlotRange
 
 KINDS = ("base", "constrained")
 
@@ -38,7 +44,7 @@ class ModelCase:
 
 Models = Annotated[
     Mapping[str, ModelCase],
-    Kind(
+    Check(
         "like {name: {terms: {x: [x, x*y]}, relations: [..]}}",
         lambda value: isinstance(value, dict) and bool(value),
     ),
@@ -53,7 +59,7 @@ class Study:
     formulation: Formulation
     models: Models
     held_out: Share
-    figures: Shown
+    figures: PlotRange
 
     def compute(self, run: Run) -> Outcome:
         models = {n: case.constraints(n, self.source.states) for n, case in self.models.items()}

@@ -15,12 +15,12 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.figures.identified import frontier_figure
-from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Deferred, Names, Positives
-from ep2sindy.studies.variants import Variant, built_variants, merits
+from ep2sindy.runtime.parallel import Workers, rows_in_order
+from ep2sindy.studies.benchmark import Variant, built_variants, merits
+from ep2sindy.studies.study import Deferred, Names, Positives
 from ep2sindy.synthetic.systems import System
 
 TITLE = "Lowest sampling rate (Hz) from which on all rates identify the system, by duration"

@@ -17,23 +17,33 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.figures.windows import loss_against_window_figure
 from ep2sindy.library.library import polynomial
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.held_out import Judged, first_and_last, fit_and_judge, judge
-from ep2sindy.studies.held_out_view import COMPARED, Outcome, judged_summary, run_summary
+from ep2sindy.studies.fits import (
+    COMPARED,
+    Judged,
+    Outcome,
+    Relations,
+    Terms,
+    first_and_last,
+    fit_and_judge,
+    judge,
+    judged_summary,
+    run_summary,
+    terms_of,
+)
 from ep2sindy.studies.ils_draws import draws_table, spread_section, spread_summary
-from ep2sindy.studies.kinds import Count, Counts, Share
-from ep2sindy.studies.known_terms import Relations, Terms, terms_of
 from ep2sindy.studies.living import LivingSearch, two_periods
-from ep2sindy.studies.shown import Shown
 from ep2sindy.studies.source import Source
+from ep2sindy.studies.study import Count, Counts, Share
+from ep2sindy.studies.views import PlotRange
 
 if TYPE_CHECKING:
     from ep2sindy.refinement.problem import Iteration
@@ -75,7 +85,7 @@ class Study:
     windows: Counts
     n_draws: Count
     living: LivingSearch
-    figures: Shown
+    figures: PlotRange
 
     def compute(self, run: Run) -> Outcome:
         library, terms = terms_of(self.model, states=self.source.states)

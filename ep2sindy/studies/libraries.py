@@ -2,27 +2,55 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.figures.fronts import front_figure
+from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.machine.progress import counted
+from ep2sindy.model.free_run import FreeRun, free_run, samples_in
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import Progress, counted
 from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.studies.functions import registered
-from ep2sindy.studies.kinds import Coefficients, PositiveOrAll, Share
-from ep2sindy.studies.libraries_view import Outcome
-from ep2sindy.studies.library_result import result_of
-from ep2sindy.studies.living import LivingSearch
-from ep2sindy.studies.shown import Shown
-from ep2sindy.studies.source import Source, zone_length_m
-from ep2sindy.studies.term_roles import Compared
+from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.fits import first_and_last
+from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
+from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
+from ep2sindy.studies.source import Source, data_summary, zone_length_m
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, Share
+from ep2sindy.studies.term_roles import Compared, term_roles
+from ep2sindy.studies.views import (
+    INTEGRATED,
+    PlotRange,
+    interval_table,
+    rollout_tables,
+    run_figures,
+    shown_equation,
+    trajectories,
+)
+from ep2sindy.trust.user_code import load_user_module
+
+FIGURES = ("data", "trajectories", "trajectories_thesis", "derivatives", "phase")
+THESIS = "The same with the thesis's terms, fitted to these data."
+FRONT = (
+    "Error against number of terms: every support that the search proposed, and the best of each "
+    "size; the star is selected. Carets at the upper edge: models far worse than none."
+)
+EVERY_RECORD = "the selected models, integrated from the first sample of every record"
+_FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
 
 @dataclass(frozen=True)
@@ -77,7 +105,7 @@ class Study:
     recipe: Recipe
     libraries: Mapping[str, LibraryCase]
     rollout_s: PositiveOrAll
-    figures: Shown
+    figures: PlotRange
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: Share = 0.25
@@ -97,19 +125,10 @@ class Study:
         # Each case draws from its own stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
+        length_m = zone_length_m(self.source, opened[0])
         results = {
-            name: result_of(
-                runs,
-                library,
-                recipes[name],
-                self.thesis.get(name, {}),
-                self.rollout_s,
-                self.living,
-                self.held_out,
-                self.compared,
-                zone_length_m(self.source, opened[0]),
-                rng=rng,
-                progress=run.watch,
+            name: self._result(
+                runs, name, library, recipes[name], length_m, rng=rng, progress=run.watch
             )
             for (name, library), rng in counted(run.watch, pairs, "library")
         }
@@ -118,6 +137,52 @@ class Study:
                 run.warn(f"{name}: {result.discovery.misfit}")
         files = [str(field.attrs.get("file", "")) for field in opened]
         return Outcome(data, results, self.figures, files)
+
+    def _result(
+        self,
+        runs: Sequence[Trajectory],
+        name: str,
+        library: Library,
+        recipe: Recipe,
+        length_m: float | None,
+        *,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> LibraryResult:
+        """What one library finds in all records, and how its model and the published one run.
+
+        They run over the first record, the model over the others as well; a model that lives is
+        searched in the first. length_m: of the zone.
+        """
+        s = self.rollout_s
+        first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
+        data, n_samples = first
+        found = discover(list(runs), library, recipe, seed=rng, progress=progress)
+        published = self.thesis.get(name, {})
+        refitted = refit(found, published)
+        lives = roles = None
+        if self.living is not None and not found.model.inputs:
+            parts = first_and_last(data, self.held_out)
+            lives = living_model(
+                *parts, library, recipe, self.living, found.model, rng=rng, progress=progress
+            )
+            if self.compared is not None:
+                roles = term_roles(
+                    lives.discovery, data, *parts, self.compared, self.living.bounds,
+                    length_m=length_m, progress=progress,
+                )  # fmt: skip
+        with progress.stage(None, "", "free runs"):
+            return LibraryResult(
+                recipe=recipe,
+                discovery=found,
+                selected=free_run(found.model, data, n_samples=n_samples),
+                given=published,
+                refitted=refitted,
+                published=run_refitted(found, refitted, data, n_samples),
+                living=lives,
+                roles=roles,
+                elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
+            )
 
 
 def alone(data: Trajectory) -> str | None:
@@ -129,3 +194,175 @@ def alone(data: Trajectory) -> str | None:
         f"{name} oscillates, and one first-order equation cannot: where it rises it never falls "
         f"again. Name a second state, or let +exp=trace signal={name} make one of the signal"
     )
+
+
+def registered(names: Sequence[str]) -> list[str]:
+    """Names as a library takes them: `my_module.tanh(2*x)` imports my_module and is `tanh(2*x)`.
+
+    Raises ValueError for a module that cannot be imported or does not register the name.
+    """
+    return [_registered(str(name)) for name in names]
+
+
+def _registered(text: str) -> str:
+    found = _FROM_MODULE.fullmatch(text.strip())
+    if found is None:
+        return text
+    module, name = found["module"], found["name"]
+    try:
+        load_user_module(module)
+    except ImportError as error:
+        raise ValueError(
+            f"functions may name one of your own as MODULE.NAME: {text!r} came, and {error}; the "
+            "module must lie below the folder that you start in"
+        ) from error
+    if name not in function_names():
+        raise ValueError(
+            f"{module} must register {name!r} when it is imported, by "
+            f"ep.register_function({name!r}, value, derivative): it has not"
+        )
+    return name + (found["argument"] or "")
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What every library found in the same data; files: of all records, data being the first."""
+
+    data: Trajectory
+    results: Mapping[str, LibraryResult]
+    shown: PlotRange
+    files: Sequence[str] = ()
+
+    @property
+    def published(self) -> dict[str, FreeRun]:
+        """Models of published terms, where they could be fitted to our data."""
+        return {n: r.published for n, r in self.results.items() if r.published is not None}
+
+    @property
+    def selected(self) -> dict[str, FreeRun]:
+        return {name: result.selected for name, result in self.results.items()}
+
+    @property
+    def living(self) -> dict[str, Living]:
+        """Models that were searched for on their own cycle, by library."""
+        return {n: r.living for n, r in self.results.items() if r.living is not None}
+
+    def models(self) -> dict[str, SparseModel]:
+        found = {name: result.discovery.model for name, result in self.results.items()}
+        return found | {f"{name}_living": each.model for name, each in self.living.items()}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        found: dict[str, pd.DataFrame] = {}
+        for name, result in self.results.items():
+            found |= result.front_tables(name)
+        published = {f"{name}_thesis_terms": each for name, each in self.published.items()}
+        found |= rollout_tables(self.data, self.selected | published)
+        for name, result in self.results.items():
+            if result.roles is not None:
+                found[f"roles_{name}"] = result.roles.table()
+        found |= living_tables(self.living) | {"comparison": self.comparison.csv("model")}
+        return found | ({"records": self.records.csv()} if len(self.files) > 1 else {})
+
+    @property
+    def comparison(self) -> ResultTable[FreeRun]:
+        """One row per model: frequencies, trajectory error, and a word on the trajectory."""
+        published = {f"{name}, thesis's terms": each for name, each in self.published.items()}
+        return ResultTable(self.selected | published, frequencies(self.data))
+
+    @property
+    def records(self) -> ResultTable[tuple[str, str, FreeRun]]:
+        """One row per model and record."""
+        runs = [
+            (name, file, each)
+            for name, result in self.results.items()
+            for file, each in zip(self.files, [result.selected, *result.elsewhere], strict=True)
+        ]
+        return ResultTable(runs, RECORDS)
+
+    def figures(self) -> dict[str, Captioned]:
+        formulation = next(iter(self.results.values())).recipe.formulation
+        drawn = run_figures(FIGURES, self.data, self.selected, self.shown, formulation=formulation)
+        if self.published:
+            drawn["trajectories_thesis"] = trajectories(
+                self.data, self.published, self.shown, THESIS
+            )
+        for name, result in self.results.items():
+            found = result.discovery
+            front = partial(front_figure, found.fronts, found.scores, label=result.label)
+            drawn[f"front_{name}"] = Captioned(front, FRONT)
+        for name, living in self.living.items():
+            drawn |= living.figures(name)
+        return drawn
+
+    def sections(self) -> list[Section]:
+        found = [self._in_short()]
+        for name, result in self.results.items():
+            found += result.sections(name, self.data)
+        for name, result in self.results.items():
+            if result.living is not None:
+                found.append(result.living.section(name))
+            if result.roles is not None:
+                found.append(result.roles.section(name))
+        compared = Table(self.comparison.screen("model", by_state=True), title=INTEGRATED)
+        found.append(Section("Run freely from the first sample", [compared, *pictures(FIGURES)]))
+        if len(self.files) > 1:
+            records = Table(self.records.screen(), title=EVERY_RECORD)
+            found.append(Section("Every record", [records]))
+        return found
+
+    def _in_short(self) -> Section:
+        """The equations that were found and how they run; a screen ends with them anyway."""
+        blocks: list[Block] = []
+        for name, result in self.results.items():
+            living, clock = result.living, self.data.clock
+            run = result.selected if living is None else living.run
+            how = "selected by their derivatives" if living is None else "selected by free runs"
+            if result.discovery.estimate is not None and living is None:
+                how = "estimated together with the states"
+            text = f"{name}: equations {how}; run freely: {run.text}"
+            blocks.append(Text(text, page_only=True))
+            for state in run.model.states:
+                blocks.append(shown_equation(run.model, state, clock, on_screen=False))
+            if living is None:
+                blocks += interval_table(run.model, clock=clock, page_only=True)
+        return Section("What was found", blocks)
+
+    def summary(self) -> dict[str, Any]:
+        models = {name: result.summary() for name, result in self.results.items()}
+        return {"data": data_summary(self.data), "models": models}
+
+    def headline(self) -> dict[str, float]:
+        living = {f"{name}/living": each for name, each in self.living.items()}
+        scalars: dict[str, float] = {}
+        for name, result in self.results.items():
+            scalars |= result.headline(name)
+        return scalars | ResultTable(living, LIVING).headline()
+
+
+def frequencies(data: Trajectory) -> Metrics[FreeRun]:
+    """How models run beside the data: frequencies by state, trajectory error, verdict."""
+    text = data.clock.frequency_text
+    f_data = {
+        state: dominant_frequency(data.t, column)
+        for state, column in zip(data.state_names, data.states.T, strict=True)
+    }
+
+    def both(run: FreeRun) -> dict[str, float]:
+        pairs = [(f"data_{s}", f"model_{s}", f, run.frequency_Hz[s]) for s, f in f_data.items()]
+        return {k: v for data, model, f, own in pairs for k, v in ((data, f), (model, own))}
+
+    return [
+        Metric("f", both, View.CSV, column="f_{}_Hz"),
+        Metric("f_data", lambda run: f_data, View.SCREEN, "frequency of the data", text),
+        Metric("f_model", lambda run: run.frequency_Hz, View.SCREEN, "of the model", text),
+        Metric("nrmse", lambda run: run.nrmse, View.SHOWN, format="{:.3f}"),
+        Metric("verdict", lambda run: run.text, View.SHOWN),
+    ]
+
+
+RECORDS: Metrics[tuple[str, str, FreeRun]] = [
+    Metric("model", lambda row: row[0], View.SHOWN),
+    Metric("record", lambda row: row[1], View.SHOWN),
+    Metric("nrmse", lambda row: row[2].nrmse, View.SHOWN, format="{:.3f}"),
+    Metric("verdict", lambda row: row[2].text, View.SHOWN),
+]

@@ -1,25 +1,57 @@
-"""A closed model that lives: found by free runs in a part of a record, judged on the rest."""
+"""A closed model that lives: found by free runs in a part of a record, judged on the rest.
+
+With how it reads: a section, tables, figures and a summary for the studies that show it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.figures import living as figures
+from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library
-from ep2sindy.machine.progress import SILENT, Progress
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds, Verdict
+from ep2sindy.model.likeness import FreeRunBounds, Verdict
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
+from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.kalman import KalmanSmoother
-from ep2sindy.studies.kinds import Count
+from ep2sindy.studies.study import Count
+from ep2sindy.studies.views import (
+    coefficients,
+    interval_table,
+    intervals,
+    rollout_tables,
+    shown_equation,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CAPTIONS = {
+    "free_run": "The living model (colour) integrated freely from the first sample of held-out "
+    "time, over the data (grey): the first and the last periods.",
+    "cycle": "Its cycle in the plane of two states, over the data (grey), and runs from other "
+    "starts.",
+    "waveform": "One period by phase, shown twice: samples, their waveform, and the model's.",
+}
+STARTS = ((0.5, 0.5), (0.5, 2.0), (1.0, 1.0), (2.0, 0.5), (2.0, 2.0))  # times the cycle's mean
+N_PERIODS = 12.0  # of a run from another start
 
 
 @dataclass(frozen=True)
@@ -47,9 +79,9 @@ class LivingSearch:
         return discover(train, library, own, seed=rng, progress=progress)
 
     @property
-    def bounds(self) -> Bounds:
+    def bounds(self) -> FreeRunBounds:
         """What its rule calls living."""
-        return getattr(self.selection, "bounds", Bounds())
+        return getattr(self.selection, "bounds", FreeRunBounds())
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +111,175 @@ class Living:
     @property
     def model(self) -> SparseModel:
         return self.discovery.model
+
+    @property
+    def n_terms(self) -> int:
+        return int(np.count_nonzero(self.model.coef))
+
+    def section(self, name: str) -> Section:
+        """Equations with intervals, how they run, and what the derivatives' choice does instead."""
+        model, clock = self.model, self.run.rollout.clock
+        rows = ResultTable([self], LIVING).screen(by_state=True)
+        blocks: list[Block] = [
+            *(shown_equation(model, state, clock) for state in model.states),
+            *interval_table(model, clock=clock),
+            Table(rows, title=_title(self)),
+            *(Text(text) for text in (_note(self), _by_derivatives(self))),
+            *pictures(self.figures(name)),
+        ]
+        return Section(f"{name}: a model that {_ending(self)}", blocks)
+
+    def figures(self, name: str) -> dict[str, Captioned]:
+        """By name; those of a cycle only where there is one."""
+        run, held = self.run, self.held
+        drawn: dict[str, Any] = {}
+        if self.cycle is not None:
+            period_s = self.cycle.period_s
+            drawn["free_run"] = partial(
+                figures.free_run_figure, held, run.rollout, period_s=period_s
+            )
+            if len(self.model.states) > 1:
+                drawn["cycle"] = partial(_cycle_figure, self)
+            if figures.has_waveform(held, run.rollout):
+                drawn["waveform"] = partial(figures.waveform_figure, held, run.rollout)
+        return {f"{key}_{name}": Captioned(draw, CAPTIONS[key]) for key, draw in drawn.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` says."""
+        return facts(self, LIVING)
+
+
+LIVING: Metrics[Living] = [
+    Metric("terms", lambda found: _terms(found.model), View.JSON),
+    Metric("n_terms", lambda found: found.n_terms),
+    Metric("verdict", lambda found: str(found.run.verdict)),
+    Metric(
+        "frequency",
+        lambda found: found.run.rollout.clock.frequency_text(
+            found.run.frequency_Hz[found.model.states[0]]
+        ),
+        View.SCREEN,
+    ),
+    Metric("f_error", lambda found: found.run.f_error, View.ALL, "its error", percent(2)),
+    Metric(
+        "amplitude_ratio",
+        lambda found: found.run.amplitude_ratio,
+        View.SHOWN,
+        "amplitude (times the data's)",
+        "{:.3f}",
+    ),
+    Metric("waveform_error", lambda found: found.run.waveform_error, View.SHOWN, format="{:.3f}"),
+    Metric("waveform_error", lambda found: max(found.run.waveform_error.values()), View.HEADLINE),
+    Metric("verdict", lambda found: found.run.text, View.SCREEN),
+    Metric("periods", lambda found: found.run.periods),
+    Metric("floquet", lambda found: found.cycle and _multipliers(found.cycle), View.JSON),
+    Metric("stability", lambda found: found.cycle and str(found.cycle.stability)),
+    Metric("share_reaching", lambda found: found.share),
+    Metric("status_by_derivatives", lambda found: found.by_derivatives.status, View.CSV),
+    Metric("verdict_by_derivatives", lambda found: str(found.by_derivatives.run.verdict), View.CSV),
+    Metric("coefficients", lambda found: _with_intervals(found.model), View.JSON),
+    Metric("text", lambda found: found.model.text(), View.JSON),
+    Metric("selection", lambda found: found.discovery.note, View.JSON),
+    Metric("by_derivatives", lambda found: facts(found.by_derivatives, REFINED), View.JSON),
+]
+REFINED: Metrics[Refined] = [
+    Metric("status", lambda refined: refined.status),
+    Metric("verdict", lambda refined: str(refined.run.verdict)),
+    Metric("text", lambda refined: refined.run.model.text()),
+]
+
+
+def living_tables(living: Mapping[str, Living]) -> dict[str, pd.DataFrame]:
+    if not living:
+        return {}
+    found = {"living": ResultTable(living, LIVING).csv("library")}
+    for name, each in living.items():
+        found |= rollout_tables(each.held, {f"{name}_living": each.run})
+    models = {name: each.model for name, each in living.items()}
+    return found | {"coefficients_living": coefficients(models, heading="library")}
+
+
+def _terms(model: SparseModel) -> dict[str, list[str]]:
+    return {state: list(model.terms(state)) for state in model.states}
+
+
+def _multipliers(cycle: LimitCycle) -> list[list[float]]:
+    return [[float(m.real), float(m.imag)] for m in cycle.multipliers]
+
+
+def _with_intervals(model: SparseModel) -> dict[str, dict[str, Any]]:
+    known = intervals(model)
+    return {
+        state: {
+            term: {"value": value, "ci95": None if known is None else known[state][term]}
+            for term, value in model.terms(state).items()
+        }
+        for state in model.states
+    }
+
+
+def _ending(living: Living) -> str:
+    return "lives" if living.run.verdict == "lives" else f"does not live ({living.run.text})"
+
+
+def _title(living: Living) -> str:
+    n = round(living.run.periods) if living.run.periods == living.run.periods else 0
+    return f"run freely from one sample over held-out time; in phase for {n} periods"
+
+
+def _note(living: Living) -> str:
+    """Selection, stability, and what the columns are."""
+    found = [f"Selection: {living.discovery.note}."]
+    if living.cycle is not None and living.share is not None:
+        moduli = ", ".join(f"{abs(m):.3g}" for m in living.cycle.multipliers[1:])
+        found.append(
+            f"Its cycle is {living.cycle.stability}: Floquet multiplier {moduli}; "
+            f"{100 * living.share:.0f} % of starts around reach it."
+        )
+    found.append(
+        "Amplitude: ratio of standard deviations; waveform error: RMS difference in standard "
+        "deviations of the data."
+    )
+    return " ".join(found)
+
+
+def _by_derivatives(living: Living) -> str:
+    """What the equations that derivatives select do when they are refined."""
+    refined = living.by_derivatives
+    text = "; ".join(
+        equation_text(state, refined.run.model.terms(state)) for state in refined.run.model.states
+    )
+    if refined.status == "non_finite":
+        return (
+            "The equations selected by their derivatives cannot be refined: no trajectory of "
+            f"theirs stays finite over two periods ({text})."
+        )
+    return (
+        f"The equations selected by their derivatives, refined as they are ({refined.status}): "
+        f"{refined.run.text} ({text})."
+    )
+
+
+def _cycle_figure(living: Living) -> Figure:
+    assert living.cycle is not None
+    model, cycle, held = living.model, living.cycle, living.held
+    order = [model.states.index(name) for name in held.state_names]
+    return figures.cycle_figure(
+        held, cycle.states[:, order], _paths(living), plane=held.state_names[:2]
+    )
+
+
+def _paths(living: Living) -> list[Rollout]:
+    """Runs from starts around the cycle's mean, in the first two states."""
+    assert living.cycle is not None
+    mean = living.cycle.states.mean(axis=0)
+    t = np.linspace(0.0, N_PERIODS * living.cycle.period_s, 1200)
+    found = []
+    for factors in STARTS:
+        start = mean.copy()
+        start[:2] *= factors
+        found.append(living.model.simulate(t, start, blow_up=30.0))
+    return found
 
 
 def living_model(

@@ -16,7 +16,6 @@ from ep2sindy.figures.trends import rows_at, trends_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS
-from ep2sindy.machine.parallel import Workers
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.point_fits import (
     Case,
@@ -32,10 +31,11 @@ from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
 from ep2sindy.operating.records import point_label
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Count, Kind
-from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.shown import coefficients
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.study import Check, Count
+from ep2sindy.studies.views import coefficients
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
@@ -112,7 +112,7 @@ class Panels:
 
 Cases = Annotated[
     Mapping[str, CaseSettings],
-    Kind(
+    Check(
         "like {free: {relations: [], quantities: {k: {coefficient: 'x: x'}}}}",
         lambda value: isinstance(value, dict) and bool(value),
     ),

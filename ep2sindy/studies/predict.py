@@ -13,10 +13,14 @@ import pandas as pd
 from scipy.special import ndtri
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.figures.operating import frequency_scale, laws_figure, left_out_figure
-from ep2sindy.figures.operating_map import line_figure, map_figure
+from ep2sindy.figures.operating import (
+    frequency_scale,
+    laws_figure,
+    left_out_figure,
+    line_figure,
+    map_figure,
+)
 from ep2sindy.library.library import polynomial
-from ep2sindy.machine.parallel import Workers
 from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import (
@@ -42,11 +46,12 @@ from ep2sindy.report.document import (
     places,
 )
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.oscillation import Oscillation
-from ep2sindy.studies.kinds import Count, Counts, Kind, Positive
-from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.simulate_scan import compile_kernels
+from ep2sindy.studies.fits import Terms, terms_of
+from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.study import Check, Count, Counts, Positive
 
 INTERVALS = (
     "In SI units, and the parameters in theirs. ±: half the 95 % interval, from a sandwich with "
@@ -108,7 +113,7 @@ class SearchSettings:
 Parameters = Mapping[str, float]
 Points = Annotated[
     Sequence[Mapping[str, Any]],
-    Kind(
+    Check(
         "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], every combination being a point",
         lambda value: isinstance(value, list) and bool(value),
     ),

@@ -1,28 +1,74 @@
-"""Run the simulator, once or over any of its parameters, and show what it did: `+exp=simulate`."""
+"""Run the simulator, once or over any of its parameters, and show what it did: `+exp=simulate`.
+
+One run shows where its power went and how it breathes; a scan shows every combination of some
+settings.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
+from textwrap import fill
 from typing import Annotated, Any
 
+import numpy as np
+import pandas as pd
 import xarray as xr
 
-from ep2sindy.machine.parallel import Workers
+from ep2sindy.figures import breathing
+from ep2sindy.figures.stability import curves_figure, stability_figure
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures, places
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Deferred, Kind, Positive, PositiveOrAll
-from ep2sindy.studies.simulate_scan import (
-    FAILED,
-    ScanOutcome,
-    Simulated,
+from ep2sindy.runtime.files import WriteError
+from ep2sindy.runtime.parallel import Workers
+from ep2sindy.signals.spectrum import power_spectrum
+from ep2sindy.studies.simulated import (
     compile_kernels,
-    scan_points,
-    simulated,
+    doubts,
+    is_simulation,
+    say_simulation,
+    status_text,
 )
-from ep2sindy.studies.simulate_view import Outcome
-from ep2sindy.studies.simulated import is_simulation, say_simulation
-from ep2sindy.studies.study import Outcome as AnyOutcome
+from ep2sindy.studies.study import Check, Deferred, Positive, PositiveOrAll
+from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.cache import write
+from ep2sindy.thruster.verdict import TRANSIT_HZ
+
+LEAST_SAMPLES = 16  # fewer cannot be drawn
+AVERAGED = " Averaged over r by area."
+CAPTIONS = {
+    "current": "Discharge current over the record (above) and over the part that is shaded there, "
+    "beside the ion beam current (below).",
+    "spectrum": "Power spectrum of the discharge current; breathing lies below 60 kHz, "
+    "oscillations of ions in transit above.",
+    "profiles": "Profiles along the axis: mean in time, the band that holds 5 to 95 % of the time, "
+    "and the whole range. Dashed: the channel's exit.",
+    "maps": "Discharge current, neutrals and ions over time and axis: neutrals fill the channel, "
+    "are ionised, and fill it again. Dashed: the channel's exit.",
+}
+NUMBERS = (
+    "f_kHz", "I_d_mean", "I_d_std", "thrust_N", "isp_s", "anode_efficiency", "I_beam_mean",
+    "I_wall_mean", "mass_balance", "energy_balance",
+)  # fmt: skip
+FAILED = "failed"
+SCANNED = (
+    "f_kHz", "I_d_mean", "I_d_std", "thrust_N", "isp_s", "anode_efficiency", "mass_balance",
+    "energy_balance",
+)  # fmt: skip
+HEADING = 9  # characters in a line of a table's heading
+MAP = (
+    "Standard deviation of the discharge current over the scanned parameters: the colour and the "
+    "first number of a cell; below it frequency and cycle (strong: a standard deviation above 90 % "
+    "of the mean). Hatched: no breathing, for the reason that the cell names."
+)
+CURVES = (
+    "Discharge current with its standard deviation as bars, frequency, thrust and anode efficiency "
+    "over the scanned parameter; vertical lines: points that diverged or could not be run."
+)
 
 
 def _is_scan(value: Any) -> bool:
@@ -34,7 +80,7 @@ def _is_scan(value: Any) -> bool:
 
 Scan = Annotated[
     Mapping[str, Sequence[Any]] | None,
-    Kind("like {operating_point.voltage: [250,300]}, each value once, or null", _is_scan),
+    Check("like {operating_point.voltage: [250,300]}, each value once, or null", _is_scan),
 ]
 
 
@@ -64,7 +110,7 @@ class Study:
     def __post_init__(self) -> None:
         scan_points(self.data, self.scan or {})  # a misspelt place must cost no simulation
 
-    def compute(self, run: Run) -> AnyOutcome:
+    def compute(self, run: Run) -> Outcome | ScanOutcome:
         return self._scanned(run) if self.scan else self._one(run)
 
     def _one(self, run: Run) -> Outcome:
@@ -80,7 +126,7 @@ class Study:
             compile_kernels([point.data for point in points])
         found: dict[int, Simulated] = {}
         with run.progress(len(points), "simulation") as came:
-            for number, result in self.parallel.run(simulated, points):
+            for number, result in self.parallel.run(run_point, points):
                 found[number] = result
                 came(1)
         results = [found[number] for number in range(len(points))]
@@ -99,3 +145,339 @@ def check_simulation(field: object, data: Deferred) -> None:
             "data must be a simulation, with status, current and parameters as its attributes: "
             f"{data.settings['_target_']} gave none; choose data=simulation"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Settings of one run: values by their place in the data group, and the data with them."""
+
+    values: Mapping[str, Any]
+    data: Deferred
+
+    @property
+    def label(self) -> str:
+        return ", ".join(f"{name}={value_text(value)}" for name, value in self.values.items())
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What became of a point.
+
+    notes: what is amiss beside the status. message: why it could not be run.
+    """
+
+    status: str
+    cycle: str = "none"
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    initial: str = ""
+    notes: Sequence[str] = ()
+    message: str = ""
+
+
+def scan_points(data: Deferred, scan: Mapping[str, Sequence[Any]]) -> list[Point]:
+    """Every combination, the last place varying fastest; ValueError for a place that is not."""
+    found = []
+    for values in product(*scan.values()):
+        chosen = dict(zip(scan, values, strict=True))
+        found.append(Point(chosen, quiet(data.changed(chosen))))
+    return found
+
+
+def quiet(data: Deferred) -> Deferred:
+    """Runs come side by side: their bars would mix."""
+    try:
+        return data.changed({"progress": False})
+    except ValueError:
+        return data  # it shows none
+
+
+def run_point(point: Point) -> Simulated:
+    """Run a point; one that cannot be run says why, and leaves the others alone.
+
+    Raises WriteError where the simulation cannot be kept: that is none of the point's.
+    """
+    try:
+        run = point.data.build()
+    except WriteError:
+        raise
+    except (ValueError, OSError, ArithmeticError) as error:
+        return Simulated(FAILED, message=str(error) or type(error).__name__)
+    attributes = getattr(run, "attrs", {})
+    if not is_simulation(attributes):
+        came = point.data.settings["_target_"]
+        return Simulated(FAILED, message=f"data must be a simulation: {came} gave none")
+    return Simulated(
+        attributes["status"],
+        attributes.get("cycle", "none"),
+        {name: float(attributes.get(name, float("nan"))) for name in SCANNED},
+        attributes.get("initial", ""),
+        doubts(attributes),
+    )
+
+
+def value_text(value: Any) -> str:
+    """`250`, `BN`, `ColdStart(n_i=1e+17)`: a value as tables and axes have it."""
+    if isinstance(value, Mapping):
+        name = str(value.get("_target_", "")).rpartition(".")[2]
+        inner = [f"{k}={value_text(v)}" for k, v in value.items() if k != "_target_"]
+        return f"{name}({', '.join(inner)})" if inner or not name else name
+    if isinstance(value, list):
+        return f"[{', '.join(map(value_text, value))}]"
+    return f"{value:g}" if isinstance(value, float) else "null" if value is None else str(value)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A run, and how much of it figures show: `field.nc` holds all of it."""
+
+    field: xr.Dataset
+    periods: float
+    f_max_Hz: float | None
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What a run is judged by, in SI; NaN for what it did not live to have."""
+        attributes = dict(self.field.attrs)
+        if "I_beam" in self.field and self.field.sizes["time"]:
+            attributes["I_beam_mean"] = self.field["I_beam"].mean()
+        return {name: float(attributes.get(name, np.nan)) for name in NUMBERS}
+
+    @property
+    def can_be_drawn(self) -> bool:
+        return self.field.sizes["time"] >= LEAST_SAMPLES
+
+    def models(self) -> dict[str, SparseModel]:
+        return {}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        found = {"performance": self._performance(), "power": power_table(self.field)}
+        if self.can_be_drawn:
+            found |= {"profiles": self._profiles(), "spectrum": self._spectrum()}
+        return found
+
+    def _profiles(self) -> pd.DataFrame:
+        columns = {"z": self.field["z"].values}
+        for name, values in breathing.profile_table(self.field).items():
+            ends = ("mean", "low", "high", "min", "max")
+            columns |= {f"{name}_{end}": each for end, each in zip(ends, values, strict=True)}
+        return pd.DataFrame(columns)
+
+    def _spectrum(self) -> pd.DataFrame:
+        frequency, power = power_spectrum(self.field["time"].values, self.field["I_d"].values)
+        return pd.DataFrame({"frequency_Hz": frequency, "power": power})
+
+    def figures(self) -> dict[str, Captioned]:
+        if not self.can_be_drawn:
+            return {}
+        field, time = self.field, self.field["time"].values
+        window = breathing.last_periods(time, self.numbers["f_kHz"], self.periods)
+        highest = 0.5 / float(time[1] - time[0])
+        up_to = {"f_max_Hz": min(self.f_max_Hz or highest, highest), "transit_Hz": TRANSIT_HZ}
+        drawn = {
+            "current": partial(breathing.current_figure, field, window),
+            "spectrum": partial(
+                breathing.spectrum_figure, field, f_kHz=self.numbers["f_kHz"], **up_to
+            ),
+            "profiles": partial(breathing.profile_figure, field),
+            "maps": partial(breathing.map_figure, field, window),
+        }
+        radial = AVERAGED if "r" in field.dims else ""
+        tails = {"profiles": radial, "maps": radial}
+        return {n: Captioned(d, CAPTIONS[n] + tails.get(n, "")) for n, d in drawn.items()}
+
+    def sections(self) -> list[Section]:
+        notes: list[Block] = []
+        if not self.can_be_drawn:
+            n = self.field.sizes["time"]
+            notes = [Text(f"The run broke after {n} samples: there is nothing to draw.")]
+        return [
+            Section("Run", [Table(self._performance()), *notes]),
+            Section("Where the power goes", [power_text(self.field)]),
+            Section("Current", pictures(["current", "spectrum"])),
+            Section("Along the axis", pictures(["profiles", "maps"])),
+        ]
+
+    def _performance(self) -> pd.DataFrame:
+        """What it did in words and units."""
+        n, attributes = self.numbers, self.field.attrs
+        mode = "transit" if attributes["status"] == "transit" else "breathing"
+        share = f"{100.0 * n['I_d_std'] / n['I_d_mean']:.0f}"
+        beam = f"{100.0 * n['I_beam_mean'] / n['I_d_mean']:.0f}"
+        rows = {
+            "status": status_text(attributes),
+            "start": attributes.get("initial", "-"),
+            "discharge current, mean": _with(places(n["I_d_mean"], 2), "A"),
+            "discharge current, standard deviation": _with(
+                places(n["I_d_std"], 2), f"A, {share} % of the mean"
+            ),
+            f"{mode} frequency": _with(places(n["f_kHz"], 2), "kHz"),
+            "thrust": _with(places(1e3 * n["thrust_N"], 1), "mN"),
+            "specific impulse": _with(places(n["isp_s"], 0), "s"),
+            "anode efficiency": _with(places(100.0 * n["anode_efficiency"], 1), "%"),
+            "ion beam current, mean": _with(
+                places(n["I_beam_mean"], 2), f"A, {beam} % of the discharge current"
+            ),
+            "ion current to the walls, mean": _with(places(n["I_wall_mean"], 2), "A"),
+            "mass balance, (left + stored)/entered": places(n["mass_balance"], 4),
+            "energy balance, (left + stored)/entered": places(n["energy_balance"], 4),
+            "rates of the propellant": attributes.get("rates", "-"),
+        }
+        return pd.DataFrame({"quantity": list(rows), "value": list(rows.values())})
+
+    def summary(self) -> dict[str, Any]:
+        attributes = self.field.attrs
+        return {
+            "file": "field.nc",
+            "status": attributes["status"],
+            "cycle": attributes.get("cycle", "none"),
+            "initial": attributes.get("initial"),
+            **self.numbers,
+            "rates": attributes.get("rates"),
+            "n_samples": self.field.sizes["time"],
+            "power_W": dict(power_table(self.field)[["name", "power_W"]].to_numpy().tolist()),
+        }
+
+    def headline(self) -> dict[str, float]:
+        return self.numbers
+
+
+def _with(number: str, unit: str) -> str:
+    return number if number == "-" else f"{number} {unit}"
+
+
+def power_table(field: xr.Dataset) -> pd.DataFrame:
+    """Mean power in W by where it goes, and its share of what the plasma takes."""
+    known = [name for name in POWERS if name in field and field.sizes["time"]]
+    power = {name: float(field[name].mean()) for name in known}
+    text = {name: str(field[name].attrs.get("long_name", name)) for name in known}
+    if "P_in" in power:
+        power["stored"] = power["P_in"] - sum(power[name] for name in known if name != "P_in")
+        text["stored"] = "stored by the electrons, or unaccounted for"
+    share = [100.0 * each / power.get("P_in", np.nan) for each in power.values()]
+    columns = {"name": list(power), "goes_to": list(text.values()), "power_W": list(power.values())}
+    return pd.DataFrame({**columns, "share": share})
+
+
+def power_text(field: xr.Dataset) -> Table | Text:
+    """The same to read."""
+    table = power_table(field)
+    if table.empty:
+        return Text("This run has no record of its power.")
+    rows = {
+        "power": table["goes_to"],
+        "W": [places(round(value, 1) + 0.0, 1) for value in table["power_W"]],  # no -0.0
+        "%": [places(round(value, 1) + 0.0, 1) for value in table["share"]],
+    }
+    return Table(pd.DataFrame(rows), breaks=[0], note="Means over the record.")
+
+
+@dataclass(frozen=True, eq=False)
+class ScanOutcome:
+    """All points and what became of them; labels: what some places are called."""
+
+    points: Sequence[Point]
+    results: Sequence[Simulated]
+    labels: Mapping[str, str]
+
+    @property
+    def rows(self) -> pd.DataFrame:
+        """One row per point: its settings, verdict, numbers in SI, and why it failed."""
+        nothing = dict.fromkeys(SCANNED, float("nan"))
+        rows = []
+        for point, each in zip(self.points, self.results, strict=True):
+            verdict = {"status": each.status, "cycle": each.cycle}
+            told = {"initial": each.initial, "message": each.message or "; ".join(each.notes)}
+            rows.append({**point.values, **verdict, **nothing, **each.numbers, **told})
+        return pd.DataFrame(rows)
+
+    @property
+    def scanned(self) -> list[str]:
+        """Places that take several values; all where none does."""
+        several = [name for name in self._places if len(self._texts[name].unique()) > 1]
+        return several or self._places[:1]
+
+    @property
+    def _places(self) -> list[str]:
+        return list(self.points[0].values)
+
+    @property
+    def _texts(self) -> pd.DataFrame:
+        """The rows with their settings as text."""
+        texts = {
+            name: [value_text(each.values[name]) for each in self.points] for name in self._places
+        }
+        return self.rows.assign(**texts)
+
+    def label(self, place: str) -> str:
+        return self.labels.get(place, place.replace(".", ": ").replace("_", " "))
+
+    def models(self) -> dict[str, SparseModel]:
+        return {}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        return {"points": self._texts}
+
+    def figures(self) -> dict[str, Captioned]:
+        along = self.scanned
+        if len(along) == 1:
+            values = [each.values[along[0]] for each in self.points]
+            numbers = all(type(value) in (int, float) for value in values)
+            points = self.rows if numbers else self._texts
+            draw = partial(curves_figure, points, along[0], self.label(along[0]))
+            return {"curves": Captioned(draw, CURVES)}
+        labels = {name: self.label(name) for name in along}
+        drawn = partial(stability_figure, self._texts, along, labels)
+        return {"stability": Captioned(drawn, MAP)}
+
+    def sections(self) -> list[Section]:
+        counts = ", ".join(f"{n} {status}" for status, n in self._counts.items())
+        starts = dict.fromkeys(each.initial for each in self.results if each.initial)
+        lines = [
+            Text(f"{len(self.points)} points: {counts}; from {', '.join(starts)}."),
+            *self._failures(),
+        ]
+        return [Section("Scan", [*lines, self._table(), *pictures(["curves", "stability"])])]
+
+    def _failures(self) -> list[Text]:
+        """Why points could not be run, each reason once."""
+        failed: dict[str, list[str]] = {}
+        for point, each in zip(self.points, self.results, strict=True):
+            if each.message:
+                failed.setdefault(each.message, []).append(point.label)
+        found = []
+        for message, labels in failed.items():
+            more = f" and {len(labels) - 2} more" if len(labels) > 2 else ""
+            found.append(Text(f"{'; '.join(labels[:2])}{more}: {message}", warning=True))
+        return found
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        return dict(Counter(each.status for each in self.results))
+
+    def _table(self) -> Table:
+        shown = []
+        for row in self._texts.to_dict("records"):
+            shown.append(
+                {
+                    **{self.label(name): row[name] for name in self._places},
+                    "status": row["status"],
+                    "cycle": row["cycle"].replace("none", "-"),
+                    "current mean (A)": places(row["I_d_mean"], 2),
+                    "std (A)": places(row["I_d_std"], 2),
+                    "f (kHz)": places(row["f_kHz"], 1),
+                    "thrust (mN)": places(1e3 * row["thrust_N"], 1),
+                    "efficiency (%)": places(100.0 * row["anode_efficiency"], 1),
+                    "mass balance": places(row["mass_balance"], 4),
+                    "energy balance": places(row["energy_balance"], 4),
+                }
+            )
+        narrow = {name: fill(name, HEADING, break_long_words=False) for name in shown[0]}
+        return Table(pd.DataFrame(shown).rename(columns=narrow), note="balance: (out + stored)/in")
+
+    def summary(self) -> dict[str, Any]:
+        return {"statuses": self._counts, "points": self.rows.to_dict("records")}
+
+    def headline(self) -> dict[str, float]:
+        names = ("oscillating", "transit", "steady", "decaying", "diverged", FAILED)
+        counts = {f"n_{name}": float(self._counts.get(name, 0)) for name in names}
+        return {"n_points": float(len(self.points)), **counts}

@@ -1,15 +1,18 @@
-"""What a study says of a simulation that it takes: what it is, and what is amiss with it."""
+"""Simulations that a study takes: what they are, what is amiss with them, kernels for many."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import xarray as xr
 
 from ep2sindy.report.run import Run
+from ep2sindy.studies.study import Deferred
 
 LEAST_SAMPLES = 200  # some periods of breathing at the usual step: less says nothing of it
+GLIMPSE_SAMPLES = 20
 BALANCE_TOLERANCE = 1e-3  # of what enters; a record in float32 closes to 1e-4
 BALANCES = {"mass_balance": "mass", "energy_balance": "energy"}
 VERDICTS = {
@@ -88,3 +91,16 @@ def status_text(attributes: Mapping[str, Any]) -> str:
     """`oscillating, strong cycle`; a status alone where there is no cycle."""
     cycle = attributes.get("cycle", "none")
     return attributes["status"] + (f", {cycle} cycle" if cycle != "none" else "")
+
+
+def compile_kernels(data: Sequence[Deferred]) -> None:
+    """A glimpse of a run in this process: workers then find the compiled kernels on disk."""
+    with TemporaryDirectory() as folder:
+        for each in data:
+            sample_s = each.settings.get("sample_s") or 1e-6
+            brief = {"duration_s": GLIMPSE_SAMPLES * sample_s, "warm_up_s": 0.0, "cache": folder}
+            try:
+                each.changed({"sample_s": sample_s, **brief}).build()
+            except (ValueError, OSError):
+                continue  # this point says why when its turn comes
+            return

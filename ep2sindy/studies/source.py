@@ -17,13 +17,12 @@ from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.machine.parallel import Workers, collect
-from ep2sindy.machine.screen import in_line
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.parallel import Workers, collect
+from ep2sindy.runtime.screen import in_line
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.kinds import Deferred
 from ep2sindy.studies.simulated import (
     DivergedError,
     amiss,
@@ -31,6 +30,7 @@ from ep2sindy.studies.simulated import (
     is_simulation,
     say_simulation,
 )
+from ep2sindy.studies.study import Deferred
 
 Step = Callable[[xr.Dataset], xr.Dataset]
 WITHOUT_BREATHING = (  # what a simulation says of itself

@@ -13,11 +13,12 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import Constraint, Relation, constraint, parse_relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery
-from ep2sindy.machine.progress import SILENT, Progress, counted
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Bounds
+from ep2sindy.model.likeness import FreeRunBounds
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Section, Table, Text, places
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
+from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.studies.living import start_of, two_periods
 
 if TYPE_CHECKING:
@@ -82,6 +83,59 @@ class Roles:
     terms: Sequence[Role]
     shared: FreeRun | None
 
+    def table(self) -> pd.DataFrame:
+        return ResultTable(self.terms, ROLES).csv()
+
+    def section(self, name: str) -> Section:
+        """A row per term: what a balance of the zone expects there, and the model without it."""
+        shared = facts(self.shared, WITHOUT)
+        text = f"Ionization as one coefficient of opposite signs: {shared['verdict']}"
+        if self.shared is not None:
+            terms = "; ".join(self.shared.model.text().splitlines())
+            text += f", waveform {places(shared['waveform_error'], 3)} ({terms})"
+        rows = ResultTable(self.terms, ROLES).screen()
+        table = Table(rows, title="each term beside a balance of the zone, and left out")
+        return Section(f"{name}: what the terms mean", [table, Text(f"{text}.")], level=3)
+
+    def summary(self) -> dict[str, Any]:
+        """What `summary.json` says."""
+        text = None if self.shared is None else self.shared.model.text()
+        return {
+            "terms": [facts(role, ROLES) for role in self.terms],
+            "shared_ionization": facts(self.shared, WITHOUT) | {"text": text},
+        }
+
+
+# Of a refined model that lacks a term; None where it cannot be refined.
+WITHOUT: Metrics[FreeRun | None] = [
+    Metric(
+        "verdict", lambda run: run.text if run else "cannot be refined", View.SHOWN, "without it"
+    ),
+    Metric("f_error", lambda run: run.f_error if run else np.nan),
+    Metric(
+        "waveform_error",
+        lambda run: max(run.waveform_error.values()) if run else np.nan,
+        View.SHOWN,
+        "waveform",
+        "{:.3f}",
+    ),
+]
+ROLES: Metrics[Role] = [
+    Metric("state", lambda role: role.state),
+    Metric("equation", lambda role: f"{role.state}'", View.SCREEN),
+    Metric("term", lambda role: role.term, View.SHOWN),
+    Metric("coefficient", lambda role: role.coef, View.SHOWN),
+    Metric(
+        "balance", lambda role: role.expected[0] if role.expected else "", View.SHOWN,
+        "in a balance",
+    ),
+    Metric(
+        "balance_value", lambda role: role.expected[1] if role.expected else np.nan, View.SHOWN,
+        "value",
+    ),
+    *(metric.of(lambda role: role.without, "without_{}") for metric in WITHOUT),
+]  # fmt: skip
+
 
 def term_roles(
     found: Discovery,
@@ -89,7 +143,7 @@ def term_roles(
     train: Trajectory,
     held: Trajectory,
     compared: Compared,
-    bounds: Bounds,
+    bounds: FreeRunBounds,
     *,
     length_m: float | None,
     progress: Progress = SILENT,
@@ -121,7 +175,7 @@ def _run(
     relations: Sequence[Relation],
     train: Trajectory,
     held: Trajectory,
-    bounds: Bounds,
+    bounds: FreeRunBounds,
     progress: Progress,
     *,
     window: int | None,
@@ -156,56 +210,3 @@ def _refined(
         rng=0,
         progress=progress,
     )
-
-
-def roles_table(roles: Roles) -> pd.DataFrame:
-    rows = []
-    for role in roles.terms:
-        name, value = role.expected or ("", np.nan)
-        row = {"state": role.state, "term": role.term, "coefficient": role.coef}
-        row |= {"balance": name, "balance_value": value}
-        rows.append(row | {f"without_{key}": v for key, v in _figures(role.without).items()})
-    return pd.DataFrame(rows)
-
-
-def _figures(run: FreeRun | None) -> dict[str, Any]:
-    if run is None:
-        return {"verdict": "cannot be refined", "f_error": np.nan, "waveform_error": np.nan}
-    waveform = max(run.waveform_error.values())
-    return {"verdict": run.text, "f_error": run.f_error, "waveform_error": waveform}
-
-
-def roles_section(name: str, roles: Roles) -> Section:
-    """A row per term: what a balance of the zone expects there, and the model without it."""
-    rows = []
-    for row in roles_table(roles).to_dict("records"):
-        waveform = places(row["without_waveform_error"], 3)
-        rows.append(
-            {
-                "equation": f"{row['state']}'",
-                "term": row["term"],
-                "coefficient": row["coefficient"],
-                "in a balance": row["balance"],
-                "value": row["balance_value"],
-                "without it": row["without_verdict"],
-                "waveform": waveform,
-            }
-        )
-    shared = _figures(roles.shared)
-    text = f"Ionization as one coefficient of opposite signs: {shared['verdict']}"
-    if roles.shared is not None:
-        terms = "; ".join(roles.shared.model.text().splitlines())
-        text += f", waveform {places(shared['waveform_error'], 3)} ({terms})"
-    table = Table(pd.DataFrame(rows), title="each term beside a balance of the zone, and left out")
-    return Section(f"{name}: what the terms mean", [table, Text(f"{text}.")], level=3)
-
-
-def roles_summary(roles: Roles | None) -> dict[str, Any] | None:
-    if roles is None:
-        return None
-    shared = roles.shared
-    return {
-        "terms": roles_table(roles).to_dict("records"),
-        "shared_ionization": _figures(shared)
-        | {"text": None if shared is None else shared.model.text()},
-    }

@@ -1,32 +1,74 @@
-"""A living model from one measured signal: `+exp=trace`."""
+"""A living model from one measured signal: `+exp=trace`.
+
+It is judged on the end of the record, and by runs from starts off its cycle.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.figures.fronts import front_figure
+from ep2sindy.figures.living import (
+    cycle_figure,
+    free_run_figure,
+    has_waveform,
+    waveform_figure,
+)
+from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.stability import share_reaching
+from ep2sindy.model.likeness import Verdict
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.rollout import Rollout
+from ep2sindy.model.stability import LimitCycle, share_reaching
+from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.report.run import Run
+from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
-from ep2sindy.signals.trace import Trace, trace
-from ep2sindy.studies.kinds import Count, Deferred, Positive, Share
+from ep2sindy.signals.trace import LEAST_PERIODS, Trace, from_one_signal
+from ep2sindy.studies.library_result import Row, candidate_rows
 from ep2sindy.studies.living import cycle_of
-from ep2sindy.studies.source import Source
-from ep2sindy.studies.trace_judged import as_measured, fitted_samples
-from ep2sindy.studies.trace_view import Outcome
+from ep2sindy.studies.source import Source, data_summary
+from ep2sindy.studies.study import Count, Deferred, Positive, Share
+from ep2sindy.studies.views import (
+    coefficients,
+    interval_table,
+    intervals,
+    model_summary,
+    rollout_tables,
+    shown_equation,
+)
 
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
 
 # Of each equation where none is known, so that their combinations stay few.
 DEPTH_OF_BOTH = 2
+
+LEAST_JUDGED = 4.0  # periods of the end of a record, to be held out
+
+N_PERIODS = 12.0  # of a run from another start
+
+STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distances from the cycle's middle, in those of its states
+
+CAPTIONS = {
+    "free_run": "The model run freely from one sample (colour) over the record that it never saw "
+    "(grey): the first periods, and the last.",
+    "plane": "The model's cycle in the plane of both states, over the data (grey), and runs from "
+    "other starts.",
+    "waveform": "One period by phase, shown twice: samples, their waveform, and the model's.",
+    "front": "Error of the derivative against number of terms: every candidate that was refined "
+    "and run freely; the star is selected, by its free runs.",
+}
 
 
 @dataclass(frozen=True)
@@ -62,7 +104,7 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         data = self._sampled(run)
-        signal = trace(data, decimate=self.decimate, detrend=self.detrend)
+        signal = from_one_signal(data, decimate=self.decimate, detrend=self.detrend)
         for text in signal.done:
             run.say(f"{signal.name}: {text}")
         for text in signal.advice:
@@ -76,7 +118,7 @@ class Study:
         found = self._found(chosen, states.window(0, n_fitted), run)
         held = states if n_fitted == states.n_samples else states.window(n_fitted, states.n_samples)
         with run.progress(None, "", "free run and limit cycle"):
-            return living(signal, chosen, found, states, held, label=self.recipe.selection.label)
+            return evaluate(signal, chosen, found, states, held, label=self.recipe.selection.label)
 
     def _sampled(self, run: Run) -> Trajectory:
         zone = getattr(self.source.trajectory, "zone", None)
@@ -157,7 +199,23 @@ def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str
     return data.changed(places)
 
 
-def living(
+def fitted_samples(signal: Trace, states: Trajectory, held_out: float) -> int:
+    """Samples to fit: all of a record too short for a part of it to be held out."""
+    n_fitted = round((1.0 - held_out) * states.n_samples)
+    periods = states.dt_s / signal.period_s * np.array([n_fitted, states.n_samples - n_fitted])
+    enough = periods[0] >= LEAST_PERIODS + 0.5 and periods[1] >= LEAST_JUDGED
+    return n_fitted if enough else states.n_samples
+
+
+def as_measured(signal: Trace, held: Trajectory) -> Trajectory:
+    """Held-out states with the samples of the signal in place of the smoothed ones."""
+    first = int(np.searchsorted(signal.t, held.t[0] - 1e-6 * held.dt_s))
+    states = held.states.copy()
+    states[:, 0] = signal.x[first : first + held.n_samples]
+    return replace(held, states=states)
+
+
+def evaluate(
     signal: Trace,
     chosen: Chosen,
     found: Discovery,
@@ -172,3 +230,236 @@ def living(
     cycle = cycle_of(run)
     share = float("nan") if cycle is None else share_reaching(found.model, cycle)
     return Outcome(signal, chosen, found, states, measured, run, cycle, share, label)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one signal taught.
+
+    states: all of the record, smoothed. measured: what judges, the signal as it was measured; run:
+    the model over it, from its first sample smoothed. cycle: of the model, if it has one; share:
+    of starts that reach it. label: what the scores are called.
+    """
+
+    signal: Trace
+    chosen: Chosen
+    found: Discovery
+    states: Trajectory
+    measured: Trajectory
+    run: FreeRun
+    cycle: LimitCycle | None
+    share: float
+    label: str
+
+    @property
+    def model(self) -> SparseModel:
+        return self.found.model
+
+    @property
+    def is_held_out(self) -> bool:
+        return self.measured.n_samples < self.states.n_samples
+
+    @property
+    def searched(self) -> list[str]:
+        return self.chosen.embedded.searched
+
+    @property
+    def data_frequency(self) -> str:
+        cycle = find_cycle(self.measured.t, self.measured.states[:, :1])
+        frequency_Hz = cycle.frequency_Hz if cycle else float("nan")
+        return self.run.rollout.clock.frequency_text(frequency_Hz)
+
+    def models(self) -> dict[str, SparseModel]:
+        return {"trace": self.model}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        fronts = {f"front_{state}": self._front(state).csv() for state in self.searched}
+        samples = dict(zip(self.states.state_names, self.states.states.T, strict=True))
+        return {
+            **fronts,
+            **rollout_tables(self.measured, {"trace": self.run}),
+            "states": pd.DataFrame({"t_s": self.states.t, **samples}),
+            "coefficients": coefficients(self.models(), heading="model"),
+        }
+
+    def _front(self, state: str) -> ResultTable[Row]:
+        return ResultTable(candidate_rows(self.found, state), CANDIDATES)
+
+    def figures(self) -> dict[str, Captioned]:
+        held, rollout = self.measured, self.run.rollout
+        period_s = self.signal.period_s
+        drawn: dict[str, Any] = {
+            "free_run": partial(free_run_figure, held, rollout, period_s=period_s)
+        }
+        if self.cycle is not None:
+            plane, paths = held.state_names, paths_off(self.model, self.cycle)
+            drawn["plane"] = partial(
+                cycle_figure, self.states, self.cycle.states, paths, plane=plane
+            )
+        if has_waveform(held, rollout):
+            drawn["waveform"] = partial(waveform_figure, held, rollout)
+        fronts = {state: self.found.fronts[state] for state in self.searched}
+        scores = {state: self.found.scores[state] for state in self.searched}
+        drawn["front"] = partial(front_figure, fronts, scores, label=self.label)
+        return {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()}
+
+    def sections(self) -> list[Section]:
+        return [self._signal_section(), self._search_section(), self._living_section()]
+
+    def _signal_section(self) -> Section:
+        signal, embedded = self.signal, self.chosen.embedded
+        names = self.states.state_names
+        made = f"{self.chosen.embedding.says}, {names[0]} and {names[1]}"
+        per_period = signal.period_s / self.states.dt_s
+        blocks: list[Block] = [
+            Text(
+                f"{signal.clock.frequency_text(1.0 / signal.period_s)}, "
+                f"{signal.cycle.n_periods:.0f} periods of {per_period:.0f} samples"
+            ),
+            Text(f"states: {made} ({self.chosen.reason})"),
+            Text(
+                f"noise, and what is too fast to be followed: {embedded.noise_std:.3g} "
+                f"{signal.unit}, {100.0 * embedded.noise_std / signal.x.std():.2g} % of the "
+                "standard deviation"
+            ),
+            *(Text(each) for each in signal.done),
+        ]
+        return Section(f"The signal {signal.name}", blocks)
+
+    def _search_section(self) -> Section:
+        blocks: list[Block] = []
+        for state in self.searched:
+            front = self._front(state)
+            table = front.csv()
+            shown = _best_of_sizes(table)
+            blocks.append(
+                Table(
+                    front.screen().iloc[shown].reset_index(drop=True),
+                    title=f"candidates for {state}'",
+                    bold=np.flatnonzero(table["selected"].to_numpy()[shown]).tolist(),
+                    note="Of every size the best three by score, then by R2 of the derivative; "
+                    "score: largest deviation of a free run, in units of its bound; one lives.",
+                )
+            )
+        return Section("Search", [*blocks, *pictures(["front"])])
+
+    def _living_section(self) -> Section:
+        model, clock = self.model, self.states.clock
+        blocks: list[Block] = [Text(self.found.note)] if self.found.note else []
+        for state in model.states:
+            exact = "known" if state not in self.searched else ""
+            blocks.append(shown_equation(model, state, clock, lead=exact))
+        blocks += interval_table(model, self.searched, clock)
+        where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
+        rows = ResultTable({"model": self}, FREE_RUN).upright("")
+        blocks.append(Table(rows, title=f"run freely from one sample over the {where}"))
+        blocks += [Text(text, warning=warn) for text, warn in self._stability()]
+        return Section("Living model", [*blocks, *pictures(["free_run", "plane", "waveform"])])
+
+    def _stability(self) -> list[tuple[str, bool]]:
+        if self.cycle is None:
+            return [("the model has no cycle near its run", True)]
+        text = (
+            f"cycle {self.cycle.stability}: of a departure {self.multiplier:.3g} is left after a "
+            f"period (Floquet multiplier); {100.0 * self.share:.0f} % of starts from 0.3 to 3 "
+            "times the cycle's states reach it"
+        )
+        return [(text, self.run.verdict is not Verdict.LIVES)]
+
+    @property
+    def multiplier(self) -> float:
+        """The largest modulus beside the flow's own."""
+        if self.cycle is None:
+            return float("nan")
+        return float(np.abs(self.cycle.multipliers[1:]).max())
+
+    def n_terms(self, *, known: bool) -> int:
+        states = [s for s in self.model.states if (s not in self.searched) == known]
+        return sum(len(self.model.terms(state)) for state in states)
+
+    def summary(self) -> dict[str, Any]:
+        name = self.signal.name
+        return {
+            "data": data_summary(self.states),
+            "signal": {
+                "name": name,
+                "unit": self.signal.unit,
+                "done": list(self.signal.done),
+                "embedding": type(self.chosen.embedding).__name__,
+                "reason": self.chosen.reason,
+                "noise_std": self.chosen.embedded.noise_std,
+                "period_s": self.signal.period_s,
+            },
+            "model": model_summary(self.model) | {"intervals": intervals(self.model)},
+            "living": facts(self, FREE_RUN),
+        }
+
+    def headline(self) -> Mapping[str, float]:
+        return ResultTable([self], FREE_RUN).headline()
+
+
+COMPARED = View.JSON | View.HEADLINE
+FREE_RUN: Metrics[Outcome] = [
+    Metric("verdict", lambda o: o.run.text, View.JSON | View.SCREEN),
+    Metric("note", lambda o: o.found.note, View.JSON),
+    Metric("held_out", lambda o: o.is_held_out, View.JSON),
+    Metric("frequency of the data", lambda o: o.data_frequency, View.SCREEN),
+    Metric("f_error", lambda o: o.run.f_error, View.ALL, "frequency error", percent(2)),
+    Metric("amplitude_ratio", lambda o: o.run.amplitude_ratio[o.signal.name], COMPARED),
+    Metric(
+        "amplitude_error", lambda o: {o.signal.name: o.run.amplitude_ratio[o.signal.name] - 1.0},
+        View.SCREEN, "amplitude error of {}", percent(2),
+    ),
+    Metric("waveform_error", lambda o: o.run.waveform_error[o.signal.name], COMPARED),
+    Metric(
+        "waveform", lambda o: {o.signal.name: o.run.waveform_error[o.signal.name]},
+        View.SCREEN, "waveform error of {}", "{:.3f} std",
+    ),
+    Metric("n_terms", lambda o: o.n_terms(known=False), View.HEADLINE),
+    Metric("n_terms_searched", lambda o: o.n_terms(known=False), View.JSON),
+    Metric("n_terms_known", lambda o: o.n_terms(known=True), View.JSON),
+    Metric(
+        "terms", lambda o: f"{o.n_terms(known=False)} searched, {o.n_terms(known=True)} known",
+        View.SCREEN,
+    ),
+    Metric("stability", lambda o: o.cycle.stability if o.cycle else None, View.JSON),
+    Metric("multiplier", lambda o: o.multiplier, COMPARED),
+    Metric("share_reaching", lambda o: o.share, COMPARED),
+]  # fmt: skip
+CANDIDATES: Metrics[Row] = [
+    Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
+    Metric("r2", lambda row: row.candidate.r2_train, View.SHOWN, "R2", "{:.3f}"),
+    Metric("score", lambda row: row.score, View.SHOWN, format="{:.3f}"),
+    Metric("selected", lambda row: row.is_selected),
+    Metric("text", lambda row: equation_text(row.candidate.equation, row.terms)),
+    Metric("model", lambda row: _marked(row), View.SCREEN),
+]
+
+
+def _marked(row: Row) -> Equation:
+    mark = "  <- selected" if row.is_selected else ""
+    return Equation(row.candidate.equation, row.terms, mark=mark)
+
+
+def _best_of_sizes(table: pd.DataFrame, most: int = 3) -> list[int]:
+    """Rows of the best of every size: by score, then as they stand."""
+    order = table.sort_values(["terms", "score"], kind="stable")
+    return sorted(order.groupby("terms").head(most).index.tolist())
+
+
+def paths_off(model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
+    """Runs from states off the cycle: nearer to its middle, and farther."""
+    middle = cycle.states.mean(axis=0)
+    t = np.linspace(0.0, N_PERIODS * cycle.period_s, round(100 * N_PERIODS))
+    places = np.arange(len(STARTS)) * len(cycle.states) // len(STARTS)
+    found = []
+    for state, factor in zip(cycle.states[places], STARTS, strict=True):
+        start = middle + factor * (state - middle)
+        start[0] = _inside(start[0], cycle.states[:, 0])
+        found.append(model.simulate(t, start, blow_up=30.0))
+    return found
+
+
+def _inside(value: float, states: np.ndarray) -> float:
+    """A start with the sign that the signal has on the cycle, if it has one."""
+    return max(value, 0.5 * float(states.min())) if (states > 0.0).all() else value

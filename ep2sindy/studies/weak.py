@@ -1,26 +1,38 @@
-"""Known terms in the weak form, with windows of several lengths: `+exp=weak`."""
+"""Known terms in the weak form, with windows of several lengths: `+exp=weak`.
+
+The forms and their fits `+exp=weak_windows` takes as well.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.equations import equation_text
+from ep2sindy.discovery.choice import assemble_model, reweighted
+from ep2sindy.library.library import Library
+from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures, places
+from ep2sindy.model.scores import r2
+from ep2sindy.regression.rows import Formulation, RegressionRows
+from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
+from ep2sindy.regression.weak import Weak
+from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.report.run import Run
+from ep2sindy.runtime.progress import SILENT, Progress, counted
+from ep2sindy.search.front import Candidate, fit_support
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.kinds import Coefficients, Count, Counts, Deferred, PositiveOrAll
-from ep2sindy.studies.known_terms import Terms, terms_of
-from ep2sindy.studies.shown import (
+from ep2sindy.studies.fits import Terms, equation_texts, terms_of
+from ep2sindy.studies.source import Source, data_summary
+from ep2sindy.studies.study import Coefficients, Count, Counts, Deferred, PositiveOrAll
+from ep2sindy.studies.views import (
     INTEGRATED,
-    Shown,
+    PlotRange,
     coefficients,
     equation_sections,
     intervals,
@@ -28,8 +40,6 @@ from ep2sindy.studies.shown import (
     rollout_tables,
     run_figures,
 )
-from ep2sindy.studies.source import Source, data_summary
-from ep2sindy.studies.weak_forms import Fitted, fit_settings, settings_of
 
 FIGURES = ("trajectories", "phase", "derivatives", "spectra")
 INTERVALS = (
@@ -55,7 +65,7 @@ class Study:
     n_windows: Count
     n_points: Counts
     rollout_s: PositiveOrAll
-    figures: Shown
+    figures: PlotRange
     thesis: Coefficients = field(default_factory=dict)
 
     def compute(self, run: Run) -> Outcome:
@@ -84,6 +94,194 @@ class Study:
         return Outcome(self, data, f_data_Hz, fitted)
 
 
+@dataclass(frozen=True)
+class Setting:
+    """A form of the regression; weighted: its fit follows the noise of the samples to the rows."""
+
+    formulation: Formulation
+    weighted: bool = False
+
+    def __post_init__(self) -> None:
+        can = isinstance(self.formulation, Weak) and self.formulation.errors_in_variables
+        if self.weighted and not can:
+            raise ValueError(
+                "a weighted fit needs the formulation Weak with errors_in_variables: "
+                f"{self.formulation} came"
+            )
+
+    @property
+    def windows(self) -> WindowFunctions | None:
+        """The test functions of this form, if it is a weak one."""
+        return self.formulation.test_functions if isinstance(self.formulation, Weak) else None
+
+    @property
+    def boxes(self) -> Boxes | None:
+        """The random windows of this form, if it has any."""
+        return self.windows if isinstance(self.windows, Boxes) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What one setting makes of a trajectory.
+
+    r2: by state, on the setting's own rows, which differ from setting to setting.
+    half_width: by state, in samples, for smooth windows; empty for others.
+    f_error: dominant frequency of the first state against the data's, minus one; NaN where the
+    integrated model diverges or dies out.
+    """
+
+    setting: Setting
+    r2: Mapping[str, float]
+    half_width: Mapping[str, int]
+    integrated: FreeRun
+    f_error: float
+
+    def by_state(self, value: Callable[[str], Any]) -> dict[str, Any]:
+        return {state: value(state) for state in self.integrated.model.states}
+
+    def window_steps(self, state: str) -> int:
+        """Steps in one window, from end to end; 0 without windows."""
+        boxes = self.setting.boxes
+        return boxes.n_points - 1 if boxes else 2 * self.half_width.get(state, 0)
+
+
+def settings_of(
+    formulation: Formulation,
+    boxes: Deferred,
+    automatic: Formulation,
+    *,
+    n_windows: Sequence[int],
+    n_points: Sequence[int],
+) -> dict[str, Setting]:
+    """The differential form, random windows of every number and length, and smooth windows.
+
+    boxes: the form with random windows, whose number and length are null.
+    """
+    chosen = {"n_windows": n_windows[0], "n_points": n_points[0]}
+    for key in chosen:
+        given = boxes.settings.get("test_functions", {}).get(key)
+        if given is not None:
+            raise ValueError(
+                f"boxes.test_functions.{key} is what {key} says: {given!r} came; set {key} alone"
+            )
+    form = boxes.changed({f"test_functions.{key}": value for key, value in chosen.items()}).build()
+    return {
+        "differential": Setting(formulation),
+        **boxes_grid(form, n_windows=n_windows, n_points=n_points),
+        "automatic": Setting(automatic),
+        "automatic_weighted": Setting(automatic, weighted=True),
+    }
+
+
+def boxes_grid(
+    form: Weak, *, n_windows: Sequence[int], n_points: Sequence[int]
+) -> dict[str, Setting]:
+    """One form with every number and length of windows, named by those that vary."""
+    grid = {}
+    for windows in n_windows:
+        for points in n_points:
+            varying = [("n_windows", windows, n_windows), ("n_points", points, n_points)]
+            name = "_".join(f"{key}_{value}" for key, value, all in varying if len(all) > 1)
+            boxes = Boxes(n_windows=windows, n_points=points)
+            grid[name or f"n_points_{points}"] = Setting(replace(form, test_functions=boxes))
+    return grid
+
+
+def check_windows(settings: Mapping[str, Setting], n_samples: int) -> None:
+    """Raise ValueError for boxes that are longer than a trajectory of `n_samples`."""
+    longest = max((s.boxes.n_points for s in settings.values() if s.boxes), default=0)
+    if longest > n_samples:
+        raise ValueError(
+            f"windows must fit the data: n_points={longest} was asked of {n_samples} samples; "
+            "lower n_points or use more data"
+        )
+
+
+def fitted_terms(
+    trajectories: Sequence[Trajectory],
+    library: Library,
+    terms: Mapping[str, Sequence[str]],
+    setting: Setting,
+    *,
+    rng: np.random.Generator,
+) -> dict[str, tuple[Candidate, RegressionRows]]:
+    """Fit given terms, state by state, and keep the rows that they were fitted to.
+
+    Raises ValueError as the form's `assemble` and `fit_support` do.
+    """
+    problems = setting.formulation.assemble(trajectories, library, rng=rng)
+    found = {}
+    for problem in problems:
+        for state in problem.equations:
+            candidate = fit_support(problem, state, terms[state])
+            if setting.weighted:
+                candidate = reweighted(problem, candidate)
+            found[state] = (candidate, problem)
+    return found
+
+
+def fit_settings(
+    run: Trajectory,
+    library: Library,
+    terms: Mapping[str, Sequence[str]],
+    settings: Mapping[str, Setting],
+    *,
+    f_data_Hz: float,
+    rollout_s: float | None,
+    rng: np.random.Generator,
+    progress: Progress = SILENT,
+) -> dict[str, Fitted]:
+    """Fit the same terms in every setting and integrate each model from the first sample.
+
+    terms: state -> its terms. f_data_Hz: the frequency that models are held against. rollout_s:
+    how far to integrate; None, or more than there is, means to the data's end.
+    Each setting draws its windows from a stream of its own.
+    Raises ValueError, before any fit, for windows longer than the data.
+    """
+    check_windows(settings, run.n_samples)
+    widths = {name: _half_widths(run, setting.windows, rng) for name, setting in settings.items()}
+    n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
+    results = {}
+    pairs = list(zip(settings.items(), rng.spawn(len(settings)), strict=True))
+    for (name, setting), stream in counted(progress, pairs, "setting", "fits and free runs"):
+        found = fitted_terms([run], library, terms, setting, rng=stream)
+        model = assemble_model(
+            library,
+            [candidate for candidate, _ in found.values()],
+            units=run.units,
+            provenance={"formulation": repr(setting.formulation), "trajectories": run.label},
+        )
+        integrated = free_run(model, run, n_samples=n_samples)
+        results[name] = Fitted(
+            setting=setting,
+            r2={state: _r2_own_rows(*pair) for state, pair in found.items()},
+            half_width=widths[name],
+            integrated=integrated,
+            f_error=integrated.frequency_Hz[run.state_names[0]] / f_data_Hz - 1.0,
+        )
+    return results
+
+
+def _half_widths(
+    run: Trajectory, functions: WindowFunctions | None, rng: np.random.Generator
+) -> dict[str, int]:
+    """Of smooth windows, by state."""
+    if not isinstance(functions, Bumps):
+        return {}
+    windows = [functions.windows(run.t, x, rng=rng) for x in run.states.T]
+    return {
+        state: int(w.last[0] - w.first[0]) // 2
+        for state, w in zip(run.state_names, windows, strict=True)
+    }
+
+
+def _r2_own_rows(candidate: Candidate, problem: RegressionRows) -> float:
+    columns = [problem.library.index(name) for name in candidate.terms]
+    prediction = candidate.coef[None] @ problem.theta[:, columns].T
+    truth = problem.target[:, problem.equations.index(candidate.equation)]
+    return float(r2(truth=truth, prediction=prediction)[0])
+
+
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """What every setting makes of the data; f_data_Hz: dominant frequency of the first state."""
@@ -105,7 +303,7 @@ class Outcome:
         models = {name: fitted.integrated for name, fitted in self.fitted.items()}
         return {
             **rollout_tables(self.data, models),
-            "settings": settings_table(self.fitted, self.data.dt_s),
+            "settings": self._settings(),
             "coefficients": coefficients(self.models(), heading="setting"),
         }
 
@@ -126,24 +324,16 @@ class Outcome:
             Section("Integrated", [self._table(), *pictures(FIGURES)]),
         ]
 
+    def _settings(self) -> pd.DataFrame:
+        """One row per setting and state: windows, equation, R2, and how the model runs."""
+        rows = ResultTable(self.fitted, self._metrics()).csv("setting", by_state=True)
+        return rows.astype({"n_points": "Int64", "half_width": "Int64"})
+
     def _table(self) -> Table:
-        rows = []
-        for name, fitted in self.labelled.items():
-            integrated, states = fitted.integrated, self.data.state_names
-            f_text = self.data.clock.frequency_text(integrated.frequency_Hz[states[0]])
-            steady = not np.isnan(fitted.f_error)
-            of_model = {
-                "f": f"{f_text} ({100 * fitted.f_error:+.0f} %)" if steady else "-",
-                "nrmse": places(integrated.nrmse, 2),
-                "verdict": integrated.text,
-            }
-            for k, state in enumerate(states):
-                windows, score = self._windows(fitted, state), f"{fitted.r2[state]:.3f}"
-                row = {"setting": "" if k else name, "state": state, **windows, "R2": score}
-                rows.append(row if k else row | of_model)
+        rows = ResultTable(self.labelled, self._metrics()).screen("setting", by_state=True)
         n = len(self.data.state_names)
         return Table(
-            pd.DataFrame(rows).fillna(""),
+            rows,
             title=f"Models {INTEGRATED}",
             breaks=range(n - 1, len(rows), n),
             note=f"The data's first state has {self.data.clock.frequency_text(self.f_data_Hz)}. "
@@ -151,31 +341,61 @@ class Outcome:
             "settings.",
         )
 
-    def _windows(self, fitted: Fitted, state: str) -> dict[str, str]:
-        """Samples, length and periods of the first state in one window, from end to end."""
-        boxes = fitted.setting.boxes
-        steps = boxes.n_points - 1 if boxes else 2 * fitted.half_width.get(state, 0)
-        if not steps:
-            return dict.fromkeys(("samples", "length", "periods"), "-")
-        length_s = steps * self.data.dt_s
-        return {
-            "samples": str(steps + 1),
-            "length": self.data.clock.duration_text(length_s),
-            "periods": f"{length_s * self.f_data_Hz:.2f}",
-        }
+    def _metrics(self) -> Metrics[Fitted]:
+        """Samples, length and periods of the first state are those of one window."""
+        clock, dt_s = self.data.clock, self.data.dt_s
+
+        def frequency(fitted: Fitted) -> str:
+            text = clock.frequency_text(first_frequency_Hz(fitted))
+            return f"{text} ({100 * fitted.f_error:+.0f} %)" if np.isfinite(fitted.f_error) else "-"
+
+        return [
+            Metric("n_points", lambda f: f.setting.boxes and f.setting.boxes.n_points, View.CSV),
+            Metric("half_width", lambda f: f.by_state(f.half_width.get), View.CSV),
+            Metric(
+                "half_width_s",
+                lambda f: f.by_state(lambda s: dt_s * f.half_width[s] if f.half_width else None),
+                View.CSV,
+            ),
+            Metric("text", lambda f: equation_texts(f.integrated.model), View.CSV),
+            Metric(
+                "samples", lambda f: f.by_state(f.window_steps), View.SCREEN,
+                format=lambda n: str(n + 1) if n else "-",
+            ),
+            Metric(
+                "length", lambda f: f.by_state(f.window_steps), View.SCREEN,
+                format=lambda n: clock.duration_text(n * dt_s) if n else "-",
+            ),
+            Metric(
+                "periods", lambda f: f.by_state(f.window_steps), View.SCREEN,
+                format=lambda n: f"{n * dt_s * self.f_data_Hz:.2f}" if n else "-",
+            ),
+            Metric("r2", lambda f: f.r2, View.ALL, "R2", "{:.3f}"),
+            Metric("f", frequency, View.SCREEN),
+            Metric("f_Hz", lambda f: f.integrated.frequency_Hz, View.CSV),
+            Metric("f_kHz", lambda f: 1e-3 * first_frequency_Hz(f), View.JSON),
+            Metric("f_error", lambda f: f.f_error, View.FILES | View.HEADLINE),
+            Metric("nrmse", lambda f: f.integrated.nrmse, View.ALL, format="{:.2f}"),
+            Metric("verdict", lambda f: f.integrated.text, View.SHOWN),
+        ]  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
-        dt_s = self.data.dt_s
-        settings = {name: _summary(fitted, dt_s) for name, fitted in self.fitted.items()}
+        metrics, dt_s = self._metrics(), self.data.dt_s
+        settings = {
+            name: model_summary(fitted.integrated.model)
+            | _windows_summary(fitted, dt_s)
+            | facts(fitted, metrics)
+            for name, fitted in self.fitted.items()
+        }
         return {"data": data_summary(self.data), "settings": settings}
 
     def headline(self) -> dict[str, float]:
-        scalars = {"data/f_kHz": 1e-3 * self.f_data_Hz}
-        for name, fitted in self.fitted.items():
-            scalars[f"{name}/f_error"] = fitted.f_error
-            scalars[f"{name}/nrmse"] = fitted.integrated.nrmse
-            scalars |= {f"{name}/{state}/r2": value for state, value in fitted.r2.items()}
-        return scalars
+        models = ResultTable(self.fitted, self._metrics()).headline()
+        return {"data/f_kHz": 1e-3 * self.f_data_Hz} | models
+
+
+def first_frequency_Hz(fitted: Fitted) -> float:
+    return fitted.integrated.frequency_Hz[fitted.integrated.model.states[0]]
 
 
 def _label(name: str, fitted: Fitted) -> str:
@@ -184,50 +404,16 @@ def _label(name: str, fitted: Fitted) -> str:
     return f"{boxes.n_points} points" if boxes else name.replace("_", ", ")
 
 
-def settings_table(fitted: Mapping[str, Fitted], dt_s: float) -> pd.DataFrame:
-    """One row per setting and state: windows, equation, R2, and how the model runs."""
-    rows = []
-    for name, each in fitted.items():
-        integrated, boxes = each.integrated, each.setting.boxes
-        for state in integrated.model.states:
-            half_width = each.half_width.get(state)
-            rows.append(
-                {
-                    "setting": name,
-                    "state": state,
-                    "n_points": boxes.n_points if boxes else None,
-                    "half_width": half_width,
-                    "half_width_s": None if half_width is None else half_width * dt_s,
-                    "text": equation_text(state, integrated.model.terms(state)),
-                    "r2": each.r2[state],
-                    "f_Hz": integrated.frequency_Hz[state],
-                    "f_error": each.f_error,
-                    "nrmse": integrated.nrmse,
-                    "verdict": integrated.text,
-                }
-            )
-    return pd.DataFrame(rows).astype({"n_points": "Int64", "half_width": "Int64"})
-
-
-def _summary(fitted: Fitted, dt_s: float) -> dict[str, Any]:
-    integrated = fitted.integrated
-    model, boxes = integrated.model, fitted.setting.boxes
-    windows: dict[str, Any] = {}
-    if boxes:
-        windows = {"n_points": boxes.n_points, "n_windows": boxes.n_windows}
+def _windows_summary(fitted: Fitted, dt_s: float) -> dict[str, Any]:
+    """Windows of those kinds that have any, and intervals where they are known."""
+    found: dict[str, Any] = {}
+    if boxes := fitted.setting.boxes:
+        found = {"n_points": boxes.n_points, "n_windows": boxes.n_windows}
     if fitted.half_width:
-        windows = {
+        found = {
             "half_width": dict(fitted.half_width),
             "half_width_s": {state: n * dt_s for state, n in fitted.half_width.items()},
         }
-    if (known := intervals(model)) is not None:
-        windows["intervals"] = known
-    return {
-        **model_summary(model),
-        **windows,
-        "r2": dict(fitted.r2),
-        "f_kHz": 1e-3 * integrated.frequency_Hz[model.states[0]],
-        "f_error": fitted.f_error,
-        "nrmse": integrated.nrmse,
-        "verdict": integrated.text,
-    }
+    if (known := intervals(fitted.integrated.model)) is not None:
+        found["intervals"] = known
+    return found

@@ -18,13 +18,13 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.library.library import Library, named_terms
-from ep2sindy.machine.parallel import Workers, rows_in_order
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
-from ep2sindy.studies.kinds import Count, Counts, Deferred, Levels, Positive
-from ep2sindy.studies.weak_forms import Setting, check_windows, fitted_terms, settings_of
+from ep2sindy.runtime.parallel import Workers, rows_in_order
+from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Positive
+from ep2sindy.studies.weak import Setting, check_windows, fitted_terms, settings_of
 from ep2sindy.synthetic.systems import System
 
 FIGURE = (

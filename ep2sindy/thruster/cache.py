@@ -12,15 +12,15 @@ import xarray as xr
 from tqdm import tqdm
 
 from ep2sindy.data.netcdf import write_netcdf
-from ep2sindy.machine.files import fingerprint, sweep, writing
-from ep2sindy.machine.progress import Progress
-from ep2sindy.machine.screen import in_line, on_screen
+from ep2sindy.runtime.files import fingerprint, sweep, writing
+from ep2sindy.runtime.progress import Progress
+from ep2sindy.runtime.screen import in_line, on_screen
 from ep2sindy.thruster.axial.model import CFL
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.simulate import as_start, simulate_as
 from ep2sindy.thruster.axial.starts import Start
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.seal import sealed, unsealed
+from ep2sindy.trust.checksum import verified, with_checksum
 
 
 def simulate_cached(
@@ -74,7 +74,7 @@ def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
     path = stem.with_name(f"{stem.name}_{key}.nc")
     if path.exists():
         try:
-            return unsealed(read(path), parameters)
+            return verified(read(path), parameters)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             with on_screen(sys.stdout):
                 tqdm.write(in_line(f"{path} cannot be read ({error}); simulating it again"))
@@ -84,7 +84,7 @@ def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
         with TemporaryFile(dir=path.parent):
             pass
     field = run()
-    write(sealed(field, parameters), path)
+    write(with_checksum(field, parameters), path)
     return field
 
 

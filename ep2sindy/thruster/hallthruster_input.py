@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ep2sindy.machine.files import read_json
+from ep2sindy.runtime.files import read_json
 from ep2sindy.thruster.anode import AnodeSheath, FixedAnode
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.hallthruster_models import conduction_of, field_of, transport_of, wall_of

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import xarray as xr
 
-from ep2sindy.machine.progress import Progress
+from ep2sindy.runtime.progress import Progress
 from ep2sindy.thruster.cache import simulate_cached
 from ep2sindy.thruster.hallthruster_input import read_hallthruster_input
 

@@ -26,7 +26,7 @@ LIMIT_S, MEMORY = 600.0, 3 * 2**30  # of seconds on a machine that does other th
 CASES: Mapping[str, Case] = {**crafted_configs.cases(), **crafted_files.cases()}
 
 # Processes that the package and its libraries start themselves, whatever they are given.
-OURS = ("rev-parse", "status", "ep2sindy.data.readers.probe", "uname", "fc-list")
+OURS = ("rev-parse", "status", "ep2sindy.trust.probe", "uname", "fc-list")
 RUNS = {"os.system", "os.exec", "os.posix_spawn", "os.startfile", "pty.spawn"}
 TALKS = {"socket.connect", "socket.bind", "socket.getaddrinfo", "socket.sendto"}
 CHANGES = {

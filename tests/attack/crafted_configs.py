@@ -62,7 +62,7 @@ def _called() -> dict[str, Case]:
         "by _partial_": "prepare: [{_target_: ep2sindy.crop, _partial_: true}]",
         "by _convert_": "prepare: [{_target_: ep2sindy.crop, _convert_: all}]",
         "of Hydra": "prepare: [{_target_: hydra.utils.instantiate, a: {_target_: os.abort}}]",
-        "of an inner module": "prepare: [{_target_: ep2sindy.machine.files.write_text}]",
+        "of an inner module": "prepare: [{_target_: ep2sindy.runtime.files.write_text}]",
         "of a writer": "prepare: [{_target_: ep2sindy.write_field, path: x.nc}]",
         "of a method": "prepare: [{_target_: ep2sindy.SparseModel.load, path: a.csv}]",
         "of an attribute": "prepare: [{_target_: ep2sindy.crop.__globals__}]",

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
-from ep2sindy.machine.threads import NUMBERS
+from ep2sindy.runtime.threads import NUMBERS
 from tests.attack.left import EARLIER, contents, finished
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -144,7 +144,7 @@ def _undisturbed(name: str, place: Path) -> tuple[float, dict[str, str]]:
 
 def _code(name: str) -> str:
     """What a reference depends on."""
-    from ep2sindy.machine.files import fingerprint
+    from ep2sindy.runtime.files import fingerprint
 
     configs = [path.read_text("utf-8") for path in sorted((ROOT / "conf").rglob("*.yaml"))]
     return fingerprint(json.dumps([RUNS[name], configs]), sources=ROOT / "ep2sindy")

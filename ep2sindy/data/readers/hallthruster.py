@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.readers.source import Reader, Source, leaves
-from ep2sindy.machine.files import read_json
+from ep2sindy.runtime.files import read_json
 
 UNITS = {
     "t": "s", "z": "m", "grid": "m", "cell_centers": "m", "n": "m^-3", "ni": "m^-3", "nn": "m^-3",

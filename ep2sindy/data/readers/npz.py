@@ -8,8 +8,8 @@ from zipfile import ZipFile
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.limits import check_declared
 from ep2sindy.data.readers.source import Reader, Source
+from ep2sindy.trust.limits import check_declared
 
 
 def read_npz(path: Path) -> Source:

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ep2sindy.data.readers.csv import CSV
-from ep2sindy.data.readers.guard import look_through_first
 from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
 from ep2sindy.data.readers.hdf5 import HDF5
-from ep2sindy.data.readers.limits import check_kind
 from ep2sindy.data.readers.matlab import MATLAB
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.npz import NPZ
 from ep2sindy.data.readers.source import Reader, Source, damage_named, look_at
 from ep2sindy.data.readers.zarr import ZARR
+from ep2sindy.trust.guard import look_through_first
+from ep2sindy.trust.limits import check_kind
 
 # In any order: no two of them claim a file equally.
 READERS = (NETCDF, HDF5, MATLAB, NPZ, CSV, HALLTHRUSTER, ZARR)

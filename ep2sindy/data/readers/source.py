@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.fields import channel_length_m
-from ep2sindy.data.readers.limits import ALWAYS, check_declared
+from ep2sindy.trust.limits import ALWAYS, check_declared
 
 # Time stays a number, whatever its attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}

@@ -10,7 +10,7 @@ from typing import Any
 import xarray as xr
 
 from ep2sindy.data.readers.source import Reader, Source, dataset_source
-from ep2sindy.machine.files import read_json
+from ep2sindy.runtime.files import read_json
 
 # Compressors and filters that turn bytes into bytes or numbers. Others may make objects of them,
 # which can run code (pickle), and a codec that is registered by name may do anything.

@@ -12,9 +12,8 @@ import torch
 from torch import nn
 from torchdiffeq import odeint
 
-from ep2sindy.refinement.ode import ODE, Drive
+from ep2sindy.refinement.ode import ODE, Drive, RungeKutta
 from ep2sindy.refinement.problem import Fit, Iteration, Problem, joined, residual_weights, single
-from ep2sindy.refinement.steps import RungeKutta
 
 Optimizer = Callable[[list[nn.Parameter]], torch.optim.Optimizer]
 

@@ -9,8 +9,8 @@ import torch
 from scipy.optimize import least_squares
 from torchdiffeq import odeint
 
+from ep2sindy.refinement.ode import RungeKutta
 from ep2sindy.refinement.problem import Fit, Iteration, Problem, joined, residual_weights, single
-from ep2sindy.refinement.steps import RungeKutta
 
 
 @dataclass(frozen=True)

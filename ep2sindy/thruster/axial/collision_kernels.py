@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial.state_kernels import FAST, ONE
 from ep2sindy.thruster.closures import (
     COULOMB,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial.collision_kernels import collisions
 from ep2sindy.thruster.axial.state_kernels import (
     CURRENT,

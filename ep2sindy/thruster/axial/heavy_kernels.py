@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial.electron_kernels import COLDEST_EV, sheath_drop
 from ep2sindy.thruster.axial.state_kernels import (
     BEAM,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
 from ep2sindy.thruster.axial.heavy_kernels import add_scaled, heavy_step
 from ep2sindy.thruster.axial.state_kernels import (

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ep2sindy.machine.memory import check_memory
 from ep2sindy.thruster.axial.model import CFL
+from ep2sindy.trust.memory import check_memory
 
 MIN_STEPS = 16  # fewer samples leave nothing to judge an oscillation by
 

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.machine.progress import Advance, Progress, as_progress
+from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial import kernels
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
 from ep2sindy.thruster.axial.grid import cell_faces

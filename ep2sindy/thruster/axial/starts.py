@@ -13,12 +13,12 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.data.readers.guard import look_through_first
 from ep2sindy.data.readers.source import damage_named
-from ep2sindy.machine.files import read_json
+from ep2sindy.runtime.files import read_json
 from ep2sindy.thruster.axial.state_kernels import CURRENT, SERIES_SUMS, Model, State
 from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
+from ep2sindy.trust.guard import look_through_first
 
 Profile = Float[np.ndarray, " cells"]
 # What a run leaves for another to go on from: arrays of its cells, at its last instant.

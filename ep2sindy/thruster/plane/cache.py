@@ -8,7 +8,7 @@ from typing import Any
 
 import xarray as xr
 
-from ep2sindy.machine.progress import Progress
+from ep2sindy.runtime.progress import Progress
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.cache import kept
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster

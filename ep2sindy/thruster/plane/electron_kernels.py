@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 from ep2sindy.thruster.plane.state_kernels import (
     COULOMB,

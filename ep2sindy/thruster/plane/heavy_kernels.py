@@ -5,7 +5,7 @@ Inner loops run along r, write one array each and call nothing: so they vectoris
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.thruster.plane.state_kernels import FAST, ONE
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ep2sindy.machine.compilation import compiled
+from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.plane.electron_kernels import electron_step
 from ep2sindy.thruster.plane.heavy_kernels import heavy_step, velocities
 from ep2sindy.thruster.plane.state_kernels import FAST, ONE, Columns, Fluxes, Gas, Work

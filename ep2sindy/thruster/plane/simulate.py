@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.machine.progress import Advance, Progress, as_progress
+from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plane.balance import diagnose

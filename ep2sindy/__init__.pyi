@@ -1,0 +1,97 @@
+# How to read and extend this file: ep2sindy/_stubs.py.
+__version__: str
+
+# Data
+from ep2sindy.data.trajectory import Trajectory as Trajectory
+from ep2sindy.data.open import open_field as open_field  # for configs
+from ep2sindy.data.inspection import inspect_file as inspect_file
+from ep2sindy.data.open import read_field as read_field  # for configs
+from ep2sindy.data.open import write_field as write_field
+from ep2sindy.data.zones import zone_average as zone_average
+from ep2sindy.data.zones import point_samples as point_samples
+from ep2sindy.data.extent import Zone as Zone  # for configs
+from ep2sindy.data.mapping import Variable as Variable  # for configs
+from ep2sindy.library.units import Clock as Clock
+
+# Libraries
+from ep2sindy.library.library import Library as Library
+from ep2sindy.library.library import polynomial as polynomial
+from ep2sindy.library.library import named_terms as named_terms
+
+# Discover
+from ep2sindy.discovery.discover import discover as discover
+from ep2sindy.discovery.discover import Discovery as Discovery
+from ep2sindy.discovery.recipe import Recipe as Recipe  # for configs
+from ep2sindy.discovery.shared_support import discover_jointly as discover_jointly
+from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
+from ep2sindy.discovery.pointwise import pointwise as pointwise
+from ep2sindy.estimation.estimate import estimate as estimate
+
+# Searches
+from ep2sindy.estimation.solver import Joint as Joint  # for configs
+from ep2sindy.search.searches import BestSubset as BestSubset  # for configs
+from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso  # for configs
+from ep2sindy.search.searches import STLSQ as STLSQ  # for configs
+from ep2sindy.search.bootstraps import Bootstraps as Bootstraps  # for configs
+from ep2sindy.search.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
+
+# Regressions
+from ep2sindy.regression.differential import Differential as Differential  # for configs
+from ep2sindy.regression.weak import Weak as Weak  # for configs
+from ep2sindy.regression.weak import WeightedWeak as WeightedWeak  # for configs
+from ep2sindy.regression.test_functions import Bumps as Bumps  # for configs
+from ep2sindy.regression.test_functions import Boxes as Boxes  # for configs
+from ep2sindy.regression.splits import RandomSplit as RandomSplit  # for configs
+from ep2sindy.regression.splits import BlockSplit as BlockSplit  # for configs
+
+# Selection
+from ep2sindy.selection.criteria import EBIC as EBIC  # for configs
+from ep2sindy.selection.criteria import AICc as AICc  # for configs
+from ep2sindy.selection.criteria import Knee as Knee  # for configs
+from ep2sindy.selection.criteria import Evidence as Evidence  # for configs
+from ep2sindy.selection.refined import RefinedScore as RefinedScore  # for configs
+from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore  # for configs
+from ep2sindy.model.likeness import FreeRunBounds as FreeRunBounds  # for configs
+
+# Models
+from ep2sindy.model.model import SparseModel as SparseModel
+from ep2sindy.model.free_run import FreeRun as FreeRun
+from ep2sindy.model.free_run import free_run as free_run
+from ep2sindy.model.likeness import Verdict as Verdict
+from ep2sindy.model.stability import LimitCycle as LimitCycle
+from ep2sindy.model.stability import limit_cycle as limit_cycle
+from ep2sindy.model.stability import share_reaching as share_reaching
+from ep2sindy.model.model import coef_matrix as coef_matrix
+
+# Refinement
+from ep2sindy.refinement.refine import refine as refine
+from ep2sindy.refinement.refine import Refinement as Refinement
+from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
+from ep2sindy.constraints.relations import constraint as constraint
+from ep2sindy.constraints.relations import Constraint as Constraint
+
+# Systems
+from ep2sindy.synthetic.systems import lorenz as lorenz  # for configs
+from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra  # for configs
+from ep2sindy.synthetic.systems import pendulum as pendulum  # for configs
+
+# Your own code
+from ep2sindy.library.functions import register_function as register_function
+from ep2sindy.trust.user_code import for_configs as for_configs
+
+# Rooms
+from ep2sindy import data as data
+from ep2sindy import prepare as prepare
+from ep2sindy import library as library
+from ep2sindy import discovery as discovery
+from ep2sindy import regression as regression
+from ep2sindy import selection as selection
+from ep2sindy import model as model
+from ep2sindy import refinement as refinement
+from ep2sindy import signals as signals
+from ep2sindy import operating as operating
+from ep2sindy import thruster as thruster
+from ep2sindy import systems as systems
+from ep2sindy import parallel as parallel
+from ep2sindy import benchmark as benchmark
+from ep2sindy import warnings as warnings

@@ -1,0 +1,97 @@
+"""Names of version 0.2 that have moved, have another name, or are gone.
+
+All are written without `ep2sindy.` in front. Those that have moved are found in version 0.3 too,
+with a warning; then this table goes.
+"""
+
+from __future__ import annotations
+
+# Room -> names that stood in the package itself.
+MOVED = {
+    "benchmark": (
+        "PySINDyVariant PySINDyStlsq PySINDySsr PySINDyEnsemble PySINDyWeakForm PySINDySmoothing"
+    ),
+    "data": "Inspection ZoneAverage GridPoint",
+    "discovery": "Estimate PointSearch Kept Regimes",
+    "library": "equation_text",
+    "model": "Rollout r2",
+    "operating": """
+        OperatingRecord branches_of operating_fit OperatingFit Windows OperatingLaw control_law
+        ControlLaw law_map MapPoint Quantity TimeBootstrap Refining
+    """,
+    "parallel": "Serial Loky Dask Progress",
+    "prepare": """
+        crop decimate resample interpolate low_pass detrend derivative delay derive keep_where
+        radial_from_middle
+    """,
+    "refinement": """
+        MultipleShooting SingleShooting GradientDescent NelderMead RungeKutta HermiteSimpson ODE
+        cut_windows WindowBatch refine_many loss_against_window Corrected refine_tied
+        TiedRefinement
+    """,
+    "regression": """
+        Regression fit_support constrained_fit Relation relations_from_matrix
+        pareto_front ParetoFront Candidate pooled_supports STLSQRegressor
+    """,
+    "selection": "selected BIC LogKnee IntegralScore CrossValidation Stability",
+    "signals": """
+        KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing power_spectrum dominant_frequency
+        Cycle find_cycle Trace Rate LogRate Delays embed Embedded
+    """,
+    "systems": "System damped_oscillator van_der_pol three_regions",
+    "thruster": """
+        Thruster OperatingPoint OPERATING_POINTS simulate simulate_cached simulate_2d
+        simulate_2d_cached THRUSTER_2D OPERATING_POINT_2D ColdStart GuessedStart Restart SoftStart
+        zone_balance propellant read_propellant PropellantTable TabulatedRates XenonFits
+        ionization_rate MagneticField MagneticFieldTable read_magnetic_field AnomalousTransport
+        GaussianTransport MultiLogTransport ExponentialWall SheathWall wall_material AnodeSheath
+        FixedAnode HallThrusterInput read_hallthruster_input simulate_hallthruster_input
+        LANDMARK_POINT landmark_thruster
+    """,
+    "warnings": "MissingSamples DoubtfulUnit SlowSearch",
+}
+# Old name -> the name in the stubs that means the same.
+RENAMED = {
+    "Bounds": "FreeRunBounds",
+    "LeftOut": "operating.LeaveOneOut",
+    "TiedFit": "operating.LawFit",
+    "inspect": "inspect_file",
+    "left_out": "operating.leave_one_out",
+    "point": "point_samples",
+    "regimes": "discovery.find_regimes",
+    "tied_fit": "operating.fit_law",
+    "trace": "signals.from_one_signal",
+} | {name: f"{room}.{name}" for room, names in MOVED.items() for name in names.split()}
+# Old name -> what to write besides, where the new name is not called as the old one was.
+NOTES: dict[str, str] = {
+    "TiedFit": "with `law` and `tests` in place of `equations`",
+    "tied_fit": "which gives `law` and `tests` in place of `equations`",
+}
+# Old name -> what to use instead, where nothing does the same.
+GONE: dict[str, str] = {}
+
+
+def new_name(old: str) -> str | None:
+    """What a dotted name of version 0.2 is called today; None for all others."""
+    new = RENAMED.get(_bare(old))
+    return None if new is None else f"ep2sindy.{new}"
+
+
+def moved_text(old: str) -> str:
+    """What users of a name are told that `new_name` knows."""
+    note = NOTES.get(_bare(old), "")
+    return (
+        f"{old} is now {new_name(old)}{note and f', {note}'}; "
+        "the old name is understood until version 0.4"
+    )
+
+
+def gone_text(old: str) -> str:
+    """What users of a name are told that is gone; nothing for all others."""
+    instead = GONE.get(_bare(old))
+    return "" if instead is None else f"{old} is gone; {instead}"
+
+
+def _bare(name: str) -> str:
+    package, _, bare = name.partition(".")
+    return bare if package == "ep2sindy" else ""

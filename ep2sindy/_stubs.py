@@ -1,0 +1,150 @@
+"""The names that users see: read from the stubs (`.pyi`), loaded when they are first used.
+
+A stub stands beside the package and beside each of its rooms that has names for users. It is the
+one text for this loader, for type checkers and editors, for the reference of the documentation and
+for what configs may call. Of its lines are read
+
+    # Data                                        a heading, which is a page of the reference
+    from ep2sindy.data.open import write_field as write_field
+    from ep2sindy.data.open import open_field as open_field  # for configs
+
+and a config may call what is marked so and nothing else, for a config can come from anybody:
+values, readers and simulators are marked; what writes where it is told, or runs what it is given,
+must never be.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from os import path  # for pathlib takes as long as the rest of the import
+from typing import Any, NamedTuple
+
+PACKAGE = "ep2sindy"
+MARK = "# for configs"
+
+
+class Entry(NamedTuple):
+    """What a stub says of one name: the module that defines it, and its name there."""
+
+    module: str
+    name: str
+    heading: str
+    for_configs: bool
+
+    def load(self) -> Any:
+        return getattr(import_module(self.module), self.name)
+
+
+@cache
+def read_stub(module: str) -> dict[str, Entry]:
+    """Name -> what the stub of the package or of one of its rooms says of it, in its order."""
+    import ast  # here, for it takes longer than all else that `import ep2sindy` does
+
+    with open(_stub_file(module), encoding="utf-8") as file:
+        text = file.read()
+    lines = text.splitlines()
+    entries = {}
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.ImportFrom):
+            (alias,) = node.names  # one alone, for the mark is of the whole statement
+            assert node.module is not None
+            assert node.level == 0, f"write imports in full in the stub of {module}"
+            before = reversed(lines[: node.lineno])
+            heading = next((line[2:] for line in before if line.startswith("# ")), "")
+            marked = lines[(node.end_lineno or node.lineno) - 1].endswith(MARK)
+            name = alias.asname or alias.name
+            entries[name] = Entry(node.module, alias.name, heading, marked)
+    return entries
+
+
+def _stub_file(module: str) -> str:
+    place = path.join(path.dirname(path.dirname(__file__)), *module.split("."))
+    return path.join(place, "__init__.pyi") if path.isdir(place) else f"{place}.pyi"
+
+
+def rooms() -> list[str]:
+    """The package and its rooms that have names for users."""
+    own = [name for name, entry in read_stub(PACKAGE).items() if entry.module == PACKAGE]
+    return [PACKAGE, *(f"{PACKAGE}.{name}" for name in own)]
+
+
+@cache
+def dotted_names() -> dict[str, Entry]:
+    """All names, in full: `ep2sindy.EBIC`, `ep2sindy.prepare.crop`; but for the rooms."""
+    return {
+        f"{room}.{name}": entry
+        for room in rooms()
+        for name, entry in read_stub(room).items()
+        if entry.module != PACKAGE
+    }
+
+
+def place_of(kind: type) -> str | None:
+    """The name of a class in full, for users and configs; None for what is not theirs."""
+    defined = (kind.__module__, kind.__qualname__)
+    return next((name for name, e in dotted_names().items() if (e.module, e.name) == defined), None)
+
+
+def attach(module: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a module that has a stub beside it.
+
+    A name stays in the module once it is loaded. One of the version before is found as well,
+    with a warning that says where it is now.
+    """
+
+    def load(name: str) -> Any:
+        entry = read_stub(module).get(name)
+        if name == "__all__":
+            return list(read_stub(module))
+        if name == "__version__" and module == PACKAGE:
+            from importlib.metadata import version
+
+            return version(PACKAGE)
+        if entry is None:
+            return _load_old(module, name)
+        if entry.module == module:
+            return import_module(f"{module}.{name}")  # a room
+        value = entry.load()
+        setattr(sys.modules[module], name, value)
+        return value
+
+    return load, lambda: sorted(read_stub(module))
+
+
+def _load_old(module: str, name: str) -> Any:
+    """What a name of the version before means.
+
+    Raises AttributeError where there was none, or where it is gone, with what there is instead.
+    """
+    from warnings import warn
+
+    from ep2sindy._old_names import gone_text, moved_text, new_name
+
+    old = f"{module}.{name}"
+    new = new_name(old)
+    if new is None:
+        text = gone_text(old) or f"module {module!r} has no attribute {name!r}; {_near(old)}"
+        raise AttributeError(text, name=name, obj=sys.modules[module])
+    warn(moved_text(old), FutureWarning, stacklevel=3)
+    return dotted_names()[new].load()
+
+
+def _near(absent: str) -> str:
+    """Where to look for a name that a module has not."""
+    module, _, name = absent.rpartition(".")
+    look = f"see dir({module})"
+    folder = path.dirname(_stub_file(module))
+    if name.startswith("_"):
+        return look
+    if module != PACKAGE and path.exists(path.join(folder, f"{name}.py")):
+        return f"{look}, or import {absent}"
+    from difflib import get_close_matches
+
+    last = {each.rpartition(".")[2]: each for each in dotted_names()}
+    near = [last[each] for each in get_close_matches(name, last)]
+    return (
+        f"{look}; near it {'is' if len(near) == 1 else 'are'} {', '.join(near)}" if near else look
+    )

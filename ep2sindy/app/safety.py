@@ -1,0 +1,278 @@
+"""What files may not say: a config may come from anybody.
+
+Below `hydra:` one can name callbacks, log handlers, the shell lines of a cluster job, variables
+of the environment and folders to write to: that is obeyed from the command line alone. Folders for
+runs and caches that lie elsewhere, and schedulers, whose answers are trusted, are typed as well.
+What a file asks for is counted before it is written out.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import hydra._internal.hydra as program
+import yaml
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import ConfigRepository
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
+from hydra.plugins.config_source import ConfigResult
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+FOLDERS = ("output", "keep", "cache")  # keys, at any depth, of what a run writes to
+SERVERS = ("address",)
+# What Hydra itself notes of a run, and nobody obeys.
+NOTED = ("runtime.choices", "runtime.config_sources", "job.override_dirname")
+# What nobody may set, for it names what is called or made.
+SILENT = {"version": 1, "root": {"level": "ERROR"}, "disable_existing_loggers": True}
+FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_logging": SILENT}
+
+MOST_VALUES = 100_000  # of one file, with all that its anchors stand for
+MOST_CHARACTERS = 1_000_000  # of one setting, with all that its references stand for
+
+BRACES = re.compile(r"\$\{(.*)\}", re.DOTALL)
+WORD = re.compile(r"[^\s.,:$'\"(){}\[\]]+")
+
+
+class CheckedLoader(ConfigLoaderImpl):
+    """Hydra's loader of configs, which looks at each before anything of it is obeyed."""
+
+    def __init__(self, config_search_path: ConfigSearchPath) -> None:
+        super().__init__(config_search_path)
+        self.repository = CheckedFiles(config_search_path)
+
+    def load_configuration(
+        self,
+        config_name: str | None,
+        overrides: list[str],
+        run_mode: RunMode,
+        from_shell: bool = True,
+        validate_sweep_overrides: bool = True,
+    ) -> DictConfig:
+        how = (run_mode, from_shell, validate_sweep_overrides)
+        hydras = [text for text in overrides if re.match(r"[+~]*hydra[./=]", text)]
+        without = _without_folders(self, hydras).load_configuration(config_name, hydras, *how)
+        if not validate_sweep_overrides:  # Hydra asks for its mode alone, before it composes
+            return without
+        found = super().load_configuration(config_name, overrides, *how)
+        typed = _settings(without)
+        typed["overrides.task"] = [text for text in overrides if text not in hydras]
+        check_hydra(_settings(found), typed)
+        written = _written(found)
+        check_references(written)
+        check_places(_places(found, written), overrides)
+        return found
+
+
+def _without_folders(loader: ConfigLoaderImpl, hydras: Sequence[str]) -> ConfigLoaderImpl:
+    """A loader of the package's and Hydra's own configs, for a folder may hold some of their names.
+
+    With a group of Hydra's on the command line, such as a launcher, folders are trusted with it.
+    """
+    path = deepcopy(loader.config_search_path)
+    if not any("/" in text.partition("=")[0] for text in hydras):
+        path.get_path()[:] = [p for p in path.get_path() if p.provider != "command-line"]
+    return ConfigLoaderImpl(path)
+
+
+@contextmanager
+def checked_loader() -> Iterator[None]:
+    """Within, Hydra's program composes no config that has not been checked."""
+    before = program.ConfigLoaderImpl
+    program.ConfigLoaderImpl = CheckedLoader  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        program.ConfigLoaderImpl = before  # type: ignore[misc]
+
+
+def check_hydra(found: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
+    """Raise ValueError for a setting below `hydra` that does not come from the command line.
+
+    found: all that a config says, by dotted place. typed: what the command line and the package
+    say without it.
+    """
+    for name, value in FIXED.items():
+        fixed = dict(_leaves(value, name))
+        for place in found:
+            if place.startswith(name) and found[place] != fixed.get(place):
+                raise ValueError(
+                    f"hydra.{name} must stay as it is, for it names what is called: "
+                    f"hydra.{place}={found[place]!r} came; leave it out"
+                )
+    for place in [*found, *typed]:
+        if not place.startswith(NOTED) and found.get(place) != typed.get(place):
+            raise ValueError(
+                f"a config must not set hydra.{place}, for it may run or write anything: "
+                f"{found.get(place)!r} came; give it on the command line"
+            )
+
+
+def check_places(settings: Iterable[tuple[str, Any]], overrides: Sequence[str]) -> None:
+    """Raise ValueError for a folder elsewhere, or a server, that nobody has typed.
+
+    settings: plain values by their dotted place.
+    """
+    here = Path.cwd().resolve()
+    for place, value in settings:
+        key = place.rpartition(".")[2]
+        if key not in FOLDERS + SERVERS or _is_typed(place, overrides):
+            continue
+        for each in value if isinstance(value, list) else [value]:
+            if not isinstance(each, str) or each == "???":
+                continue  # whoever takes it refuses it
+            if key in SERVERS:
+                raise ValueError(
+                    f"a config must not set {place}, for what answers there is trusted: {each!r} "
+                    f"came; give it on the command line: {place}={each}"
+                )
+            if "\0" in each or not (here / each).resolve().is_relative_to(here):
+                raise ValueError(
+                    f"a config must set {place} to a folder below the one that you start in: "
+                    f"{each!r} came; give it on the command line: {place}={each}"
+                )
+
+
+def resolved(config: DictConfig) -> Iterator[tuple[str, Any]]:
+    """All that a config says, by dotted place, as a run will read it: text may make a group."""
+    for key in config:
+        with suppress(OmegaConfBaseException):  # told better by whoever reads it
+            node = config[key]
+            is_group = OmegaConf.is_config(node)
+            plain = OmegaConf.to_container(node, resolve=True) if is_group else node
+            yield from _leaves(plain, str(key))
+
+
+def _written(config: DictConfig) -> dict[str, Any]:
+    """All that a config says but Hydra's own, as it is written."""
+    written: Any = OmegaConf.to_container(config, resolve=False)
+    return {key: value for key, value in written.items() if key != "hydra"}
+
+
+def _places(config: DictConfig, written: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The same before all of it can be resolved: Hydra makes a folder first."""
+    for place, value in _leaves(written, ""):
+        known = place.rpartition(".")[2] in FOLDERS + SERVERS and "${" in str(value)
+        yield place, OmegaConf.select(config, place) if known else value
+
+
+def _is_typed(place: str, overrides: Sequence[str]) -> bool:
+    """Whether the command line gave a value; `data=mine` chooses a file, which is none."""
+    for text in overrides:
+        key, _, value = text.lstrip("+~").partition("=")
+        if place == key or (place.startswith(f"{key}.") and value.strip().startswith(("{", "["))):
+            return True
+    return False
+
+
+def _settings(config: DictConfig) -> dict[str, Any]:
+    """All below `hydra`, by dotted place, interpolations as they are written."""
+    return dict(_leaves(OmegaConf.to_container(config.hydra, resolve=False), ""))
+
+
+def _leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
+    """Values by their dotted place; an empty group is one."""
+    dot = f"{place}." if place else ""
+    if isinstance(value, Mapping) and value:
+        for name, each in value.items():
+            yield from _leaves(each, f"{dot}{name}")
+    elif isinstance(value, list) and any(isinstance(each, Mapping | list) for each in value):
+        for k, each in enumerate(value):
+            yield from _leaves(each, f"{place}[{k}]")
+    else:
+        yield place, value
+
+
+class CheckedFiles(ConfigRepository):
+    """Hydra's folders of configs; what is wrong with a file is said with its name."""
+
+    def load_config(self, config_path: str) -> ConfigResult | None:
+        source = self._find_object_source(config_path, ObjectType.CONFIG)
+        if source is None or source.scheme() != "file":
+            return super().load_config(config_path)
+        path = Path(source.path, source._normalize_file_name(config_path))
+        try:
+            check_yaml(path)
+            return super().load_config(config_path)
+        except RecursionError as error:
+            raise ValueError(f"{path} must not be nested hundreds of levels deep") from error
+        except (ValueError, OmegaConfBaseException) as error:
+            said = str(error) or type(error).__name__
+            if str(path) in said:
+                raise
+            raise ValueError(f"{path} cannot be read as a config: {said}") from error
+
+
+def check_yaml(path: Path) -> None:
+    """Raise ValueError for anchors within anchors that stand for more than anybody writes."""
+    text = path.read_text("utf-8")
+    if "&" not in text or "*" not in text:
+        return
+    if (n := _size(yaml.compose(text, Loader=yaml.SafeLoader), {})) > MOST_VALUES:
+        raise ValueError(
+            f"{path} may hold up to {MOST_VALUES} values: with its anchors written out it has "
+            f"{n:.3g}; write what it needs"
+        )
+
+
+def _size(node: Any, known: dict[int, int]) -> int:
+    """Values below a node, each as often as it is written out; an anchor in itself has no end."""
+    if id(node) not in known:
+        known[id(node)] = MOST_VALUES + 1  # until it is known
+        inner = node.value if isinstance(node, yaml.CollectionNode) else []
+        each = [part for pair in inner for part in (pair if isinstance(pair, tuple) else [pair])]
+        known[id(node)] = 1 + sum(_size(part, known) for part in each)
+    return known[id(node)]
+
+
+def check_references(settings: Any) -> None:
+    """Raise ValueError for references to references that stand for more than anybody writes.
+
+    settings: a config's groups and values as they are written. A name in `${...}` counts as the
+    longest of the settings whose key it is, for what it stands for need not be known here.
+    """
+    most = MOST_CHARACTERS + 10 * len(str(settings))
+    named: dict[str, list[Any]] = {}
+    known: dict[int, int] = {}
+    try:
+        _name(settings, named)
+        lengths = {key: max(_length(v, named, known) for v in named[key]) for key in named}
+    except RecursionError as error:
+        raise ValueError("a config must not refer hundreds of levels deep") from error
+    if too_long := [key for key, n in lengths.items() if n > most]:
+        raise ValueError(
+            f"{too_long[0]} may stand for up to {most} characters: with all that its ${{...}} "
+            f"stand for it has {lengths[too_long[0]]:.3g}; write what it needs"
+        )
+
+
+def _name(node: Any, named: dict[str, list[Any]]) -> None:
+    """Gather what stands under every key, in whatever group, and in every place of a list."""
+    inner = enumerate(node) if isinstance(node, list) else node.items()
+    for key, value in inner:
+        named.setdefault(str(key), []).append(value)
+        if isinstance(value, dict | list):
+            _name(value, named)
+
+
+def _length(node: Any, named: Mapping[str, Sequence[Any]], known: dict[int, int]) -> int:
+    """Characters of a value with its references written out; those in a circle count once."""
+    if id(node) in known:
+        return known[id(node)]
+    known[id(node)] = 0  # until it is known
+    if isinstance(node, dict | list):
+        parts = list(node.values()) if isinstance(node, dict) else node
+        n = len(parts) + sum(_length(part, named, known) for part in parts)
+    else:
+        words = WORD.findall(" ".join(BRACES.findall(node))) if isinstance(node, str) else []
+        n = len(str(node))
+        n += sum(max(_length(v, named, known) for v in named[w]) for w in words if w in named)
+    known[id(node)] = n
+    return n

@@ -1,0 +1,3 @@
+# Models
+from ep2sindy.model.rollout import Rollout as Rollout
+from ep2sindy.model.scores import r2 as r2

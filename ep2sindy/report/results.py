@@ -1,0 +1,251 @@
+"""Results as facts: a figure is described once, and becomes column, cell, JSON and headline.
+
+`Metric` is one figure of a record, `ResultTable` a table of records by their metrics. `LABELS` has
+the words of headline figures, for pages that compare runs and know their names alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Flag, auto
+from functools import reduce
+from math import isfinite
+from operator import or_
+from typing import Any, Generic, TypeVar
+
+import pandas as pd
+
+from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.report.document import cell_text
+
+LABELS = {
+    "f_kHz": "frequency",
+    "f_error": "error of the frequency (relative)",
+    "nrmse": "error of the trajectory (standard deviations)",
+    "waveform_error": "error of the waveform (standard deviations)",
+    "amplitude_ratio": "amplitude (times the data's)",
+    "periods": "periods in phase",
+    "r2": "R2",
+    "r2_test": "R2 on held-out rows",
+    "n_terms": "number of terms",
+    "d_pareto": "distance to the corner of the front",
+    "deviance": "deviance",
+    "identified_percent": "identified (%)",
+    "mean_correct_terms": "correct terms (mean)",
+    "multiplier": "Floquet multiplier",
+    "share_reaching": "share of starts that reach the cycle",
+    "cpu_s": "CPU time (s)",
+    "cpu_ms": "CPU time (ms)",
+    "n_points": "number of points",
+    "map_right": "share of the map that is right",
+    "living": "the model that lives",
+}
+
+
+class View(Flag):
+    """Where a metric appears: tables/*.csv, screen and page, summary.json, headline.
+
+    FILES: tables and summary. SHOWN: in them and on the screen. ALL: and in the headline.
+    """
+
+    CSV = auto()
+    SCREEN = auto()
+    JSON = auto()
+    HEADLINE = auto()
+    FILES = CSV | JSON
+    SHOWN = FILES | SCREEN
+    ALL = SHOWN | HEADLINE
+
+
+Record = TypeVar("Record")
+Outer = TypeVar("Outer")
+Metrics = Sequence["Metric[Record]"]
+
+
+@dataclass(frozen=True)
+class Metric(Generic[Record]):
+    """One figure of a record, in SI unless its key says otherwise.
+
+    key: its name in files and headlines. value: takes it from a record; a mapping gives a value to
+    each state (or other part). heading: of its column on the screen, `{}` being the state; the key
+    without one. format: of its cell, such as `{:.3f}` (a dash where there is no number), or a
+    function of the value; without one a number has three digits. column: name of the CSV columns
+    of a mapping, `{}` being the state; `<key>_{}` without one.
+    """
+
+    key: str
+    value: Callable[[Record], Any]
+    view: View = View.FILES
+    heading: str = ""
+    format: str | Callable[[Any], object] = ""
+    column: str = ""
+
+    def cell(self, value: Any) -> object:
+        """A value as it is read."""
+        if callable(self.format):
+            return self.format(value)
+        if not self.format:
+            return value
+        return "-" if value is None or value != value else self.format.format(value)
+
+    def columns(self, value: Any) -> dict[str, Any]:
+        """The value by CSV column: one, or one for each state."""
+        if not isinstance(value, Mapping):
+            return {self.key: value}
+        name = self.column or f"{self.key}_{{}}"
+        return {name.format(part): each for part, each in value.items()}
+
+    def cells(self, value: Any) -> dict[str, object]:
+        """The same by heading, as it is read."""
+        heading = self.heading or self.key.replace("_", " ")
+        if not isinstance(value, Mapping):
+            return {heading: self.cell(value)}
+        return {heading.format(part): self.cell(each) for part, each in value.items()}
+
+    def of(
+        self, part: Callable[[Outer], Record], key: str = "{}", view: View = View.ALL
+    ) -> Metric[Outer]:
+        """The same figure of a part of a larger record.
+
+        key: its name there, `{}` being the own one. view: where it appears, of those it did.
+        """
+        made: Any = replace(self, key=key.format(self.key))  # the one field of a record's type
+        column = key.format(self.column) if self.column else ""
+        return replace(
+            made,
+            column=column,
+            view=self.view & view,
+            value=lambda outer: self.value(part(outer)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ResultTable(Generic[Record]):
+    """Records by name, or nameless in a sequence, and the metrics that are known of each."""
+
+    records: Mapping[str, Record] | Sequence[Record]
+    metrics: Metrics[Record]
+
+    def csv(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
+        """A row per record; heading: of the column of names, if there is to be one.
+
+        by_state: a row per record and state instead, in which a metric without states repeats.
+        """
+        rows: list[dict[str, Any]] = []
+        for name, record in self._named():
+            first = {heading: name} if heading else {}
+            values = [(m, m.value(record)) for m in self._in(View.CSV)]
+            if by_state:
+                for state in _states(values):
+                    of_state = {m.key: _of_state(value, state) for m, value in values}
+                    rows.append(first | {"state": state} | of_state)
+            else:
+                columns = [metric.columns(value) for metric, value in values]
+                rows.append(reduce(or_, columns, first))
+        return pd.DataFrame(rows)
+
+    def screen(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
+        """A row of cells per record.
+
+        by_state: a row per record and state instead, in which a name, or a metric without states,
+        stands in the first row alone.
+        """
+        rows: list[dict[str, object]] = []
+        for name, record in self._named():
+            first: dict[str, object] = {heading: name} if heading else {}
+            if by_state:
+                values = [(m, m.value(record)) for m in self._in(View.SCREEN)]
+                rows += _rows_of_states(first, values)
+            else:
+                rows.append(first | self._cells(record))
+        return pd.DataFrame(rows)
+
+    def upright(self, heading: str = "quantity") -> pd.DataFrame:
+        """A row per metric, a column of cells per record."""
+        cells = {name: self._cells(record) for name, record in self._named()}
+        headings = list(next(iter(cells.values())))
+        columns = {name: [of[h] for h in headings] for name, of in cells.items()}
+        return pd.DataFrame({heading: headings, **columns})
+
+    def json(self) -> dict[str, dict[str, Any]]:
+        """Metrics by name and key, values by state as they are."""
+        return {name: facts(record, self.metrics) for name, record in self._named()}
+
+    def headline(self) -> dict[str, float]:
+        """`name/key`, and `name/state/key` of values by state."""
+        found = {}
+        for name, record in self._named():
+            for metric in self._in(View.HEADLINE):
+                value = metric.value(record)
+                by_part = value if isinstance(value, Mapping) else {"": value}
+                for part, each in by_part.items():
+                    found["/".join(filter(None, (name, part, metric.key)))] = float(each)
+        return found
+
+    def _cells(self, record: Record) -> dict[str, object]:
+        found: dict[str, object] = {}
+        return reduce(or_, (m.cells(m.value(record)) for m in self._in(View.SCREEN)), found)
+
+    def _named(self) -> Iterator[tuple[str, Record]]:
+        if isinstance(self.records, Mapping):
+            yield from self.records.items()
+        else:
+            yield from (("", record) for record in self.records)
+
+    def _in(self, view: View) -> list[Metric[Record]]:
+        return [metric for metric in self.metrics if view in metric.view]
+
+
+def facts(record: Record, metrics: Metrics[Record]) -> dict[str, Any]:
+    """What `summary.json` says of one record, by key."""
+    found = {m.key: m.value(record) for m in metrics if View.JSON in m.view}
+    return {key: dict(v) if isinstance(v, Mapping) else v for key, v in found.items()}
+
+
+def percent(digits: int, *, sign: bool = False) -> Callable[[float], str]:
+    """A format of shares: `12.3 %`, a dash where there is no number."""
+
+    def text(value: float) -> str:
+        return f"{100.0 * value:{'+' if sign else ''}.{digits}f} %" if isfinite(value) else "-"
+
+    return text
+
+
+def in_words(name: str) -> str:
+    """Words for a headline figure: `simple/n_i/r2_test` -> `simple, n_i: R2 on held-out rows`.
+
+    Parts of the name without a label stand as they are, blanks for underscores.
+    """
+    *where, what = name.split("/")
+    text = LABELS.get(what, what.replace("_", " "))
+    return f"{', '.join(LABELS.get(part, part) for part in where)}: {text}" if where else text
+
+
+def value_text(name: str, value: float, clock: Clock = SECONDS) -> str:
+    """A headline figure as a cell; a frequency with its unit, in people's time."""
+    if name.split("/")[-1] == "f_kHz":
+        return clock.frequency_text(1e3 * value)
+    return cell_text(value)
+
+
+def _states(values: Sequence[tuple[Metric[Any], Any]]) -> list[str]:
+    """States that the first value by state has."""
+    return list(next(value for _, value in values if isinstance(value, Mapping)))
+
+
+def _of_state(value: Any, state: str) -> Any:
+    return value[state] if isinstance(value, Mapping) else value
+
+
+def _rows_of_states(
+    first: dict[str, object], values: Sequence[tuple[Metric[Any], Any]]
+) -> Iterator[dict[str, object]]:
+    """Cells by state; after the first state those that do not depend on it are blank."""
+    for k, state in enumerate(_states(values)):
+        row = {name: "" if k else text for name, text in first.items()} | {"state": state}
+        for metric, value in values:
+            repeats = k and not isinstance(value, Mapping)
+            cells = metric.cells(_of_state(value, state))
+            row |= {heading: "" if repeats else cell for heading, cell in cells.items()}
+        yield row

@@ -1,0 +1,1 @@
+"""What runs rely on: files written whole or not at all, workers, threads, kernels, the screen."""

@@ -1,0 +1,242 @@
+"""Independent pieces of work: one after the other, on all cores, or on a cluster."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from threading import RLock
+from types import ModuleType
+from typing import Any, Protocol, runtime_checkable
+
+import cloudpickle
+from joblib import Parallel, delayed, effective_n_jobs
+
+from ep2sindy.runtime.threads import one_thread
+from ep2sindy.trust.interruption import end_with
+from ep2sindy.trust.user_code import isolated_children, own_packages
+
+# Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
+AHEAD = 2
+
+
+@runtime_checkable
+class Workers(Protocol):
+    """What the alternatives share: apply a function to every piece, results as they come.
+
+    Yields (number of the piece, result), in any order. Each piece runs on one thread, so that a
+    result does not depend on where it was computed. Function, pieces and results must pickle.
+    """
+
+    def run(
+        self, function: Callable[[Any], Any], pieces: Iterable[Any]
+    ) -> Iterator[tuple[int, Any]]: ...
+
+
+def _on_one_thread(function: Callable[[Any], Any], numbered: tuple[int, Any]) -> tuple[int, Any]:
+    number, piece = numbered
+    with one_thread():
+        return number, function(piece)
+
+
+def collect(
+    workers: Workers,
+    function: Callable[[Any], Any],
+    pieces: Sequence[Any],
+    stage: AbstractContextManager[Callable[[int], None]],
+    *,
+    size: Callable[[Any], int] = lambda piece: 1,
+    tell: Callable[[int, Any], None] = lambda number, result: None,
+) -> list[Any]:
+    """The results of all pieces in their order, though they come in any order.
+
+    stage: of a `Progress`; it is told the size of every piece that is done. tell: is given the
+    number and the result of every piece as it comes.
+    """
+    results: dict[int, Any] = {}
+    with stage as advance:
+        for number, result in workers.run(function, pieces):
+            results[number] = result
+            tell(number, result)
+            advance(size(pieces[number]))
+    return [results[number] for number in range(len(pieces))]
+
+
+def rows_in_order(
+    workers: Workers,
+    function: Callable[[Any], Sequence[Any]],
+    pieces: Iterable[Any],
+    progress: Callable[[int], None] = lambda n_more: None,
+) -> list[Any]:
+    """The rows that a function finds in every piece, in the order of the pieces.
+
+    progress: told of every finished piece.
+    Raises ValueError where there is no row at all.
+    """
+    found = {}
+    for number, rows in workers.run(function, pieces):
+        found[number] = rows
+        progress(1)
+    if not any(found.values()):
+        raise ValueError(
+            f"there must be something to run: {len(found)} pieces came, without a row; leave no "
+            "list of settings empty"
+        )
+    return [row for number in sorted(found) for row in found[number]]
+
+
+def _in_worker(code: bytes, parent: int, numbered: tuple[int, Any]) -> tuple[int, Any]:
+    from tqdm import tqdm
+
+    if os.getpid() != parent:  # within a worker, joblib stays in the process
+        end_with(parent)
+        tqdm.set_lock(RLock())  # by default a semaphore, of which the end of a worker would be told
+    return _sent_on_one_thread(code, numbered)
+
+
+def _sent_on_one_thread(code: bytes, numbered: tuple[int, Any]) -> tuple[int, Any]:
+    return _on_one_thread(pickle.loads(code), numbered)
+
+
+def _with_its_code(function: Callable[[Any], Any], *packages: ModuleType) -> bytes:
+    """A pickle that holds the code of packages which workers cannot import by their names:
+    these, and what configs have named in the folder of the run."""
+    for package in (*packages, *own_packages()):
+        cloudpickle.register_pickle_by_value(package)
+    return cloudpickle.dumps(function)
+
+
+@dataclass(frozen=True)
+class Serial:
+    """One piece after the other, in this process."""
+
+    def run(
+        self, function: Callable[[Any], Any], pieces: Iterable[Any]
+    ) -> Iterator[tuple[int, Any]]:
+        for numbered in enumerate(pieces):
+            yield _on_one_thread(function, numbered)
+
+
+ONE_BY_ONE = Serial()
+
+
+@dataclass(frozen=True)
+class Loky:
+    """Pieces side by side in processes of this machine. n_jobs: how many; -1, one per core."""
+
+    n_jobs: int = -1
+
+    def __post_init__(self) -> None:
+        if type(self.n_jobs) is not int or self.n_jobs == 0:
+            raise ValueError(
+                f"n_jobs must be a number of processes, or -1 for one per core: {self.n_jobs!r} "
+                "came"
+            )
+
+    def run(
+        self, function: Callable[[Any], Any], pieces: Iterable[Any]
+    ) -> Iterator[tuple[int, Any]]:
+        if effective_n_jobs(self.n_jobs) == 1:
+            yield from ONE_BY_ONE.run(function, pieces)
+            return
+        # Pieces are pickled as they are: joblib would keep a copy of every large array on disk.
+        workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
+        code, numbered = _with_its_code(function), enumerate(pieces)
+        with isolated_children():  # all workers start before the first result is asked for
+            found = workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
+        yield from found
+
+
+@dataclass(frozen=True)
+class Dask:
+    """Pieces on the workers of a running dask scheduler, such as "tcp://10.0.0.1:8786".
+
+    A piece whose worker dies is given to another, as often as the scheduler allows (three times,
+    unless it was told otherwise). Workers need this package, and see the same files under the
+    same paths; a function from elsewhere goes to them with its code. Needs the extra `cluster`.
+    Raises OSError when no scheduler answers at the address, or none has a worker, within timeout_s.
+    """
+
+    address: str
+    timeout_s: float = 10.0
+
+    def run(
+        self, function: Callable[[Any], Any], pieces: Iterable[Any]
+    ) -> Iterator[tuple[int, Any]]:
+        distributed = _distributed()
+        with self._client(distributed) as client:
+            yield from self._run(client, distributed.as_completed, function, pieces)
+
+    @contextmanager
+    def _client(self, distributed: Any) -> Iterator[Any]:
+        """A connection to a scheduler that has a worker, and that nobody else uses by default."""
+        client = None
+        try:
+            client = distributed.Client(self.address, timeout=self.timeout_s, set_as_default=False)
+            client.wait_for_workers(1, timeout=self.timeout_s)
+        except (OSError, ValueError) as error:
+            if client is not None:
+                client.close()
+            raise OSError(
+                f"a dask scheduler with a worker must answer at {self.address!r} within "
+                f"{self.timeout_s:g} s: {error}; start `dask scheduler` and `dask worker`, or "
+                "choose parallel=loky"
+            ) from error
+        with client:
+            yield client
+
+    def _run(
+        self,
+        client: Any,
+        as_completed: Callable,
+        function: Callable[[Any], Any],
+        pieces: Iterable[Any],
+    ) -> Iterator[tuple[int, Any]]:
+        waiting, n_running = enumerate(pieces), 0
+        code = _with_its_code(function, *_package_of(function))
+
+        def submitted() -> list[Any]:
+            """What keeps all threads busy, of workers that have joined since, too."""
+            n_threads = max(1, sum(client.nthreads().values()))
+            return [
+                client.submit(_sent_on_one_thread, code, each, pure=False)
+                for each in islice(waiting, max(0, AHEAD * n_threads - n_running))
+            ]
+
+        running = as_completed(loop=client.loop)
+        while True:
+            following = submitted()
+            running.update(following)
+            n_running += len(following)
+            if not n_running:
+                return
+            future = next(running)
+            n_running -= 1
+            result = future.result()
+            future.release()
+            yield result
+
+
+def _package_of(function: Callable[[Any], Any]) -> list[ModuleType]:
+    """Where a function comes from, unless workers have it: this package, or the main program."""
+    inner: Any = function
+    while isinstance(inner, partial):
+        inner = inner.func
+    package = inner.__module__.partition(".")[0]
+    known = package in (__name__.partition(".")[0], "__main__")
+    return [] if known else [sys.modules[package]]
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError as error:
+        raise ValueError(
+            "parallel=dask needs dask.distributed: pip install 'ep2sindy[cluster]'"
+        ) from error
+    return distributed

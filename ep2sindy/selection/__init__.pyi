@@ -1,0 +1,2 @@
+# Selection
+from ep2sindy.selection.rule import selected as selected

@@ -1,0 +1,335 @@
+"""Known terms fitted in several ways to the first part of a record, judged alike on the rest.
+
+For the experiments that do so: what a config says of terms, the fits, and how they read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add
+from time import process_time
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from ep2sindy.constraints.fit import constrained_fit
+from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.equations import equation_text
+from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.terms import variables_of
+from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.windows import dominant_window
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
+from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.source import data_summary
+from ep2sindy.studies.study import Check
+from ep2sindy.studies.views import (
+    MARKS,
+    PlotRange,
+    coefficients,
+    equation_sections,
+    intervals,
+    model_summary,
+    rollout_tables,
+    run_figures,
+    trajectories,
+)
+
+Terms = Mapping[str, Sequence[int | str]]  # by state; the constant, 1, may come as a number
+Relations = Annotated[
+    Sequence[str],
+    Check(
+        "a list of relations, such as ['x: x*y == -1 * y: x*y']",
+        lambda value: isinstance(value, list) and bool(value),
+    ),
+]
+DIVERGED = 10.0  # residual, in std, of samples that a run does not reach
+TITLE = "integrated over held-out time from its first sample (nrmse 1: no better than a constant)"
+INTERVALS = (
+    "The intervals say how far the windows' residuals move the coefficients; starts are fitted "
+    "with them."
+)
+CAPTIONS = {
+    "trajectories": "Models integrated over held-out time from its first sample (colour) over the "
+    f"data (grey). {MARKS}",
+    "trajectories_started": "The same from a start fitted to the first one and a half periods.",
+}
+SINCE = "time since start of held-out part"
+FIGURES = ("phase", "spectra")
+COMPARED = ("f_error", "nrmse", "amplitude_ratio")
+
+
+def terms_of(
+    given: Terms, *, states: Sequence[str], key: str = "model"
+) -> tuple[Library, dict[str, list[str]]]:
+    """The terms of every state, and a library that holds each of them once.
+
+    key: what the config calls this model, for the message.
+    """
+    if set(given) != set(states) or not all(given.values()):
+        came = {state: list(names) for state, names in given.items()}
+        raise ValueError(
+            f"{key} must list the terms of every state of {list(states)}, such as "
+            f"{{x: [x, x*y]}}: {came} came"
+        )
+    terms = {state: [str(name) for name in given[state]] for state in states}
+    factors = [
+        variable for names in terms.values() for name in names for variable in variables_of(name)
+    ]
+    variables = list(dict.fromkeys([*states, *factors]))
+    named = reduce(add, (named_terms(variables, names) for names in terms.values()))
+    return named.take(np.argsort(named.degrees, kind="stable")), terms
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A fit and what it does on the held-out part.
+
+    from_sample: started at the first sample; from_fit: at a start fitted to the first samples,
+    for one sample may lie off every orbit of the model. cpu_s: of the fit, without that of the
+    model it starts from. status, loss: of a refinement; None and NaN for least squares.
+    """
+
+    model: SparseModel
+    from_sample: FreeRun
+    from_fit: FreeRun
+    cpu_s: float
+    status: str | None
+    loss: float
+
+
+def first_and_last(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
+    """The first part of a record, and the last `held_out` of its samples.
+
+    Raises ValueError for a share that leaves either of them under 20 samples.
+    """
+    n_train = round(run.n_samples * (1.0 - held_out))
+    if min(n_train, run.n_samples - n_train) < 20:
+        raise ValueError(
+            f"held_out={held_out} must leave 20 samples on either side: the data have "
+            f"{run.n_samples}"
+        )
+    return run.window(0, n_train), run.window(n_train, run.n_samples)
+
+
+def fit_and_judge(
+    train: Trajectory,
+    held: Trajectory,
+    library: Library,
+    constraint: Constraint,
+    formulation: Formulation,
+    *,
+    rng: np.random.Generator,
+) -> Judged:
+    """Least squares under the constraint, in one form of the regression.
+
+    Without covariance: smoothed rows and overlapping windows are not independent, and intervals
+    that took them for it would be too narrow.
+    """
+    begun = process_time()
+    model = constrained_fit(
+        formulation.assemble([train], library, rng=rng),
+        constraint,
+        units=train.units,
+        provenance={"formulation": repr(formulation), "trajectories": train.label},
+    )
+    return judge(replace(model, covariance=None), held, cpu_s=process_time() - begun)
+
+
+def judge(
+    model: SparseModel,
+    held: Trajectory,
+    *,
+    cpu_s: float = float("nan"),
+    status: str | None = None,
+    loss: float = float("nan"),
+) -> Judged:
+    """Integrate a fitted model over the held-out part, from its first sample and from a fit."""
+    return Judged(
+        model=model,
+        from_sample=free_run(model, held),
+        from_fit=free_run(model, held, initial=_fitted_start(model, held)),
+        cpu_s=cpu_s,
+        status=status,
+        loss=loss,
+    )
+
+
+def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
+    """The initial state whose trajectory is closest to the first one and a half periods.
+
+    Distances in standard deviations of the data; the search begins at the first sample.
+    """
+    n_samples = min(dominant_window([run], model.states), run.n_samples)
+    data = run.window(0, n_samples).columns(model.states)
+    std = run.columns(model.states).std(axis=0)
+
+    def residual(start: np.ndarray) -> np.ndarray:
+        rollout = model.rollout(run, n_samples=n_samples, initial=start * std, rtol=1e-6)
+        strayed = np.full(data.shape, DIVERGED)
+        strayed[: len(rollout.t)] = (rollout.states - data[: len(rollout.t)]) / std
+        return strayed.ravel()
+
+    return least_squares(residual, data[0] / std, diff_step=1e-4).x * std
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Models by name, fitted to `train` and judged on `held`.
+
+    labels: what a reader calls the models. relations: that the constrained ones obey. findings,
+    more_tables, more_figures, more_sections: what the study itself adds.
+    """
+
+    train: Trajectory
+    held: Trajectory
+    judged: Mapping[str, Judged]
+    labels: Mapping[str, str]
+    relations: Sequence[str]
+    shown: PlotRange
+    findings: Mapping[str, Any]
+    more_tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    more_figures: Mapping[str, Captioned] = field(default_factory=dict)
+    more_sections: Sequence[Section] = ()
+
+    @property
+    def f_data_Hz(self) -> float:
+        """Of the first state on the held-out part, as models are held against it."""
+        return dominant_frequency(self.held.t, self.held.states[:, 0])
+
+    @property
+    def labelled(self) -> dict[str, Judged]:
+        return {self.labels[name]: each for name, each in self.judged.items()}
+
+    def models(self) -> dict[str, SparseModel]:
+        return {name: each.model for name, each in self.judged.items()}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        integrated = {name: each.from_sample for name, each in self.judged.items()}
+        return {
+            **rollout_tables(self.held, integrated),
+            "methods": ResultTable(self.judged, METHOD).csv("method", by_state=True),
+            "coefficients": coefficients(self.models(), heading="method"),
+            **self.more_tables,
+        }
+
+    def figures(self) -> dict[str, Captioned]:
+        sample = {name: each.from_sample for name, each in self.labelled.items()}
+        fit = {name: each.from_fit for name, each in self.labelled.items()}
+        runs = {
+            name: trajectories(self.held, models, self.shown, caption, since=SINCE)
+            for (name, caption), models in zip(CAPTIONS.items(), (sample, fit), strict=True)
+        }
+        more = run_figures(FIGURES, self.held, sample, self.shown)
+        return {**runs, **more, **self.more_figures}
+
+    def sections(self) -> list[Section]:
+        models = {label: each.model for label, each in self.labelled.items()}
+        known = any(model.covariance is not None for model in models.values())
+        relations = [Text(f"relation: {text}") for text in self.relations]
+        intervals = [Text(INTERVALS, page_only=True)] if known else []
+        shown = pictures([*CAPTIONS, *FIGURES, *self.more_figures])
+        return [
+            Section("Equations", [*relations, *intervals]),
+            *equation_sections(models, self.held.clock, page_only=True),
+            Section("Held-out time", [self._table(), *shown]),
+            *self.more_sections,
+        ]
+
+    def _table(self) -> Table:
+        """A row per model: how it runs."""
+        metrics = [self._frequency, *METHOD]
+        rows = ResultTable(self.labelled, metrics).screen("method")
+        if rows["status"].isna().all():  # least squares has none
+            del rows["status"]
+        return Table(
+            rows,
+            title=TITLE,
+            note=f"Data, held out: {self.held.clock.frequency_text(self.f_data_Hz)}. Amplitude: "
+            "standard deviation against the data's. Start fitted: frequency error and nrmse from "
+            "a start fitted to the first one and a half periods.",
+        )
+
+    @property
+    def _frequency(self) -> Metric[Judged]:
+        """Of a model, beside that of the data."""
+
+        def text(judged: Judged) -> str:
+            run = judged.from_sample
+            frequency = run.rollout.clock.frequency_text(self.f_data_Hz * (1.0 + run.f_error))
+            return _or_verdict(run, f"{frequency} ({100 * run.f_error:+.1f} %)")
+
+        return Metric("f", text, View.SCREEN)
+
+    def summary(self) -> dict[str, Any]:
+        n_held_out = self.held.n_samples
+        data = data_summary(self.train) | {
+            "n_samples": self.train.n_samples + n_held_out,
+            "n_held_out": n_held_out,
+            "f_kHz": 1e-3 * self.f_data_Hz,
+        }
+        return {"data": data, **self.findings}
+
+    def headline(self) -> dict[str, float]:
+        return ResultTable(self.judged, METHOD).headline()
+
+
+# A free run: CSV by state; in JSON and headlines what has states is that of the first.
+RUN: Metrics[FreeRun] = [
+    Metric("f_Hz", lambda run: run.frequency_Hz, View.CSV),
+    Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.JSON),
+    Metric("f_error", lambda run: run.f_error, View.FILES | View.HEADLINE),
+    Metric("nrmse", lambda run: run.nrmse, View.ALL),
+    Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.CSV),
+    Metric(
+        "amplitude_ratio", lambda run: run.amplitude_ratio[run.model.states[0]],
+        View.JSON | View.HEADLINE,
+    ),
+    Metric("amplitude", lambda run: run.amplitude_ratio, View.SCREEN, "amplitude {}"),
+    Metric("waveform_error", lambda run: run.waveform_error[run.model.states[0]], View.JSON),
+    Metric("periods", lambda run: run.periods, View.JSON),
+    Metric("verdict", lambda run: str(run.verdict), View.SCREEN),
+    Metric("verdict", lambda run: run.text, View.JSON),
+]  # fmt: skip
+METHOD: Metrics[Judged] = [
+    Metric("text", lambda judged: equation_texts(judged.model), View.CSV),
+    *(metric.of(lambda judged: judged.from_sample) for metric in RUN),
+    *(metric.of(lambda judged: judged.from_fit, "{}_started", View.CSV) for metric in RUN),
+    Metric("start fitted", lambda judged: _started_text(judged.from_fit), View.SCREEN),
+    Metric("fitted_start", lambda judged: run_summary(judged.from_fit), View.JSON),
+    Metric("ci95", lambda judged: intervals(judged.model), View.JSON),
+    Metric("loss", lambda judged: judged.loss),
+    Metric("status", lambda judged: judged.status, View.SHOWN),
+    Metric("cpu_s", lambda judged: judged.cpu_s, View.ALL, "CPU s"),
+]
+
+
+def equation_texts(model: SparseModel) -> dict[str, str]:
+    return {state: equation_text(state, model.terms(state)) for state in model.states}
+
+
+def _started_text(run: FreeRun) -> str:
+    return _or_verdict(run, f"{100 * run.f_error:+.1f} %, {run.nrmse:.2f}")
+
+
+def _or_verdict(run: FreeRun, text: str) -> str:
+    """The text, or what became of a model that has no frequency."""
+    return run.text if np.isnan(run.f_error) else text
+
+
+def judged_summary(judged: Judged) -> dict[str, Any]:
+    """f_kHz, f_error, nrmse, amplitude_ratio: of the first state, from the first sample."""
+    return model_summary(judged.model) | facts(judged, METHOD)
+
+
+def run_summary(run: FreeRun) -> dict[str, Any]:
+    return facts(run, RUN)

@@ -1,0 +1,202 @@
+"""What several studies show alike: runs as figures and tables, models as equations and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures import series
+from ep2sindy.library.units import SECONDS, Clock, unit_product
+from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.model import SparseModel
+from ep2sindy.report.document import Block, Captioned, Equation, Section, Table
+from ep2sindy.studies.study import PositiveOrAll
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+INTEGRATED = "integrated from the first sample (nrmse 1: no better than a constant)"
+MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
+CAPTIONS = {
+    "data": "States (start of the record) and their power spectra; the line marks the peak.",
+    "trajectories": "Models integrated from the first sample (colour) over the data (grey). "
+    f"{MARKS}",
+    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey); "
+    "carets: a curve leaves the panel.",
+    "phase": "Phase portraits of the integrated models (colour) over the data (grey), dots where "
+    f"they start. {MARKS}",
+    "spectra": "Power spectra of the integrated models (colour) and of the data over the same time "
+    "(grey); the dashed line marks the data's dominant frequency, the number is the model's.",
+}
+
+
+@dataclass(frozen=True)
+class PlotRange:
+    """How much figures show: the start of a record, and the low end of spectra."""
+
+    duration_s: PositiveOrAll
+    f_max_Hz: PositiveOrAll
+
+    def span_s(self, data: Trajectory) -> float:
+        return self.duration_s or float(data.t[-1] - data.t[0])
+
+    def up_to_Hz(self, data: Trajectory) -> float:
+        return self.f_max_Hz or 0.5 / data.dt_s
+
+
+def rollout_tables(data: Trajectory, models: Mapping[str, FreeRun]) -> dict[str, pd.DataFrame]:
+    """Model and data, sample by sample, so that the figures can be drawn again."""
+    found = {}
+    for name, integrated in models.items():
+        rollout, states = integrated.rollout, integrated.model.states
+        samples = data.columns(states)[: len(rollout.t)]
+        columns: dict[str, Any] = {"t_s": rollout.t}
+        for k, state in enumerate(states):
+            columns |= {f"{state}_data": samples[:, k], f"{state}_model": rollout.states[:, k]}
+        found[f"rollout_{name.replace(' ', '_')}"] = pd.DataFrame(columns)
+    return found
+
+
+def run_figures(
+    names: Sequence[str],
+    data: Trajectory,
+    models: Mapping[str, FreeRun],
+    shown: PlotRange,
+    *,
+    formulation: object = None,
+    since: str = series.SINCE_START,
+) -> dict[str, Captioned]:
+    """Those of CAPTIONS that are named; phase portraits only of two states or more.
+
+    formulation: its smoother takes the data's derivative; without one there are no derivatives.
+    since: what the times of runs are counted from.
+    """
+    span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
+    rollouts = {name: integrated.rollout for name, integrated in models.items()}
+    verdicts = {name: integrated.verdict for name, integrated in models.items()}
+    drawn: dict[str, Callable[[], Figure]] = {
+        "data": partial(series.data_figure, data, duration_s=span, f_max_Hz=f_max_Hz),
+        "trajectories": partial(
+            series.trajectory_figure, data, rollouts, duration_s=span, verdicts=verdicts,
+            since=since,
+        ),
+        "spectra": partial(
+            series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, verdicts=verdicts
+        ),
+    }  # fmt: skip
+    if smoother := getattr(formulation, "smoother", None):
+        sides = {name: integrated.model for name, integrated in models.items()}
+        drawn["derivatives"] = partial(
+            series.derivative_figure, data, sides, smoother=smoother, duration_s=span
+        )
+    if len(plane := data.state_names[:2]) > 1:
+        drawn["phase"] = partial(
+            series.phase_figure, data, rollouts, plane=plane, duration_s=span, verdicts=verdicts
+        )
+    return {name: Captioned(drawn[name], CAPTIONS[name]) for name in names if name in drawn}
+
+
+def trajectories(
+    data: Trajectory,
+    models: Mapping[str, FreeRun],
+    shown: PlotRange,
+    caption: str,
+    *,
+    since: str = series.SINCE_START,
+) -> Captioned:
+    """Trajectories of other models, or from other starts."""
+    (figure,) = run_figures(["trajectories"], data, models, shown, since=since).values()
+    return replace(figure, caption=caption)
+
+
+def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] | None:
+    """95 % intervals by state and term; None where they are not known."""
+    if model.covariance is None:
+        return None
+    return {state: model.intervals(state) for state in model.states}
+
+
+def model_summary(model: SparseModel) -> dict[str, Any]:
+    return {
+        "text": model.text(),
+        "equations": {state: model.terms(state) for state in model.states},
+    }
+
+
+def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataFrame:
+    """One row per model, state and term: in SI, with 95 % intervals where they are known.
+
+    heading: of the column that holds the models' names.
+    """
+    rows = []
+    for name, model in models.items():
+        known = intervals(model) or {}
+        for state in model.states:
+            for term, value in model.terms(state).items():
+                lower, upper = known.get(state, {}).get(term, (np.nan, np.nan))
+                row: dict[str, Any] = {heading: name, "state": state, "term": term}
+                rows.append(row | {"coef": value, "lower": lower, "upper": upper})
+    return pd.DataFrame(rows)
+
+
+def shown_equation(
+    model: SparseModel,
+    state: str,
+    clock: Clock = SECONDS,
+    *,
+    lead: str = "",
+    on_screen: bool = True,
+) -> Equation:
+    """One equation of a model with its unit, per unit of the clock."""
+    terms = {name: clock.seconds * coef for name, coef in model.terms(state).items()}
+    unit = clock.rate_unit(model.units[state])
+    return Equation(state, terms, lead=lead, unit=unit, on_screen=on_screen)
+
+
+def interval_table(
+    model: SparseModel,
+    states: Sequence[str] | None = None,
+    clock: Clock = SECONDS,
+    *,
+    page_only: bool = False,
+) -> list[Block]:
+    """Coefficients of some equations, by default of all, with 95 % intervals; none if unknown."""
+    if model.covariance is None:
+        return []
+    units = {term.name: term.unit(model.units) for term in model.library.terms}
+    rows = []
+    for state in model.states if states is None else states:
+        for term, ends in model.intervals(state).items():
+            numbers = [model.terms(state)[term], *ends]
+            unit = unit_product([(model.units[state], 1), (units[term], -1)])
+            row = [f"{state}'", term.replace("*", " ")]
+            row += [f"{clock.seconds * number:.4g}" for number in numbers]
+            rows.append([*row, clock.rate_unit(unit)])
+    columns = ["equation", "term", "coefficient", "95 % from", "to", "unit"]
+    return [Table(pd.DataFrame(rows, columns=columns), page_only=page_only)] if rows else []
+
+
+def equation_sections(
+    models: Mapping[str, SparseModel], clock: Clock = SECONDS, *, page_only: bool = False
+) -> list[Section]:
+    """Under the name of each model its equations, with intervals where they are known.
+
+    page_only: of the intervals.
+    """
+    return [
+        Section(
+            name,
+            [
+                *(shown_equation(model, state, clock) for state in model.states),
+                *interval_table(model, clock=clock, page_only=page_only),
+            ],
+            level=3,
+        )
+        for name, model in models.items()
+    ]

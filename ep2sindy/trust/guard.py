@@ -1,0 +1,90 @@
+"""Files whose libraries may die of them are looked through in a process of its own first."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+from functools import cache, lru_cache
+from pathlib import Path
+from threading import Lock
+
+from ep2sindy.trust.limits import size_of
+from ep2sindy.trust.user_code import isolated
+
+PATIENCE_S = 20.0  # and a second per 10 MB: slower than any disk
+SPEED = 1e7  # bytes per s
+
+_LOCK = Lock()
+
+
+def look_through_first(path: Path, reader: str) -> None:
+    """Raise ValueError for a file that cannot be read to its end, or that the library dies of.
+
+    reader: the name of the one that will read it. The process is started once and kept. A file that
+    was sound is not looked at again until it changes.
+    """
+    stat = path.stat()
+    if said := _verdict(path.absolute(), reader, stat.st_size, stat.st_mtime_ns):
+        raise ValueError(f"a file must be readable to its end: {said}")
+
+
+@lru_cache(maxsize=1000)  # a process may read files for weeks
+def _verdict(path: Path, reader: str, size: int, changed_ns: int) -> str:
+    with _LOCK:
+        prober = _prober(os.getpid())
+        if prober.poll() is not None:  # since the last file, as by Ctrl-C in a notebook
+            _ended(prober)
+            prober = _prober(os.getpid())
+        patience_s = PATIENCE_S + size_of(path) / SPEED
+        try:
+            line = _asked(prober, [str(path), reader], patience_s)
+        except BaseException:  # its answer would be taken for that on the next file
+            _ended(prober)
+            raise
+        if line:
+            return str(json.loads(line))
+        status = _ended(prober)
+    if line is None:
+        return f"reading it was given up after {patience_s:.0f} s"
+    by = signal.Signals(-status).name if status < 0 else f"status {status}"
+    return f"the library that reads it breaks down over it ({by})"
+
+
+def _asked(prober: subprocess.Popen, file: list[str], patience_s: float) -> bytes | None:
+    """What it says of a file; nothing, if it dies, and None, if it takes too long."""
+    assert prober.stdin is not None
+    assert prober.stdout is not None
+    prober.stdin.write(json.dumps(file).encode() + b"\n")
+    prober.stdin.flush()
+    return prober.stdout.readline() if _answers(prober, patience_s) else None
+
+
+def _ended(prober: subprocess.Popen) -> int:
+    """The status of a process that is ended here, if it has not ended itself."""
+    _prober.cache_clear()
+    prober.kill()
+    return prober.wait()
+
+
+def _answers(prober: subprocess.Popen, patience_s: float) -> bool:
+    """Whether it says something, or ends, in time."""
+    if os.name == "nt":
+        return True  # no pipe can be waited for there
+    assert prober.stdout is not None
+    return bool(select.select([prober.stdout], [], [], patience_s)[0])
+
+
+@cache
+def _prober(process: int) -> subprocess.Popen:
+    """One for each process of ours: a fork must not share its parent's."""
+    command, environment = isolated("ep2sindy.trust.probe")
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env={**environment, "MALLOC_PERTURB_": "165"},  # luck is no soundness
+    )

@@ -1,0 +1,168 @@
+"""Code of the user's own: modules below the folder that a run is started in.
+
+A config may come from anybody, and so may name no other code than the package's and that of this
+folder, of which it may call only what is marked for it. The folder may be full of what others
+wrote, with the names of modules: nothing of it is imported but what is named.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, chdir, contextmanager, nullcontext
+from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any, TypeVar
+
+PACKAGE = Path(__file__).resolve().parents[1]
+MARK = "__offered_to_configs__"
+SAFE = "PYTHONSAFEPATH"  # asks Python to import nothing of the current folder
+Called = TypeVar("Called", bound=Callable[..., Any])
+
+_OWN: dict[str, ModuleType] = {}  # the first part of a dotted name -> what it names
+
+
+def leave_folder() -> None:
+    """Import nothing from the current folder from now on, unless it is a checkout of the package.
+
+    Raises ValueError where the folder is gone.
+    """
+    try:
+        here = Path.cwd()
+    except FileNotFoundError as error:
+        raise ValueError(
+            "the folder that a run is started in must be there, but it has been removed; "
+            "change to another: cd FOLDER"
+        ) from error
+    if here != PACKAGE.parent:
+        sys.path[:] = [path for path in sys.path if Path(path).resolve() != here]
+
+
+def isolated(module: str) -> tuple[list[str], dict[str, str]]:
+    """Command and environment of a process that runs a module of the package, and that imports
+    nothing of the current folder, unless it is a checkout of the package."""
+    here = Path.cwd()
+    places = [path for path in sys.path if path]
+    if here != PACKAGE.parent:  # else another checkout that is installed would be found before it
+        places = [path for path in places if Path(path).resolve() != here]
+    known = os.pathsep.join([*places, str(PACKAGE.parent)])
+    return [sys.executable, "-P", "-m", module], {**os.environ, SAFE: "1", "PYTHONPATH": known}
+
+
+def away_from(settings: str) -> AbstractContextManager[None]:
+    """Stand elsewhere while something is imported that would read this file of the folder."""
+    return chdir(PACKAGE) if os.path.exists(settings) else nullcontext()
+
+
+@contextmanager
+def isolated_children() -> Iterator[None]:
+    """Processes of Python that are started within import nothing of the current folder."""
+    before = os.environ.get(SAFE)
+    os.environ[SAFE] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE]
+        else:
+            os.environ[SAFE] = before
+
+
+def for_configs(call: Called) -> Called:
+    """Mark a function or class of your own, so that configs may name it: `@ep.for_configs`.
+
+    A config then says `_target_: my_module.crop_twice`, of my_module.py in the folder that the
+    run is started in.
+    """
+    setattr(call, MARK, call)  # itself: a class derived from it is not marked by that
+    return call
+
+
+def is_for_configs(value: object) -> bool:
+    return getattr(value, MARK, None) is value
+
+
+def load_user_module(name: str) -> ModuleType:
+    """The module of a file below the current folder, by its dotted name.
+
+    Modules of a folder may import each other by its name, `from studies.tools import crop`.
+    Raises ModuleNotFoundError where there is no such file, or where the name is that of an
+    installed package or of the standard library, before anything is run.
+    """
+    parts = name.split(".")
+    here = Path.cwd()
+    if not all(part.isidentifier() for part in parts) or _file(here.joinpath(*parts)) is None:
+        raise ModuleNotFoundError(f"{here} has no {'/'.join(parts)}.py", name=name)
+    for k in range(1, len(parts) + 1):
+        _load(".".join(parts[:k]), here.joinpath(*parts[:k]))
+    return sys.modules[name]
+
+
+def own_source(name: str) -> Path | None:
+    """The file or folder below the current one that holds the code of a dotted name."""
+    root = Path.cwd() / name.partition(".")[0]
+    return root if root.is_dir() else _file(root)
+
+
+def own_packages() -> list[ModuleType]:
+    """What configs have named, whose code no other process can import by its name."""
+    return [module for name, module in _OWN.items() if sys.modules.get(name) is module]
+
+
+def _file(place: Path) -> Path | None:
+    """The source of a module, or of a package, that a dotted name leads to."""
+    files = (place.with_suffix(".py"), place / "__init__.py")
+    return next((file for file in files if file.is_file()), None)
+
+
+def _load(name: str, place: Path) -> None:
+    """Make a module from its source: a file of bytecode beside it need not say the same."""
+    known = find_spec(name)
+    if known is not None and not _lies_at(known, place):
+        raise ModuleNotFoundError(
+            f"a module of yours must have a name of its own: {name!r} is another's; rename it",
+            name=name,
+        )
+    if name in sys.modules:
+        return
+    spec = _spec(name, place)
+    module = sys.modules[name] = module_from_spec(spec)
+    try:
+        if spec.loader is not None:
+            spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    parent, _, last = name.rpartition(".")
+    if parent:
+        setattr(sys.modules[parent], last, module)
+    else:
+        _OWN[name] = module
+
+
+def _lies_at(spec: ModuleSpec, place: Path) -> bool:
+    files = [spec.origin or "", *(spec.submodule_search_locations or ())]
+    return any(Path(file).with_suffix("") in (place, place / "__init__") for file in files)
+
+
+def _spec(name: str, place: Path) -> ModuleSpec:
+    """Of a module's source, a package, or a folder with modules."""
+    file = _file(place)
+    if file is None:
+        spec = ModuleSpec(name, None, is_package=True)
+        spec.submodule_search_locations = [str(place)]
+        return spec
+    inside = [str(place)] if file.name == "__init__.py" else None
+    found = spec_from_file_location(
+        name, file, loader=_Source(name, str(file)), submodule_search_locations=inside
+    )
+    assert found is not None
+    return found
+
+
+class _Source(SourceFileLoader):
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)

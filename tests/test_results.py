@@ -1,0 +1,118 @@
+"""One description of a figure makes its column, its cell, its JSON and its headline."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pandas as pd
+import pytest
+
+from ep2sindy.report.results import Metric, ResultTable, View, facts, percent
+
+
+@dataclass(frozen=True)
+class Fit:
+    error: float
+    r2: Mapping[str, float]
+    status: str = "converged"
+
+
+METRICS: list[Metric[Fit]] = [
+    Metric("status", lambda fit: fit.status, View.ALL & ~View.HEADLINE),
+    Metric("f_error", lambda fit: fit.error, View.ALL, heading="its error", format=percent(1)),
+    Metric("r2", lambda fit: fit.r2, View.ALL, heading="R2 of {}", format="{:.2f}"),
+    Metric("r2_text", lambda fit: str(fit.r2), View.JSON),
+]
+FITS = {"free": Fit(0.012, {"x": 0.5, "y": 0.25}), "tied": Fit(float("nan"), {"x": 1.0, "y": 0.0})}
+TABLE = ResultTable(FITS, METRICS)
+
+
+def test_a_row_per_record_spreads_states_over_columns() -> None:
+    table = TABLE.csv("fit")
+    assert list(table) == ["fit", "status", "f_error", "r2_x", "r2_y"]
+    assert table["r2_y"].tolist() == [0.25, 0.0]
+
+
+def test_a_row_per_state_repeats_what_has_no_states() -> None:
+    table = TABLE.csv("fit", by_state=True)
+    assert table["fit"].tolist() == ["free", "free", "tied", "tied"]
+    assert table["state"].tolist() == ["x", "y", "x", "y"]
+    assert table["r2"].tolist() == [0.5, 0.25, 1.0, 0.0]
+    assert table["f_error"][:2].tolist() == [0.012, 0.012]
+
+
+def test_cells_are_formatted_and_dashed_where_there_is_no_number() -> None:
+    table = TABLE.screen("fit")
+    assert list(table) == ["fit", "status", "its error", "R2 of x", "R2 of y"]
+    assert table["its error"].tolist() == ["1.2 %", "-"]
+    assert table["R2 of x"].tolist() == ["0.50", "1.00"]
+
+
+def test_of_several_states_the_first_row_alone_has_what_they_share() -> None:
+    metrics = [METRICS[1], Metric("r2", lambda fit: fit.r2, View.SCREEN, heading="R2")]
+    table = ResultTable(FITS, metrics).screen("fit", by_state=True)
+    assert table.to_dict("list") == {
+        "fit": ["free", "", "tied", ""],
+        "state": ["x", "y", "x", "y"],
+        "its error": ["1.2 %", "", "-", ""],
+        "R2": [0.5, 0.25, 1.0, 0.0],
+    }
+
+
+def test_a_few_records_stand_upright() -> None:
+    table = ResultTable({"value": FITS["free"]}, METRICS).upright()
+    assert table.to_dict("list") == {
+        "quantity": ["status", "its error", "R2 of x", "R2 of y"],
+        "value": ["converged", "1.2 %", "0.50", "0.25"],
+    }
+
+
+def test_json_keeps_states_together_and_headlines_part_them() -> None:
+    assert TABLE.json()["free"] == {
+        "status": "converged",
+        "f_error": 0.012,
+        "r2": {"x": 0.5, "y": 0.25},
+        "r2_text": "{'x': 0.5, 'y': 0.25}",
+    }
+    headline = ResultTable({"free": FITS["free"]}, METRICS).headline()
+    assert headline == {"free/f_error": 0.012, "free/x/r2": 0.5, "free/y/r2": 0.25}
+
+
+def test_records_need_no_names() -> None:
+    table = ResultTable(list(FITS.values()), METRICS)
+    assert list(table.csv()) == ["status", "f_error", "r2_x", "r2_y"]
+    assert list(ResultTable([FITS["free"]], METRICS[1:2]).headline()) == ["f_error"]
+
+
+def test_no_records_make_no_rows() -> None:
+    empty: ResultTable[Fit] = ResultTable({}, METRICS)
+    assert empty.csv("fit").empty
+    assert empty.screen("fit").empty
+    assert empty.headline() == {}
+
+
+def test_a_metric_is_taken_of_a_part_of_a_larger_record() -> None:
+    pair = {"first": FITS["free"], "second": FITS["tied"]}
+    metrics: list[Metric[Mapping[str, Fit]]] = [
+        m.of(lambda p: p["second"], "{}_second") for m in METRICS[:3]
+    ]
+    table = ResultTable({"both": pair}, metrics).csv()
+    assert table["r2_second_x"].tolist() == [1.0]
+    assert list(facts(pair, metrics)) == ["status_second", "f_error_second", "r2_second"]
+
+
+def test_a_column_may_hold_the_state_in_its_middle() -> None:
+    metric: Metric[Fit] = Metric("f", lambda fit: fit.r2, View.CSV, column="f_{}_Hz")
+    assert list(ResultTable([FITS["free"]], [metric]).csv()) == ["f_x_Hz", "f_y_Hz"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.1234, "+12.3 %"), (-0.5, "-50.0 %"), (float("nan"), "-")]
+)
+def test_shares_read_as_percent(value: float, text: str) -> None:
+    assert percent(1, sign=True)(value) == text
+
+
+def test_what_has_no_format_is_left_to_the_table() -> None:
+    assert METRICS[0].cell("converged") == "converged"
+    assert Metric("n", len).cell(None) is None
+    assert pd.isna(Metric("n", len).cell(float("nan")))  # type: ignore[call-overload]
