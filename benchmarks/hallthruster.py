@@ -21,7 +21,7 @@ import xarray as xr
 import yaml
 
 import ep2sindy as ep
-from ep2sindy.thruster.landmark import read_landmark_rates
+from benchmarks.landmark import LANDMARK_POINT, landmark_thruster, read_landmark_rates
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"
@@ -88,9 +88,9 @@ def net_thrust(run: xr.Dataset) -> float:
 def landmark_run(case: int) -> xr.Dataset:
     """LANDMARK's case as theirs: N = 200, inner radius 34.5 mm, first order in case 1."""
     rates = read_landmark_rates(RATE_TABLE)
-    thruster = replace(ep.landmark_thruster(case, rates), inner_radius=0.0345)
+    thruster = replace(landmark_thruster(case, rates), inner_radius=0.0345)
     return ep.simulate(
-        thruster, ep.LANDMARK_POINT, duration_s=2e-3, warm_up_s=0.0, n_cells=200, stretch=1.0,
+        thruster, LANDMARK_POINT, duration_s=2e-3, warm_up_s=0.0, n_cells=200, stretch=1.0,
         reconstruct=case > 1, progress=False,
     )  # fmt: skip
 

@@ -55,7 +55,7 @@ class Case:
 @cache
 def record(label: str, zone_mm: tuple[int, int]) -> ep.Trajectory:
     """Zone averages of the default simulation."""
-    field = ep.simulate_cached(
+    field = ep.simulate(
         ep.Thruster(), POINTS[label], cache=Path(".cache/simulations"), progress=False
     )
     zone = ep.Zone(z=(1e-3 * zone_mm[0], 1e-3 * zone_mm[1]))
@@ -64,11 +64,11 @@ def record(label: str, zone_mm: tuple[int, int]) -> ep.Trajectory:
 
 def selected(fitted: ep.Trajectory, *, seed: int, weak: bool = False) -> ep.Discovery:
     """By free runs, from the library of degree 2, up to 4 + 4 terms."""
-    recipe = ep.Recipe(
+    recipe = ep.Regression(
         ep.WeightedWeak() if weak else ep.Differential(),
         ep.BestSubset(max_terms=4, n_best=2),
-        ep.Bootstraps(n=0),
         ep.FreeRunScore(seed=seed),
+        ep.Bootstraps(n=0),
         depth=2,
     )
     library = ep.polynomial(["n_i", "n_n"], degree=2)

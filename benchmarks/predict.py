@@ -43,7 +43,7 @@ def recorded(
     voltage: float, flow: float, thruster: ep.Thruster | None = None
 ) -> OperatingRecord | None:
     """None where the simulation does not breathe."""
-    field = ep.simulate_cached(
+    field = ep.simulate(
         thruster or ep.Thruster(),
         ep.OperatingPoint(float(voltage), float(flow)),
         cache=".cache/simulations",

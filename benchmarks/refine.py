@@ -28,11 +28,11 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.methods.nelder_mead import window_paths
-from ep2sindy.refinement.methods.single_shooting import SingleShooting
 from ep2sindy.refinement.ode import ODE, HermiteSimpson
 from ep2sindy.refinement.problem import Iteration, Problem
 from ep2sindy.refinement.refine import refine, refine_many
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
+from tests.single_shooting import SingleShooting
 
 DT_S, N_SAMPLES, N_WINDOWS, WINDOW = 1.5e-6, 12001, 30, 100
 CLOSE = 1e-4  # of the optimal loss

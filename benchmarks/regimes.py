@@ -11,8 +11,8 @@ import argparse
 import numpy as np
 from sklearn.metrics import adjusted_rand_score
 
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Loky
@@ -35,11 +35,11 @@ def found(truth: RegionField, rule: Selection, *, noise: float, seed: int) -> Re
     search = PointSearch(
         states=STATES,
         library=truth.library,
-        recipe=Recipe(
+        method=Regression(
             formulation=Differential(),
             search=BestSubset(max_terms=5),
-            bootstraps=Bootstraps(n=32, n_culled=0, block=35),
             selection=rule,
+            bootstraps=Bootstraps(n=32, n_culled=0, block=35),
         ),
         seed=seed,
     )

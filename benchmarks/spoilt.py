@@ -154,7 +154,7 @@ def main() -> None:
     parser.add_argument("--align", action="store_true", help="bring late channels together")
     parser.add_argument("--words", action="store_true", help="what was said of doubtful ones")
     asked = parser.parse_args()
-    recipe = ep.Recipe(search=ep.Joint(align=asked.align))
+    recipe = ep.TrajectorySearch(align=asked.align)
     total: Counter[str] = Counter()
     for kind, name in product(asked.kinds, asked.systems):
         counts: Counter[str] = Counter()

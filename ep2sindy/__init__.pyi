@@ -28,7 +28,8 @@ from ep2sindy.discovery.pointwise import pointwise as pointwise
 from ep2sindy.estimation.estimate import estimate as estimate
 
 # Searches
-from ep2sindy.estimation.solver import Joint as Joint  # for configs
+from ep2sindy.discovery.method import TrajectorySearch as TrajectorySearch  # for configs
+from ep2sindy.discovery.method import Regression as Regression  # for configs
 from ep2sindy.search.searches import BestSubset as BestSubset  # for configs
 from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso  # for configs
 from ep2sindy.search.searches import STLSQ as STLSQ  # for configs

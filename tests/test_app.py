@@ -17,7 +17,7 @@ from ep2sindy.app.build import Configured
 from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_config, study_class
 from ep2sindy.app.schema import keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.runtime.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
@@ -36,7 +36,7 @@ class Inner:
 class Toy:
     """A study's signature with every kind of key."""
 
-    recipe: Recipe
+    recipe: AnyMethod
     n: Count
     share: Share
     span: PositiveOrAll

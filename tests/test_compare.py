@@ -14,7 +14,10 @@ from ep2sindy.app.sweep import parted, write_index
 from ep2sindy.report.results import LABELS, in_words
 from tests.browser import seen
 
-CONFIG = "experiment: discover\nseed: 0\nsearch: {_target_: ep2sindy.Joint, max_terms: MOST}\n"
+CONFIG = (
+    "experiment: discover\nseed: 0\n"
+    "search: {_target_: ep2sindy.TrajectorySearch, max_terms: MOST}\n"
+)
 
 
 def model(slope: float, width: float, *more: str) -> ep.SparseModel:

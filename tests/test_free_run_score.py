@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.constraints.relations import binding, completed, parse_relation
+from ep2sindy.constraints.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.selection.systems import folds_of
 
@@ -33,11 +33,11 @@ def record(n_periods=24.0, *, noise=0.0, seed=0):
 
 
 def recipe(*, max_terms=3, n_best=2, formulation=None, **settings):
-    return ep.Recipe(
+    return ep.Regression(
         formulation or ep.Differential(),
         ep.BestSubset(max_terms=max_terms, n_best=n_best),
-        ep.Bootstraps(n=0),
         ep.FreeRunScore(n_windows=4, n_folds=2, **settings),
+        ep.Bootstraps(n=0),
         depth=n_best,
     )
 
@@ -193,8 +193,12 @@ SHARED = "x: x*y == -1 * y: x*y"
 )
 def test_relations_hold_to_the_last_digit(rule):
     run = PREY.trajectory(noise=0.02, rng=0)
-    how = ep.Recipe(
-        ep.WeightedWeak(), ep.BestSubset(max_terms=2), ep.Bootstraps(n=0), rule, depth=1
+    how = ep.Regression(
+        ep.WeightedWeak(),
+        ep.BestSubset(max_terms=2),
+        rule,
+        ep.Bootstraps(n=0),
+        depth=1,
     )
     library = ep.polynomial(["x", "y"], degree=2)
     tied = ep.discover(run, library, how, relations=[SHARED]).model
@@ -204,7 +208,7 @@ def test_relations_hold_to_the_last_digit(rule):
 
 def test_a_coefficient_keeps_the_value_it_is_given():
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    value, how = "x: x*y == -1.1", ep.Recipe(ep.WeightedWeak())
+    value, how = "x: x*y == -1.1", ep.Regression(ep.WeightedWeak())
     free, fixed = (ep.discover(run, None, how, relations=r).model for r in ((), [value]))
     assert fixed.terms("x")["x*y"] == -1.1
     together = ep.discover(run, relations=[value])
@@ -242,10 +246,10 @@ def test_supports_are_completed_by_what_relations_ask():
     library = ep.polynomial(["x", "y"], degree=2)  # 1, x, y, x^2, x*y, y^2
     masks = np.array([[0, 1, 0, 0, 0, 0], [0, 1, 0, 0, 1, 0]], dtype=bool)
     shared = [parse_relation(SHARED)]
-    both = completed(masks, library, "x", shared)
+    both = complete(masks, library, "x", shared)
     assert both.tolist() == [[False, True, False, False, False, False],
                              [False, True, False, False, True, False]]  # fmt: skip
-    valued = completed(masks, library, "x", [parse_relation("x: 1 == 2")])
+    valued = complete(masks, library, "x", [parse_relation("x: 1 == 2")])
     assert valued[:, 0].all()
     assert len(valued) == 2
     assert binding(shared, {"x": ("x*y",), "y": ("y",)}) is None

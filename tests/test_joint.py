@@ -5,10 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from benchmarks.joint import find, rates, run_family
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.operating.law import fit_law
@@ -21,10 +22,9 @@ from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection
-from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.synthetic.systems import lotka_volterra
 
-METHOD = Recipe(
+METHOD = Regression(
     WeightedWeak(Weak(test_functions=Bumps(half_width_s=1.5), split=RandomSplit(0.0))),
     BestSubset(n_best=5),
     selection=EBIC(),
@@ -40,6 +40,7 @@ class Given:
     """Rows made by a test, found by the label of their trajectory."""
 
     rows: Mapping[str, RegressionRows]
+    smoother: None = None
 
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
@@ -82,7 +83,7 @@ def searched(
     return discover_jointly(
         {point: [label(point)] for point in rows},
         named_terms(NAMES, NAMES),
-        Recipe(formulation=Given(rows), search=search, selection=selection),
+        Regression(formulation=Given(rows), search=search, selection=selection),
         seed=np.random.default_rng(0),
     )
 
@@ -95,7 +96,7 @@ def searched(
 def test_one_point_gives_what_discover_does(formulation: Formulation, selection: Selection) -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=np.random.default_rng(0)).window(0, 300)
     library = polynomial(["x", "y"], degree=3)
-    recipe = Recipe(formulation, BestSubset(n_best=3), selection=selection, depth=3)
+    recipe = Regression(formulation, BestSubset(n_best=3), selection=selection, depth=3)
     alone = discover([run], library, recipe, seed=1)
     joint = discover_jointly({"A": [run]}, library, recipe, seed=1)
     for state, front in alone.fronts.items():
@@ -226,7 +227,7 @@ def test_points_may_be_sampled_differently() -> None:
             "slow": [slow.trajectory(), slow.trajectory().window(0, 400)],
         },
         polynomial(["x", "y"], degree=3),
-        Recipe(formulation=WeightedWeak(), search=BestSubset(), selection=EBIC()),
+        Regression(formulation=WeightedWeak(), search=BestSubset(), selection=EBIC()),
         seed=np.random.default_rng(0),
     )
     assert found.models["fast"].terms("x") == pytest.approx({"x": 2 / 3, "x*y": -1.0}, rel=1e-6)
@@ -322,7 +323,7 @@ def test_a_law_with_a_term_per_point_is_no_tie() -> None:
 
 
 def test_a_study_judges_all_points_jointly_and_each_alone() -> None:
-    method = Recipe(Differential(split=RandomSplit(0.0)), BestSubset(max_terms=3))
+    method = Regression(Differential(split=RandomSplit(0.0)), BestSubset(max_terms=3))
     outcomes = run_family(method, noises=[0.01], n_realizations=2, workers=Serial(), seed=3)
     table = rates(outcomes)
     assert list(table.columns) == ["joint", "pooled", *PARAMETERS]

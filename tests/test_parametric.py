@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.point_fits import (
@@ -73,7 +73,7 @@ def study(*, weak: bool = True) -> PointStudy:
         bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
         refining=Refining(n_windows=10, periods=0.5, max_iter=50),
         searched=SEARCHED,
-        recipe=Recipe(
+        recipe=Regression(
             Weak(split=every) if weak else Differential(NoSmoothing(), split=every),
             BestSubset(max_terms=3),
             selection=Knee(n_norm="max_terms"),

@@ -79,12 +79,12 @@ def prey() -> ep.Trajectory:
     return ep.lotka_volterra().trajectory(noise=0.01, rng=0)
 
 
-def regression(selection: object = None, **settings: object) -> ep.Recipe:
-    return ep.Recipe(
+def regression(selection: object = None, **settings: object) -> ep.Regression:
+    return ep.Regression(
         ep.Differential(),
         ep.BestSubset(max_terms=2),
-        ep.Bootstraps(**({"n": 4} | settings)),
         selection or ep.EBIC(),
+        ep.Bootstraps(**({"n": 4} | settings)),
     )
 
 
@@ -153,7 +153,7 @@ def test_refinements_tell_their_iterations_and_windows(prey: ep.Trajectory) -> N
 def test_a_search_of_all_points_tells_points_and_equations(prey: ep.Trajectory) -> None:
     watch = Recorder()
     points = {"a": [prey], "b": [ep.lotka_volterra().trajectory(noise=0.01, rng=1)]}
-    recipe = ep.Recipe(ep.Differential(), ep.BestSubset(max_terms=2))
+    recipe = ep.Regression(ep.Differential(), ep.BestSubset(max_terms=2))
     ep.discover_jointly(points, LIBRARY, recipe, progress=watch)
     assert [(each.unit, each.total) for each in watch.stages] == [("point", 2), ("equation", 2)]
     watch.check()
@@ -218,7 +218,7 @@ def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.Captu
     }
     simulators = {name for name, default in asking.items() if default is True}
     assert simulators == {
-        "simulate", "simulate_cached", "simulate_2d", "simulate_2d_cached",
+        "simulate", "simulate_2d",
         "simulate_hallthruster_input",
     }  # fmt: skip
     assert {asking[name] for name in set(asking) - simulators} == {False}

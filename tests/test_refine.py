@@ -14,12 +14,12 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.methods.nelder_mead import NelderMead
-from ep2sindy.refinement.methods.single_shooting import SingleShooting
 from ep2sindy.refinement.ode import HermiteSimpson, RungeKutta
 from ep2sindy.refinement.problem import Iteration, Method
 from ep2sindy.refinement.refine import Refinement, loss_against_window, refine, refine_many
 from ep2sindy.refinement.windows import cut_windows, dominant_window
 from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
+from tests.single_shooting import SingleShooting
 
 PREY, LORENZ = lotka_volterra(), lorenz()
 LONG = replace(PREY, duration_s=300.0)  # 30 windows of 100 samples, none twice

@@ -5,8 +5,8 @@ import pytest
 import xarray as xr
 from sklearn.metrics import adjusted_rand_score
 
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import Regimes, find_regimes, group_points
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Serial
@@ -34,11 +34,11 @@ def studied(size: str, noise: float, *, seed: int = 0, one_equation: bool = Fals
     search = PointSearch(
         states=STATES,
         library=truth.library,
-        recipe=Recipe(
+        method=Regression(
             formulation=Differential(),
             search=BestSubset(max_terms=5),
-            bootstraps=Bootstraps(n=8, n_culled=0),
             selection=EBIC(),
+            bootstraps=Bootstraps(n=8, n_culled=0),
         ),
         seed=seed,
     )

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from ep2sindy.app import main as program
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.threads import NUMBERS, one_thread
 from ep2sindy.search.front import ParetoFront
@@ -88,7 +88,7 @@ def test_a_refinement_runs_on_one_thread() -> None:
 
 def test_a_discovery_runs_on_one_thread() -> None:
     rule = WatchedChoice()
-    discover(PREY.trajectory(), recipe=Recipe(WeightedWeak(), selection=rule))
+    discover(PREY.trajectory(), method=Regression(WeightedWeak(), selection=rule))
     assert rule.seen == [(1, 1)]
     assert threads() == (2, 2)
 

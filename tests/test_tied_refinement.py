@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.breathing_family import LAW, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
@@ -15,7 +16,6 @@ from ep2sindy.refinement.law import TiedRefinement, refine_tied
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine_many
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
-from ep2sindy.synthetic.family import LAW, PARAMETERS, TRUTH, realization, system_at
 
 POINTS = list(PARAMETERS)
 WINDOW, N_WINDOWS = 60, 4

@@ -45,7 +45,7 @@ def test_the_growth_rate_is_that_of_the_signal():
 def test_the_toda_oscillator_is_found_with_its_known_equation_exact():
     run = toda()
     found = ep.embed(ep.trace(recorded(run.t, run.states[:, 0]))).embedded
-    recipe = ep.Recipe(ep.Differential(ep.KalmanSmoother()), ep.BestSubset(max_terms=3))
+    recipe = ep.Regression(ep.Differential(ep.KalmanSmoother()), ep.BestSubset(max_terms=3))
     library = ep.polynomial(["x", "g"], degree=3)
     model = ep.discover(
         found.run, library, recipe, relations=found.relations, terms=found.terms
@@ -62,7 +62,7 @@ def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
     states = found.embedded
     assert states.run.units == {"x": "A", "v": "A s^-1"}
     library = ep.polynomial(["x", "v"], degree=2)
-    recipe = ep.Recipe(ep.Differential(ep.KalmanSmoother()), ep.BestSubset(max_terms=2))
+    recipe = ep.Regression(ep.Differential(ep.KalmanSmoother()), ep.BestSubset(max_terms=2))
     model = ep.discover(
         states.run, library, recipe, relations=states.relations, terms=states.terms
     ).model

@@ -231,7 +231,7 @@ def test_a_long_list_is_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_text_that_becomes_a_group_is_looked_at_as_one(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    said = {"data": "${oc.create:'{_target_: ep2sindy.simulate_cached, cache: ../elsewhere}'}"}
+    said = {"data": "${oc.create:'{_target_: ep2sindy.simulate, cache: ../elsewhere}'}"}
     with pytest.raises(ValueError, match=r"data\.cache to a folder below"):
         check_places(resolved(OmegaConf.create(said)), [])
     check_places(resolved(OmegaConf.create(said)), ["data.cache=../elsewhere"])

@@ -10,7 +10,7 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
-from ep2sindy.studies.source import FieldSource, Step
+from ep2sindy.studies.source import Step, open_prepared
 
 
 def simulation(status: str, n_samples: int = 2000) -> xr.Dataset:
@@ -53,14 +53,14 @@ STEPS: list[Step] = [
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying", "transit"])
 @pytest.mark.parametrize("k", range(len(STEPS)))
 def test_no_step_makes_a_simulation_silent(status: str, k: int) -> None:
-    field = FieldSource(Data(simulation(status)), [STEPS[k]]).field()
+    field = open_prepared(Data(simulation(status)), [STEPS[k]])
     assert is_simulation(field.attrs)
     assert amiss(field.attrs)
 
 
 def test_a_run_that_broke_at_once_is_no_data() -> None:
     with pytest.raises(DivergedError, match="it diverged after 3; try shorter steps"):
-        FieldSource(Data(simulation("diverged", 3))).field()
+        open_prepared(Data(simulation("diverged", 3)), ())
 
 
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying"])

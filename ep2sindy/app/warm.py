@@ -80,7 +80,9 @@ def _search() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     found = ep.discover(run)
     for method in (ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset()):
-        ep.discover(run, recipe=ep.Recipe(ep.Differential(), method, ep.Bootstraps(n=2), ep.Knee()))
+        ep.discover(
+            run, method=ep.Regression(ep.Differential(), method, ep.Knee(), ep.Bootstraps(n=2))
+        )
     found.model.simulate(run.t, run.states[0])
 
 

@@ -33,6 +33,8 @@ def front_figure(
 ) -> Figure:
     """Error against number of terms for every equation, log, the selected candidate marked.
 
+    Of a search of trajectories, which has no rows and so no error of them, the scores instead.
+
     Behind the front, light, every support that the search proposed. Errors below FLOOR are drawn
     on a line at it, those above TOP as marks at the upper edge.
     scores: by state, one per candidate, the lowest selected; label: what they are called.
@@ -41,7 +43,10 @@ def front_figure(
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
         chosen = selected(front, scores[state])
         index = front.candidates.index(chosen)
-        _front(ax, front, index)
+        if front.problem is None:
+            _scored_front(ax, front, scores[state], index, label)
+        else:
+            _front(ax, front, index)
         _hovers(ax, front, scores[state], label)
         score = f"{_score_label(label)} = {scores[state][index]:.4g}"
         ax.set_title(f"${latex_derivative(state)}$: {_terms(chosen)}\n{score}", fontsize=9)
@@ -74,7 +79,7 @@ def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
         front.sizes[chosen], errors[chosen], "*", ms=14, color=COLOURS[1], mec="white", mew=0.5,
         zorder=5, label=star,
     )  # fmt: skip
-    rows = "held-out" if front.problem.test.any() else "training"
+    rows = "held-out" if front.held_out else "training"
     ax.set(xlabel="number of terms", ylabel=f"error, $1 - R^2$ ({rows} rows)", yscale="log")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_ylim(0.4 * max(FLOOR, float(lowest)), TOP)
@@ -88,14 +93,50 @@ def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
         )  # fmt: skip
 
 
+def _scored_front(
+    ax: Axes, front: ParetoFront, scores: np.ndarray, chosen: int, label: str
+) -> None:
+    """Runners-up, the best of every size as a line, and the star, by their scores.
+
+    Linear near zero, where the best are. A candidate that cannot be run, such as an equation
+    without terms, has no finite score, and stands at the upper edge.
+    """
+    _, runners_up, best_of_size, star = _LAYERS
+    best, heights = front.leading, _finite(scores)
+    if not best.all():
+        others = front.sizes[~best], heights[~best]
+        ax.plot(*others, "o", mfc="none", mec=COLOURS[0], ms=5, zorder=3, label=runners_up)
+    ax.plot(
+        front.sizes[best], heights[best], "o-", c=COLOURS[0], ms=5, lw=1, zorder=4,
+        label=best_of_size,
+    )  # fmt: skip
+    ax.plot(
+        front.sizes[chosen], heights[chosen], "*", ms=14, color=COLOURS[1], mec="white", mew=0.5,
+        zorder=5, label=star,
+    )  # fmt: skip
+    ax.set(xlabel="number of terms", ylabel=_score_label(label))
+    ax.set_yscale("symlog", linthresh=1.0)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.margins(x=0.06)
+    ax.grid(axis="y", alpha=0.25)
+
+
+def _finite(scores: np.ndarray) -> np.ndarray:
+    """Scores, those without a finite one at ten times the largest that has."""
+    known = scores[np.isfinite(scores)]
+    return np.where(np.isfinite(scores), scores, 10.0 * max(known.max(initial=1.0), 1.0))
+
+
 def _hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
     """Over every candidate something that cannot be seen, and says which it is."""
-    errors = np.clip(front.errors, FLOOR, TOP)
-    for each, error, score in zip(front.candidates, errors, scores, strict=True):
-        (spot,) = ax.plot(each.n_terms, error, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
+    has_rows = front.problem is not None
+    heights = np.clip(front.errors, FLOOR, TOP) if has_rows else _finite(scores)
+    for each, height, score in zip(front.candidates, heights, scores, strict=True):
+        (spot,) = ax.plot(each.n_terms, height, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
         terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
         text = f"{front.equation}' of {each.n_terms} terms: {terms}"
-        hover(spot, f"{text} | 1 - R2 = {error:.3g} | {label} = {score:.4g}")
+        error = f" | 1 - R2 = {height:.3g}" if has_rows else ""
+        hover(spot, f"{text}{error} | {label} = {score:.4g}")
 
 
 def _cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:

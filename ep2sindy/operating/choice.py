@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.operating.fit import (
@@ -72,9 +72,9 @@ def candidate_structures(
 
     One search over all records: a term is in or out everywhere. Rows are those of the derivative.
     """
-    recipe = Recipe(formulation=Differential(), search=BestSubset(max_terms=max_terms))
+    method = Regression(formulation=Differential(), search=BestSubset(max_terms=max_terms))
     runs = {record.label: [record.run] for record in records}
-    found = discover_jointly(runs, library, recipe, progress=progress)
+    found = discover_jointly(runs, library, method, progress=progress)
     sizes = {
         state: [support for support in front.supports if len(support) >= 2]
         for state, front in found.fronts.items()

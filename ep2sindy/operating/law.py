@@ -34,7 +34,7 @@ from ep2sindy.selection.rule import FLOOR
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 
-# Steps of weighting and correction of the last fit, as `reweighted` takes them.
+# Steps of weighting and correction of the last fit, as `reweight` takes them.
 N_STEPS = 8
 
 INSIDE = 1e-6  # a point this far outside the hull, in ranges of the parameters, lies on its edge
@@ -382,7 +382,7 @@ def _tied(
     n_given_up = sum(fit.n_terms for fit in fits.values()) - coef.size
     n_left = len(target) - sum(fit.n_terms for fit in fits.values())
     F = max(float(growth), 0.0) / n_given_up if n_given_up > 0 else np.nan
-    known = all(each.problem.noisy is not None for each in front.points.values())
+    known = all(each.rows.noisy is not None for each in front.points.values())
     test = LawTest(
         r2_free={
             p: _r2(each, shared.models[p].terms(front.equation)) for p, each in front.points.items()
@@ -411,7 +411,7 @@ class _FreeFit:
 
     @staticmethod
     def of(front: ParetoFront, k: int, terms: Sequence[str]) -> _FreeFit:
-        problem, candidate = front.problem, front.candidates[k]
+        problem, candidate = front.rows, front.candidates[k]
         equation = problem.equations.index(front.equation)
         scale = problem.coef_scale(equation)
         theta, target = problem.train_theta, problem.train_target(equation)
@@ -436,7 +436,7 @@ class _FreeFit:
 
 def _r2(front: ParetoFront, coef: Mapping[str, float]) -> float:
     """R2 of SI coefficients on the training rows of one point."""
-    problem = front.problem
+    problem = front.rows
     equation = problem.equations.index(front.equation)
     scale = problem.coef_scale(equation)
     scaled = coef_matrix(problem.library, [coef])[:, 0] / scale

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.likeness import FreeRunBounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import DrivenWindows, Ensemble
@@ -35,7 +37,7 @@ from ep2sindy.selection.systems import (
     budget,
     folds_of,
     records_of,
-    system_of,
+    systems_of,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
 
@@ -124,28 +126,32 @@ class FreeRunScore:
         if not 0.0 < self.margin <= 1.0:
             raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
+    def scores(
+        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
+    ) -> list[Float[np.ndarray, " _candidates"]]:
         """Those of `decide`."""
-        return list(self.decide(fronts).scores)
+        return list(self.decide(fronts, library, runs).scores)
 
     def decide(
         self,
         fronts: Sequence[ParetoFront],
+        library: Library,
+        runs: Sequence[Trajectory],
         relations: Sequence[Relation] = (),
         *,
         progress: Progress = SILENT,
     ) -> Decision:
-        """Raises ValueError for rows without trajectories, a state without a front, more than
+        """Raises ValueError for no runs, a state without a front, more than
         max_combinations, or relations that no combination has the terms for.
         """
-        records = records_of(fronts)
+        records = records_of(fronts, runs)
         cycles = cycles_of(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
             rule = RefinedScore(max_combinations=self.max_combinations)
-            found = rule.decide(fronts, relations, progress=progress)
+            found = rule.decide(fronts, library, runs, relations, progress=progress)
             return replace(found, note=f"{cycles}: chosen by windows held out instead")
         places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
-        systems = [system_of(fronts, choice, relations) for choice in places]
+        systems = systems_of(fronts, places, library, runs, relations)
         trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
         winner, model, note = self._winner(records, cycles, trials, progress)

@@ -19,7 +19,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Finding, Recipe
+from ep2sindy.discovery.method import DiscoveryMethod, Finding
 from ep2sindy.figures.identified import (
     COUNTS,
     MERITS,
@@ -73,7 +73,7 @@ TITLES = {
 
 @runtime_checkable
 class Variant(Protocol):
-    """A complete method: trajectories and a library in, supports out; a `Recipe` is one."""
+    """A complete method: trajectories and a library in, supports out; a `Regression` is one."""
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
@@ -231,7 +231,7 @@ def first_realizations(
 
     Others offer supports alone.
     """
-    recipes = [(name, each) for name, each in variants.items() if isinstance(each, Recipe)]
+    recipes = [(name, each) for name, each in variants.items() if isinstance(each, DiscoveryMethod)]
     if not recipes:
         return None
     name, recipe = recipes[-1]

@@ -14,7 +14,7 @@ import pandas as pd
 
 from ep2sindy.constraints.relations import Constraint, constraint
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.windows import loss_against_window_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
@@ -24,7 +24,6 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import SILENT, Progress, counted
-from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import (
     COMPARED,
@@ -141,9 +140,9 @@ class Study:
         self, train: Trajectory, *, rng: np.random.Generator, progress: Progress
     ) -> SparseModel:
         """The model that lives on its own, in the library of degree 2."""
-        recipe = Recipe(self.formulation, bootstraps=Bootstraps(n=0))
+        rows = Regression(self.formulation)
         library = polynomial(train.state_names, degree=2)
-        return self.living.found(train, library, recipe, rng=rng, progress=progress).model
+        return self.living.found(train, library, rows, rng=rng, progress=progress).model
 
     def _check_windows(self, train: Trajectory) -> None:
         """Raise ValueError for windows that the fitted part of the data cannot hold."""

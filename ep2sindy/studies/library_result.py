@@ -11,17 +11,19 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import assemble_model
+from ep2sindy.discovery.choice import LeftOver, NoiseTest
 from ep2sindy.discovery.discover import Discovery
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
 from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
-from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.search.front import Candidate, ParetoFront, fit_support
 from ep2sindy.selection.rule import selected
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.term_roles import Roles
@@ -57,7 +59,7 @@ class LibraryResult:
     selected model over the records beside the first.
     """
 
-    recipe: Recipe
+    recipe: AnyMethod
     discovery: Discovery
     selected: FreeRun
     given: Mapping[str, Mapping[str, float]]
@@ -76,8 +78,8 @@ class LibraryResult:
         """The fronts as in the thesis's Tables I-III, and terms that the data cannot tell apart."""
         found = self.discovery
         fronts = [
-            ResultTable(candidate_rows(found, state), _columns(self.label)).csv()
-            for state in found.fronts
+            ResultTable(candidate_rows(front), _columns(self.label, front)).csv()
+            for front in found.fronts.values()
         ]
         ambiguities = [(a.exact, " ".join(a.terms), a.message) for a in found.ambiguities]
         return {
@@ -111,12 +113,16 @@ class LibraryResult:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A candidate of a front; terms: as the model has them, which may be weighted otherwise."""
+    """A candidate of a front.
+
+    terms: as the model has them, which may be weighted otherwise. left: of the noise, by the terms
+    of the model; None where that is not known.
+    """
 
     candidate: Candidate
-    score: float
     is_selected: bool
     terms: Mapping[str, float]
+    left: LeftOver | None = None
 
 
 TRAJECTORY: Metrics[FreeRun] = [
@@ -129,14 +135,17 @@ TRAJECTORY: Metrics[FreeRun] = [
 ]  # fmt: skip
 
 
-def _columns(label: str) -> Metrics[Row]:
+def _columns(label: str, front: ParetoFront) -> Metrics[Row]:
     """Of a table of candidates; label: what their scores are called."""
+    r2: Metrics[Row] = [
+        Metric("r2_test", lambda row: row.candidate.r2_test),
+        Metric("r2_train", lambda row: row.candidate.r2_train),
+    ]
     return [
         Metric("equation", lambda row: row.candidate.equation),
         Metric("n_terms", lambda row: row.candidate.n_terms),
-        Metric("r2_test", lambda row: row.candidate.r2_test),
-        Metric("r2_train", lambda row: row.candidate.r2_train),
-        Metric(label, lambda row: row.score),
+        *([] if front.problem is None else r2),  # a search of trajectories has no rows
+        Metric(label, lambda row: row.candidate.score),
         Metric("share", lambda row: row.candidate.share),
         Metric("selected", lambda row: row.is_selected),
         Metric("text", lambda row: candidate_text(row.candidate)),
@@ -151,9 +160,9 @@ def _equation(label: str) -> Metrics[Row]:
         Metric("r2_test", lambda row: row.candidate.r2_test, compared),
         Metric("n_terms", lambda row: row.candidate.n_terms, compared),
         Metric("r2_train", lambda row: row.candidate.r2_train),
-        Metric(label, lambda row: row.score, compared),
-        Metric("chi_squared", lambda row: row.candidate.chi_squared),
-        Metric("residual_autocorrelation", lambda row: row.candidate.autocorrelation),
+        Metric(label, lambda row: row.candidate.score, compared),
+        Metric("chi_squared", lambda row: row.left and row.left.chi_squared),
+        Metric("residual_autocorrelation", lambda row: row.left and row.left.autocorrelation),
         Metric("share", lambda row: row.candidate.share),
         Metric("inclusion", lambda row: _inclusion(row.candidate)),
         Metric("text", lambda row: equation_text(row.candidate.equation, row.terms)),
@@ -164,31 +173,45 @@ def _inclusion(chosen: Candidate) -> dict[str, float]:
     return dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True))
 
 
-def candidate_rows(found: Discovery, state: str) -> list[Row]:
-    front, scores = found.fronts[state], found.scores[state]
-    chosen = selected(front, scores)
-    return [
-        Row(each, float(score), each is chosen, each.coef_by_term)
-        for each, score in zip(front.candidates, scores, strict=True)
-    ]
+def candidate_rows(front: ParetoFront) -> list[Row]:
+    chosen = selected(front, front.scores)
+    return [Row(each, each is chosen, each.coef_by_term) for each in front.candidates]
 
 
 def _chosen(result: LibraryResult, state: str) -> Row:
     found = result.discovery
-    least = float(found.scores[state].min())
-    return Row(found.chosen[state], least, True, found.model.terms(state))
+    chosen = selected(found.fronts[state], found.scores[state])
+    return Row(chosen, True, found.model.terms(state), found.noise_test.left.get(state))
 
 
-def refit(found: Discovery, published: Mapping[str, Mapping[str, float]]) -> dict[str, Candidate]:
+def refit(
+    found: Discovery,
+    published: Mapping[str, Mapping[str, float]],
+    rows: Regression,
+    runs: Sequence[Trajectory],
+    rng: np.random.Generator,
+) -> dict[str, Candidate]:
     """Published terms fitted to our rows, where the data can tell them from others."""
     fits = {}
+    problems = _rows_by_state(found, rows, runs, rng) if published else {}
     for state, terms in published.items():
         if state in found.fronts:
-            problem = found.fronts[state].problem
+            problem = problems[state]
             at_hand = set(compress(problem.term_names, usable_terms(problem)))
             if set(terms) <= at_hand:
                 fits[state] = fit_support(problem, state, list(terms))
     return fits
+
+
+def _rows_by_state(
+    found: Discovery, rows: Regression, runs: Sequence[Trajectory], rng: np.random.Generator
+) -> dict[str, RegressionRows]:
+    """By state the rows that were searched; of a search of trajectories, rows for a fit."""
+    fronts = found.fronts.values()
+    if known := {front.equation: front.problem for front in fronts if front.problem is not None}:
+        return known
+    problems = rows.formulation.assemble(runs, found.model.library, rng=rng)
+    return {state: problem for problem in problems for state in problem.equations}
 
 
 def run_refitted(
@@ -196,9 +219,11 @@ def run_refitted(
 ) -> FreeRun | None:
     if set(refitted) != set(data.state_names):
         return None
-    model = assemble_model(
-        found.model.library,
-        [refitted[state] for state in data.state_names],
+    coef = [refitted[state].coef_by_term for state in data.state_names]
+    model = SparseModel(
+        library=found.model.library,
+        states=data.state_names,
+        coef=coef_matrix(found.model.library, coef),
         units=data.units,
         provenance={**found.model.provenance, "search": "published terms, refitted"},
     )
@@ -222,18 +247,18 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
         )
     for state in found.fronts:
         blocks.append(readable_front(result, state, clock))
-        blocks += [Text(each) for each in left_over(found.chosen[state])]
+        blocks += [Text(each) for each in left_over(state, found.noise_test)]
     blocks.append(Text(column_note(result.label), page_only=True))
     return Section(f"{name}: candidates", [*blocks, Picture(f"front_{name}")])
 
 
-def left_over(chosen: Candidate) -> list[str]:
+def left_over(state: str, test: NoiseTest) -> list[str]:
     """A line on what the selected terms leave of the rows, where their noise is known."""
-    if chosen.chi_squared is None or chosen.autocorrelation is None:
+    if (left := test.left.get(state)) is None:
         return []
     return [
-        f"left over of {chosen.equation}': {chosen.chi_squared:.3g} times the noise, "
-        f"autocorrelation {chosen.autocorrelation:.2f} (1 and 0 where noise alone is left)"
+        f"left over of {state}': {left.chi_squared:.3g} times the noise, "
+        f"autocorrelation {left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
     ]
 
 
@@ -246,7 +271,7 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
     """Candidates, the selected one bold; below them the last fit, and what was published."""
     label = result.label
     front, scores = result.discovery.fronts[state], result.discovery.scores[state]
-    chosen, held_out = selected(front, scores), bool(front.problem.test.any())
+    chosen, held_out = selected(front, scores), front.held_out
 
     def equation(terms: Mapping[str, float], lead: str = "", mark: str = "") -> Equation:
         shown = {name: clock.seconds * coef for name, coef in terms.items()}
@@ -275,8 +300,9 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
         rows.append(row)
     header = "R2 test" if held_out else "R2 train"
     table = pd.DataFrame(rows, columns=["terms", header, label, "share", "model"])
-    if table["share"].isin(["-", ""]).all():  # of a search without bootstraps
-        del table["share"]
+    for column in (header, "share"):  # of a search without rows, or without bootstraps
+        if table[column].isin(["-", ""]).all():
+            del table[column]
     unit = clock.rate_unit(result.discovery.model.units[state])
     bold = [k for k, each in enumerate(front.candidates) if each is chosen]
     return Table(table, title=f"candidates for {state}' [{unit}]", bold=bold, italic=italic)
@@ -285,7 +311,8 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
 def column_note(label: str) -> str:
     """What the columns of the fronts say."""
     rule = RULES.get(label, f"{label}: the score of the selection, least selected")
-    return f"{rule}. {COLUMNS}"
+    # Candidates that are weighed by trajectories have neither rows nor bootstraps.
+    return f"{rule}." if label == "deviance" else f"{rule}. {COLUMNS}"
 
 
 def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.constraints.relations import constraint
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.figures.trends import rows_at, trends_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
@@ -29,6 +29,7 @@ from ep2sindy.operating.point_fits import (
 from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
 from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
 from ep2sindy.operating.records import point_label
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
@@ -131,7 +132,8 @@ class Study:
     """
 
     source: Source
-    recipe: Recipe
+    recipe: AnyMethod
+    formulation: Formulation
     parallel: Workers
     parameters: Mapping[str, str | None]
     points: Sequence[Mapping[str, Any]]
@@ -197,6 +199,7 @@ class Study:
             refining=self.refining,
             searched=self.library.library(),
             recipe=self.recipe,
+            formulation=self.formulation,
         )
 
 

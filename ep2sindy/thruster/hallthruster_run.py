@@ -7,14 +7,14 @@ from pathlib import Path
 import xarray as xr
 
 from ep2sindy.runtime.progress import Progress
-from ep2sindy.thruster.cache import simulate_cached
+from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.hallthruster_input import read_hallthruster_input
 
 
 def simulate_hallthruster_input(
     path: str | Path,
     *,
-    cache: str | Path,
+    cache: str | Path | None = None,
     duration_s: float | None = None,
     warm_up_s: float = 0.0,
     sample_s: float | None = None,
@@ -33,7 +33,7 @@ def simulate_hallthruster_input(
             f"{path}: simulation.grid must be an EvenGrid here; n_cells={given.run.n_cells} takes "
             "one of as many cells"
         )
-    return simulate_cached(
+    return simulate(
         given.thruster,
         given.operating_point,
         cache=cache,

@@ -151,7 +151,7 @@ def _said_to_hydra() -> dict[str, Case]:
 
 def _written() -> dict[str, Case]:
     """Where a run would write."""
-    away, data = "../elsewhere", "data: {_target_: ep2sindy.simulate_cached, cache: ../elsewhere}"
+    away, data = "../elsewhere", "data: {_target_: ep2sindy.simulate, cache: ../elsewhere}"
     places = {
         "output": (f"output: {away}", "output"),
         "output by a resolver": ("output: ${oc.env:HOME}", "output"),

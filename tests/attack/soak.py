@@ -32,7 +32,9 @@ def discover() -> None:
 
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     ep.discover(run)
-    ep.discover(run, recipe=ep.Recipe(ep.WeightedWeak(), ep.BestSubset(), ep.Bootstraps(n=2)))
+    ep.discover(
+        run, method=ep.Regression(ep.WeightedWeak(), ep.BestSubset(), bootstraps=ep.Bootstraps(n=2))
+    )
 
 
 def simulate() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from ep2sindy.thruster.axial.state_kernels import (
     Model,
     State,
 )
+from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import uncovered
 from ep2sindy.thruster.verdict import diagnose, performance
@@ -59,6 +61,7 @@ def simulate(
     cfl: float = CFL,
     coldest_T_e_eV: float = 0.0,
     initial: Start | xr.Dataset | str | Path | None = None,
+    cache: str | Path | None = None,
     progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point and record it at equal steps after a warm-up.
@@ -69,7 +72,9 @@ def simulate(
     reconstruct: van Leer's slopes, or first-order fluxes. coldest_T_e_eV: T_e is held above it,
     as HallThruster.jl does at 1.5 eV; the energy balance then misses what that adds. initial:
     `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of another run: its Dataset or
-    NetCDF file.
+    NetCDF file. cache: a folder that this simulation is read from, or run once and kept in. The
+    name of its file holds a hash of all parameters and of this package's source text, so a
+    changed formula is never answered from an old file; both ways return the same values.
 
     Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
     (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the
@@ -77,7 +82,7 @@ def simulate(
     see `judge_status`), `cycle`, `f_kHz`, mean and standard deviation of I_d, thrust, specific
     impulse and efficiency, and `mass_balance` and `energy_balance` (out plus stored over in).
     A diverged run ends at its last finite sample and says so; it is not an error.
-    Raises ValueError for settings that cannot be run.
+    Raises ValueError for settings that cannot be run, OSError for a cache that cannot be written.
 
     >>> field = ep.simulate(
     ...     ep.Thruster(), ep.OPERATING_POINTS[3], duration_s=5e-5, warm_up_s=0.0, progress=False
@@ -86,10 +91,17 @@ def simulate(
     ('time', 'z')
     """
     settings = Settings(
-        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,
-        coldest_T_e_eV,
+        duration_s, warm_up_s, sample_s, averaged,
+        n_cells, stretch, reconstruct, cfl, coldest_T_e_eV,
     )  # fmt: skip
-    return simulate_as(settings, thruster, operating_point, as_start(initial), progress=progress)
+    start = as_start(initial)
+    simulation = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
+    parameters = _parameters(settings, thruster, operating_point) | {"initial": start.label}
+    return read_or_run(cache, f"thruster_{operating_point.label}", parameters, simulation)
+
+
+def _parameters(settings: Settings, thruster: Thruster, point: OperatingPoint) -> dict[str, Any]:
+    return {"thruster": thruster, "operating_point": point, "settings": settings}
 
 
 def simulate_as(
@@ -101,7 +113,7 @@ def simulate_as(
     progress: Progress | bool,
 ) -> xr.Dataset:
     """`simulate`, with its settings as one value."""
-    parameters = to_json({"thruster": thruster, "operating_point": point, "settings": settings})
+    parameters = to_json(_parameters(settings, thruster, point))
     faces = cell_faces(thruster, settings.n_cells, settings.stretch)
     model = build_model(
         thruster, point, faces, cfl=settings.cfl, reconstruct=settings.reconstruct,

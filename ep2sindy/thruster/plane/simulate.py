@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,6 +13,7 @@ from jaxtyping import Float
 
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial.settings import Settings, to_json
+from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plane.balance import diagnose
 from ep2sindy.thruster.plane.build import build_model, check_thruster, initial_state
@@ -60,22 +64,43 @@ def simulate_2d(
     n_z: int = 41,
     n_r: int = 49,
     averaged: bool = True,
+    cache: str | Path | None = None,
     progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point in (z, r) and sample it at equal steps after a warm-up.
 
     averaged: a sample is the mean over the sampling step that ends at its time; otherwise the
-    state at that time, which aliases oscillations faster than half the sampling rate.
+    state at that time, which aliases oscillations faster than half the sampling rate. cache: as
+    for `simulate`; the defaults' file takes some 300 MB.
 
     Returns a Dataset on ("time", "z", "r"), time in s from the end of the warm-up: PLANES on all
     three (float32, NaN in the thruster's body), PROFILES in time and z, SERIES in time
     (float64). The electrons are quasi-one-dimensional, so T_e_eV and R_ion do not depend on r.
     Attributes as those of `simulate`. A diverged run ends at its last finite sample and says so.
-    Raises ValueError for settings that cannot be run.
+    Raises ValueError for settings that cannot be run, OSError for a cache that cannot be written.
     """
+    settings: dict[str, Any] = {
+        "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
+        "n_z": n_z, "n_r": n_r, "averaged": averaged,
+    }  # fmt: skip
+    run = partial(simulate_as, settings, thruster, operating_point, progress=progress)
+    parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
+    return read_or_run(cache, f"plane_{operating_point.label}", parameters, run)
+
+
+def simulate_as(
+    settings: dict[str, Any],
+    thruster: Thruster,
+    operating_point: OperatingPoint,
+    *,
+    progress: Progress | bool,
+) -> xr.Dataset:
+    """`simulate_2d`, with its settings as one value."""
+    sample_s, averaged = settings["sample_s"], settings["averaged"]
+    duration_s, warm_up_s = settings["duration_s"], settings["warm_up_s"]
     Settings(duration_s, warm_up_s, sample_s)  # checks them
     check_thruster(thruster)
-    grid = MaskedGrid(thruster, n_z, n_r)
+    grid = MaskedGrid(thruster, settings["n_z"], settings["n_r"])
     model = build_model(thruster, operating_point, grid)
     n_warm_up, n_samples = round(warm_up_s / sample_s), round(duration_s / sample_s) + 1
     watch = as_progress(progress)
@@ -84,10 +109,6 @@ def simulate_2d(
     field = as_dataset(rows, sample_s, grid)
     drop = thruster.series_resistance * field["I_d"].values
     field["V_d"] = ("time", operating_point.voltage - drop, attributes(SERIES["V_d"]))
-    settings = {
-        "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
-        "n_z": n_z, "n_r": n_r, "averaged": averaged,
-    }  # fmt: skip
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
     field.attrs = {
         "title": "2-D (z, r) Hall-thruster fluid model",
