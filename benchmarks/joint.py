@@ -19,7 +19,7 @@ from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realiza
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
-from ep2sindy.operating.law import tied_fit
+from ep2sindy.operating.law import fit_law
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
@@ -81,18 +81,18 @@ ERRORS = ("error_free", "error_tied", "p_value")
 
 
 def _errors(joint: JointDiscovery) -> dict[str, float]:
-    tied = tied_fit(joint, LAW, parameters=PARAMETERS)
+    tied = fit_law(joint, LAW, parameters=PARAMETERS)
     errors: dict[str, list[float]] = {"error_free": [], "error_tied": []}
     for point, parameters in PARAMETERS.items():
         truth = system_at(parameters).model
         for name, model in (
             ("error_free", joint.models[point]),
-            ("error_tied", tied.model_at(parameters)),
+            ("error_tied", tied.law.model_at(parameters)),
         ):
             used = truth.coef != 0.0
             errors[name] += (model.coef[used] / truth.coef[used] - 1.0).tolist()
     found = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
-    return found | {"p_value": min(e.p_value for e in tied.equations.values())}
+    return found | {"p_value": min(e.p_value for e in tied.tests.values())}
 
 
 def rates(outcomes: pd.DataFrame) -> pd.DataFrame:

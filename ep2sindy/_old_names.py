@@ -16,9 +16,8 @@ MOVED = {
     "library": "equation_text",
     "model": "Rollout r2",
     "operating": """
-        OperatingRecord branches_of operating_fit OperatingFit left_out LeftOut Windows
-        OperatingLaw tied_fit TiedFit control_law ControlLaw law_map MapPoint
-        Quantity TimeBootstrap Refining
+        OperatingRecord branches_of operating_fit OperatingFit Windows OperatingLaw control_law
+        ControlLaw law_map MapPoint Quantity TimeBootstrap Refining
     """,
     "parallel": "Serial Loky Dask Progress",
     "prepare": """
@@ -53,9 +52,13 @@ MOVED = {
 # Old name -> the name in the stubs that means the same.
 RENAMED = {
     "Bounds": "FreeRunBounds",
+    "LeftOut": "operating.LeaveOneOut",
+    "TiedFit": "operating.LawFit",
     "inspect": "inspect_file",
+    "left_out": "operating.leave_one_out",
     "point": "point_samples",
     "regimes": "discovery.find_regimes",
+    "tied_fit": "operating.fit_law",
     "trace": "signals.from_one_signal",
     "Joint": "TrajectorySearch",
     "simulate_cached": "thruster.simulate",
@@ -65,6 +68,8 @@ RENAMED = {
 NOTES: dict[str, str] = {
     "simulate_cached": "with cache=folder as before",
     "simulate_2d_cached": "with cache=folder as before",
+    "TiedFit": "with `law` and `tests` in place of `equations`",
+    "tied_fit": "which gives `law` and `tests` in place of `equations`",
 }
 # Old name -> what to use instead, where nothing does the same.
 GONE: dict[str, str] = {

@@ -173,8 +173,8 @@ def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
         assert fitted.r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-6)
     # g = 2 + V / 100 lies on the law; eps does not.
     assert joint.tied is not None
-    assert joint.tied.law.names == ("1", "V")
-    assert all(set(e.r2_tied) == set(e.r2_free) for e in joint.tied.equations.values())
+    assert joint.tied.law.functions.names == ("1", "V")
+    assert all(set(e.r2_tied) == set(e.r2_free) for e in joint.tied.tests.values())
 
 
 def test_a_joint_search_says_why_it_ties_nothing(

@@ -15,7 +15,7 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import FreeRunBounds, deviation
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.law import OperatingLaw, in_hull
+from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
 from ep2sindy.operating.records import (
     OperatingRecord,
     check_records,
@@ -24,7 +24,7 @@ from ep2sindy.operating.records import (
 from ep2sindy.refinement.law import TiedRefinement, refine_tied
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import Refinement, refine_many
-from ep2sindy.refinement.weighted_law import Basis, information_of, weighted_law
+from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.runtime.parallel import Serial, Workers, collect
@@ -104,7 +104,7 @@ class OperatingFit:
     def functions(self, degree: int) -> Library:
         """Polynomials of the parameters; ValueError where the records do not suffice."""
         found = polynomial(list(self.records[0].parameters), degree=degree)
-        Basis(self.basis(found))
+        law_basis(found, values_of(self.records))
         return found
 
     def weighted(self, functions: Library) -> OperatingLaw:
@@ -201,7 +201,7 @@ def operating_fit(
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class LeaveOneOut:
     """A point read off the law of the others, and run freely from one sample of its record.
 
     inside: whether the others enclose it.
@@ -222,37 +222,37 @@ class LeftOut:
         return MOST if np.isnan(found) else min(found, MOST)
 
 
-def left_out(
+def leave_one_out(
     fit: OperatingFit,
     functions: Library,
     *,
     start: OperatingLaw | None = None,
     workers: Workers | None = None,
     progress: Progress | bool = False,
-) -> list[LeftOut]:
+) -> list[LeaveOneOut]:
     """Every point in turn by the law of the others: weighted, or tied, beginning at `start`.
 
     Raises ValueError where points without one do not suffice for the law.
     """
     for k, record in enumerate(fit.records):
         try:
-            Basis(fit.without(k).basis(functions))
+            law_basis(functions, values_of(fit.without(k).records))
         except ValueError as error:
             raise ValueError(f"{record.label} cannot be left out: {error}") from error
-    one = partial(_left_out, fit=fit, functions=functions, start=start)
+    one = partial(_leave_out, fit=fit, functions=functions, start=start)
     n_points = len(fit.records)
     stage = as_progress(progress).stage(n_points, "point", "law without a point")
     return collect(workers or Serial(), one, range(n_points), stage)
 
 
-def _left_out(
+def _leave_out(
     number: int, *, fit: OperatingFit, functions: Library, start: OperatingLaw | None
-) -> LeftOut:
+) -> LeaveOneOut:
     record, others = fit.records[number], fit.without(number)
     law = others.weighted(functions) if start is None else others.tied(functions, start=start)[0]
     model = law.model_at(record.parameters, extrapolate=True)
     at = values_of([record])[0]
-    return LeftOut(record, free_run(model, record.from_slowest), in_hull(law.points, at))
+    return LeaveOneOut(record, free_run(model, record.from_slowest), in_hull(law.points, at))
 
 
 def _values(model: SparseModel) -> list[float]:

@@ -19,7 +19,7 @@ from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
-from ep2sindy.operating.law import TiedFit, tied_fit
+from ep2sindy.operating.law import LawFit, fit_law
 from ep2sindy.operating.quantities import (
     FITTED,
     REFINED,
@@ -344,7 +344,7 @@ class JointResult:
 
     found: JointDiscovery
     fitted: Sequence[Fitted | None]
-    tied: TiedFit | None
+    tied: LawFit | None
     why_not_tied: str = ""
 
 
@@ -383,7 +383,7 @@ def searched_jointly(
     try:
         parameters = {label: point.parameters for label, point in used.items()}
         with progress.stage(None, "", "coefficients tied by a law"):
-            tied = tied_fit(found, law, parameters=parameters)
+            tied = fit_law(found, law, parameters=parameters)
     except ValueError as error:
         reason = str(error)
     labels = [point.label for point in points]

@@ -136,12 +136,15 @@ def check_varying(
     *,
     remedy: str = "leave it out, or add points",
 ) -> None:
-    """Raise ValueError for a parameter that is the same at all points: no law can hold it."""
+    """Raise ValueError for a parameter that is the same at all points: no law can hold it.
+
+    remedy: what to do about it, with `{name}` for the parameter's.
+    """
     for name, column in zip(parameters, points.T, strict=True):
         if np.ptp(column) == 0.0:
             raise ValueError(
                 f"a parameter must vary: {name!r} is {column[0]:g} at all {len(points)} operating "
-                f"points; {remedy}"
+                f"points; {remedy.format(name=name)}"
             )
 
 
@@ -170,7 +173,7 @@ def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records 
     return np.array([[record.parameters[name] for name in names] for record in records])
 
 
-def measured_left_out(
+def interpolation_errors(
     records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
     """How smooth the records are: what functions of the parameters miss at points left out.
