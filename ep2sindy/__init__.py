@@ -92,8 +92,8 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.model.stability import share_reaching as share_reaching
     from ep2sindy.refinement.correction import Corrected as Corrected
     from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
-    from ep2sindy.refinement.law import TiedRefinement as TiedRefinement
-    from ep2sindy.refinement.law import refine_tied as refine_tied
+    from ep2sindy.refinement.law import LawRefinement as LawRefinement
+    from ep2sindy.refinement.law import refine_law as refine_law
     from ep2sindy.refinement.methods.gradient_descent import GradientDescent as GradientDescent
     from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting as MultipleShooting
     from ep2sindy.refinement.methods.nelder_mead import NelderMead as NelderMead
@@ -101,10 +101,9 @@ if TYPE_CHECKING:  # for editors and type checkers; a test holds it to the table
     from ep2sindy.refinement.ode import ODE as ODE
     from ep2sindy.refinement.ode import HermiteSimpson as HermiteSimpson
     from ep2sindy.refinement.ode import RungeKutta as RungeKutta
+    from ep2sindy.refinement.problem import RefinementSettings as RefinementSettings
     from ep2sindy.refinement.refine import Refinement as Refinement
-    from ep2sindy.refinement.refine import loss_against_window as loss_against_window
     from ep2sindy.refinement.refine import refine as refine
-    from ep2sindy.refinement.refine import refine_many as refine_many
     from ep2sindy.refinement.windows import WindowBatch as WindowBatch
     from ep2sindy.refinement.windows import cut_windows as cut_windows
     from ep2sindy.regression.differential import Differential as Differential
@@ -255,13 +254,14 @@ _FACE = {
     "model.scores": "r2",
     "model.stability": "LimitCycle limit_cycle share_reaching",
     "refinement.correction": "Corrected refine_with_correction",
-    "refinement.law": "TiedRefinement refine_tied",
+    "refinement.law": "LawRefinement refine_law",
     "refinement.methods.gradient_descent": "GradientDescent",
     "refinement.methods.multiple_shooting": "MultipleShooting",
     "refinement.methods.nelder_mead": "NelderMead",
     "refinement.methods.single_shooting": "SingleShooting",
     "refinement.ode": "ODE RungeKutta HermiteSimpson",
-    "refinement.refine": "Refinement refine refine_many loss_against_window",
+    "refinement.problem": "RefinementSettings",
+    "refinement.refine": "Refinement refine",
     "refinement.windows": "WindowBatch cut_windows",
     "regression.differential": "Differential",
     "regression.rows": "Regression",

@@ -16,7 +16,7 @@ from ep2sindy.model.likeness import Bounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.refinement.refine import refine_together
+from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.combinations import admissible, combinations, joint_scores
 from ep2sindy.selection.folds import Fold, folds_of
@@ -26,6 +26,7 @@ from ep2sindy.selection.rule import FLOOR, Decision
 from ep2sindy.selection.systems import System, budget, system_of
 from ep2sindy.selection.trial_runs import cycles_of, paths_over
 from ep2sindy.signals.attractor import Cycle
+from ep2sindy.signals.spectrum import samples_in
 
 LEAST_WINDOWS = 30  # that the winner is refined on
 
@@ -134,11 +135,9 @@ class FreeRunScore:
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
         """Samples of a window."""
-        samples = [
-            self.window_periods / (cycle.frequency_Hz * run.dt_s)
-            for run, cycle in zip(records.runs, cycles, strict=True)
-        ]
-        return round(float(np.median(samples))) + 1
+        frequency_Hz = [cycle.frequency_Hz for cycle in cycles]
+        dt_s = [run.dt_s for run in records.runs]
+        return samples_in(self.window_periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
 
     def _trials(
         self,
@@ -180,7 +179,7 @@ class FreeRunScore:
         )
         method, together = budget(batch)
         with progress.stage(len(systems), "system", "refined without a fold") as advance:
-            refined = refine_together(
+            refined = refine_batch(
                 [system.model for system in systems],
                 batch,
                 method=method,

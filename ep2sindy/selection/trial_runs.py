@@ -11,6 +11,7 @@ from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.selection.folds import Stretch
 from ep2sindy.selection.integral import Records
 from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.spectrum import steps_in
 
 # Of a record, so that its folds leave windows of two: six, less what noise makes of them.
 LEAST_PERIODS = 5.5
@@ -64,7 +65,7 @@ def paths_over(
     centre, spread = joined.mean(axis=0), joined.std(axis=0)
     for part in held:
         run, x, cycle = records.runs[part.run], records.smoothed[part.run], cycles[part.run]
-        per_period = 1.0 / (cycle.frequency_Hz * run.dt_s)
+        per_period = steps_in(1.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
         first, n_samples = part.start, part.stop - part.start
         if not ensemble.inputs:
             n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))

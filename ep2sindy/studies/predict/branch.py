@@ -23,7 +23,7 @@ from ep2sindy.discovery.operating_points import (
 from ep2sindy.library.library import Library
 from ep2sindy.machine.parallel import Workers
 from ep2sindy.machine.progress import SILENT, Progress
-from ep2sindy.refinement.law import TiedRefinement
+from ep2sindy.refinement.law import LawRefinement
 
 MOST_PARAMETERS = 2  # of a map that can be drawn
 
@@ -66,7 +66,7 @@ class Branch:
     trials: Sequence[Tried]
     choice: Tried
     law: OperatingLaw
-    tied: TiedRefinement
+    tied: LawRefinement
     left_out: Sequence[LeftOut]
     smooth: tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]
     at_points: Sequence[MapPoint]
