@@ -30,7 +30,7 @@ from ep2sindy.refinement.problem import (
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import WindowBatch
 
-# Weights 1/std of the residuals would let the first state that is learned pull alone.
+# Where nobody says otherwise.
 SETTINGS = RefinementSettings(n_reweights=0)
 DESCENT = GradientDescent(max_iter=60, tolerance=1e-3, patience=5)
 

@@ -28,7 +28,7 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.weighted_law import Basis, weighted_law
 from ep2sindy.refinement.windows import WindowBatch
 
-# States count by their standard deviation at every point, where nobody says otherwise.
+# Where nobody says otherwise; states count by their standard deviation at every point.
 SETTINGS = RefinementSettings(n_windows=20, n_reweights=0)
 
 
