@@ -26,8 +26,7 @@ MOVED = {
     """,
     "refinement": """
         MultipleShooting GradientDescent NelderMead RungeKutta HermiteSimpson ODE
-        cut_windows WindowBatch refine_many loss_against_window Corrected refine_tied
-        TiedRefinement
+        cut_windows WindowBatch Corrected
     """,
     "regression": """
         fit_support constrained_fit Relation relations_from_matrix
@@ -61,11 +60,16 @@ RENAMED = {
     "tied_fit": "operating.fit_law",
     "trace": "signals.from_one_signal",
     "Joint": "TrajectorySearch",
+    "refine_many": "refine",
+    "refine_tied": "refinement.refine_law",
+    "TiedRefinement": "refinement.LawRefinement",
     "simulate_cached": "thruster.simulate",
     "simulate_2d_cached": "thruster.simulate_2d",
 } | {name: f"{room}.{name}" for room, names in MOVED.items() for name in names.split()}
 # Old name -> what to write besides, where the new name is not called as the old one was.
 NOTES: dict[str, str] = {
+    "refine_many": "which takes a list of models as well",
+    "refine_tied": "which takes RefinementSettings(window=..., n_windows=...)",
     "simulate_cached": "with cache=folder as before",
     "simulate_2d_cached": "with cache=folder as before",
     "TiedFit": "with `law` and `tests` in place of `equations`",
@@ -80,6 +84,7 @@ GONE: dict[str, str] = {
     "Stability": "take ep2sindy.EBIC()",
     "STLSQRegressor": "take pysindy.STLSQ, or ep2sindy.STLSQ() as the search of a Regression",
     "SingleShooting": "take ep2sindy.refinement.MultipleShooting()",
+    "loss_against_window": "call ep2sindy.refine in a loop over the lengths of windows",
     "LANDMARK_POINT": "see benchmarks/landmark.py",
     "landmark_thruster": "see benchmarks/landmark.py",
 }

@@ -142,13 +142,15 @@ def test_a_result_does_not_depend_on_who_watches(prey: ep.Trajectory) -> None:
 def test_refinements_tell_their_iterations_and_windows(prey: ep.Trajectory) -> None:
     watch = Recorder()
     model = ep.lotka_volterra().model
-    found = ep.refinement.loss_against_window(
-        model, [prey], [20, 40], n_windows=2, rng=0, progress=watch
-    )
+    lengths = [20, 40]
+    found = [
+        ep.refine(model, [prey], window=length, n_windows=2, rng=0, progress=watch)
+        for length in counted(watch, lengths, "window length")
+    ]
     outer, *inner = watch.stages
     assert (outer.unit, outer.total, outer.depth) == ("window length", 2, 0)
     assert [each.depth for each in inner] == [1, 1]
-    assert [each.done for each in inner] == [len(fit.history) for fit in found.values()]
+    assert [each.done for each in inner] == [len(fit.history) for fit in found]
     watch.check()
 
 
