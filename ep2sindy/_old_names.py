@@ -32,7 +32,7 @@ MOVED = {
         fit_support constrained_fit Relation relations_from_matrix
         pareto_front ParetoFront Candidate pooled_supports
     """,
-    "selection": "selected",
+    "selection": "selected Stability",
     "signals": """
         KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing power_spectrum dominant_frequency
         Cycle find_cycle Trace Rate LogRate Delays embed Embedded
@@ -81,7 +81,6 @@ GONE: dict[str, str] = {
     "LogKnee": 'write ep2sindy.Knee(scale="log"), which is the same',
     "IntegralScore": "take ep2sindy.RefinedScore(), which selects the truth more often",
     "CrossValidation": "take ep2sindy.EBIC() or ep2sindy.RefinedScore()",
-    "Stability": "take ep2sindy.EBIC()",
     "STLSQRegressor": "take pysindy.STLSQ, or ep2sindy.STLSQ() as the search of a Regression",
     "SingleShooting": "take ep2sindy.refinement.MultipleShooting()",
     "loss_against_window": "call ep2sindy.refine in a loop over the lengths of windows",
