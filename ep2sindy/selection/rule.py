@@ -21,8 +21,8 @@ from ep2sindy.search.front import Candidate, ParetoFront
 # criterion would select terms that explain the discretisation.
 FLOOR = 1e-6
 
-# Error of a system at most, which one has that dies, diverges or cannot be refined: in variances
-# (always the mean has 1) or in bounds of a free run.
+# The largest error of a system, and that of one that dies, diverges or cannot be refined. It counts
+# variances of the data, where a model that always gives the mean has 1, or bounds of a free run.
 MAX_ERROR = 10.0
 
 
