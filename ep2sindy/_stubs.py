@@ -60,8 +60,12 @@ def read_stub(module: str) -> dict[str, Entry]:
     return entries
 
 
+def _folder(module: str) -> str:
+    return path.join(path.dirname(path.dirname(__file__)), *module.split("."))
+
+
 def _stub_file(module: str) -> str:
-    place = path.join(path.dirname(path.dirname(__file__)), *module.split("."))
+    place = _folder(module)
     return path.join(place, "__init__.pyi") if path.isdir(place) else f"{place}.pyi"
 
 
@@ -127,9 +131,7 @@ def _load_old(module: str, name: str) -> Any:
     new = new_name(old)
     if new is None:
         raise AttributeError(
-            f"module {module!r} has no attribute {name!r}; {gone_text(old) or _near(old)}",
-            name=name,
-            obj=sys.modules[module],
+            f"module {module!r} has no attribute {name!r}; {gone_text(old) or _near(old)}"
         )
     warn(moved_text(old), FutureWarning, stacklevel=3)
     return dotted_names()[new].load()
@@ -139,15 +141,15 @@ def _near(absent: str) -> str:
     """Where to look for a name that a module has not."""
     module, _, name = absent.rpartition(".")
     look = f"see dir({module})"
-    folder = path.dirname(_stub_file(module))
     if name.startswith("_"):
         return look
-    if module != PACKAGE and path.exists(path.join(folder, f"{name}.py")):
+    if module != PACKAGE and path.exists(path.join(_folder(module), f"{name}.py")):
         return f"{look}, or import {absent}"
     from difflib import get_close_matches
 
-    last = {each.rpartition(".")[2]: each for each in dotted_names()}
-    near = [last[each] for each in get_close_matches(name, last)]
-    return (
-        f"{look}; near it {'is' if len(near) == 1 else 'are'} {', '.join(near)}" if near else look
-    )
+    known = {each: each.rpartition(".")[2].lower() for each in (*dotted_names(), *rooms())}
+    alike = get_close_matches(name.lower(), set(known.values()))
+    near = [each for word in alike for each in known if known[each] == word]
+    if not near:
+        return look
+    return f"{look}; near it {'is' if len(near) == 1 else 'are'} {', '.join(near)}"

@@ -11,7 +11,7 @@ import yaml
 from omegaconf import OmegaConf
 
 import ep2sindy as ep
-from ep2sindy._old_names import RENAMED, gone_text
+from ep2sindy._old_names import GONE, RENAMED, gone_text
 from ep2sindy._stubs import MARK, PACKAGE, dotted_names, read_stub, rooms
 from ep2sindy.app.targets import FOR_CONFIGS, target_of
 
@@ -75,8 +75,12 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("room", "name", "said"),
     [
-        ("ep2sindy", "Eebic", r"no attribute 'Eebic'; see dir\(ep2sindy\)"),
-        ("ep2sindy", "Trajectry", r"see dir\(ep2sindy\); near it are ep2sindy.Trajectory, "),
+        (
+            "ep2sindy",
+            "Eebic",
+            r"no attribute 'Eebic'; see dir\(ep2sindy\); near it (is|are) ep2sindy.EBIC",
+        ),
+        ("ep2sindy", "Trajectry", r"see dir\(ep2sindy\); near it (is|are) ep2sindy.Trajectory"),
         ("ep2sindy.thruster", "crop", r"see dir\(ep2sindy.thruster\); near it is .*prepare.crop$"),
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],
@@ -110,6 +114,15 @@ def test_a_config_with_an_old_name_is_built_with_a_warning() -> None:
     node = OmegaConf.create({"_target_": "ep2sindy." + "crop"})
     with pytest.warns(FutureWarning, match=r"ep2sindy.crop is now ep2sindy.prepare.crop"):
         assert target_of(node, "here") is ep.prepare.crop
+
+
+def test_a_name_that_is_gone_says_what_to_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(GONE, "OldScore", "take ep2sindy.EBIC()")
+    said = r"ep2sindy\.OldScore is gone; take ep2sindy\.EBIC\(\)"
+    with pytest.raises(AttributeError, match=said):
+        ep.OldScore  # noqa: B018
+    with pytest.raises(ValueError, match=f"here must name a _target_ .*{said}; "):
+        target_of(OmegaConf.create({"_target_": "ep2sindy.OldScore"}), "here")
 
 
 def test_the_version_is_the_one_installed() -> None:

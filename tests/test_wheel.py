@@ -50,6 +50,18 @@ def test_the_wheel_brings_its_configs_and_says_so(program: Path, tmp_path: Path)
     assert "--config-dir" in result.stdout
 
 
+def test_the_wheel_brings_its_stubs(program: Path, tmp_path: Path) -> None:
+    code = (
+        "import ep2sindy as ep\n"
+        "from importlib.resources import files\n"
+        "assert (files('ep2sindy') / 'py.typed').is_file()\n"
+        "assert (files('ep2sindy') / 'thruster' / '__init__.pyi').is_file()\n"
+        "print(ep.thruster.Thruster().channel_length, ep.prepare.crop.__name__)\n"
+    )
+    result = run(program.parent / "python", "-c", code, cwd=tmp_path)
+    assert result.stdout == "0.025 crop\n", result.stderr
+
+
 def test_the_main_job_runs_from_an_empty_folder(program: Path, tmp_path: Path) -> None:
     short = ["data.duration_s=0.3e-3", "data.warm_up_s=0.0", "data.n_cells=30"]
     result = run(program, "+exp=breathing", *short, "libraries.ionization.degree=2", cwd=tmp_path)
