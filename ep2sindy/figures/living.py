@@ -111,16 +111,12 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
     for k, (ax, name) in enumerate(zip(axes, run.state_names, strict=True)):
         for shift in (0.0, 1.0):
             ax.plot(phase + shift, run.states[:, k], ".", ms=1.0, color=GREY, rasterized=True)
-        ax.plot(PHASES, ours[:, k], color=DATA, lw=1.6)
-        ax.plot(PHASES, theirs[:, k], color=COLOURS[0], lw=1.4, ls="--")
+        ax.plot(PHASES, ours[:, k], color=DATA, lw=1.6, label="data")
+        ax.plot(PHASES, theirs[:, k], color=COLOURS[0], lw=1.4, ls="--", label="model")
         ax.set(xlabel="phase (periods)", ylabel=axis_label(name, run.units[name]))
         ax.set_xlim(0.0, 2.0)
-    handles = [
-        Line2D([], [], color=GREY, marker=".", ls="none", label="samples"),
-        Line2D([], [], color=DATA, lw=1.6, label="data"),
-        Line2D([], [], color=COLOURS[0], lw=1.4, ls="--", label="model"),
-    ]
-    legend_above(figure, handles, size=9.0)
+    samples = Line2D([], [], color=GREY, marker=".", ls="none", label="samples")
+    legend_above(figure, [samples, *axes[0].lines[-2:]], size=9.0)
     return figure
 
 

@@ -238,7 +238,7 @@ def cycle_map_figure(
         ax.set(xlabel=xlabel, ylabel=ylabel)
         bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, pad=0.02, extend="both")
         bar.set_label(title)
-    entries = _list_entries(quiet, other, color=GREY, mec=DATA)
+    entries = _list_entries(quiet, other, face=GREY)
     entries += [
         Line2D([], [], color="black", lw=1.8, label="the model's cycle ends"),
         Line2D([], [], color="black", lw=1.3, ls="--", label="its fixed point turns stable"),
@@ -271,7 +271,7 @@ def cycle_line_figure(
         ax.plot(quiet[name], np.full(len(quiet), 0.05), transform=bottom, **CROSS)
         ax.set(xlabel=name_label(name, labels), ylabel=title)
         ax.grid(alpha=0.3)
-    entries = _list_entries(quiet, other, color=DATA, mfc="white")
+    entries = _list_entries(quiet, other, face="white")
     law = Line2D([], [], color=COLOURS[0], lw=1.8, label="the model's cycle")
     legend_above(
         figure, [law, *entries, Patch(color=GREY, alpha=0.2, label="points fitted")], size=9.0
@@ -287,10 +287,10 @@ def _split_records(
     return points[own], points[quiet], points[~own & ~quiet]
 
 
-def _list_entries(quiet: pd.DataFrame, other: pd.DataFrame, **style: Any) -> list[Artist]:
-    """Of a legend: records in this style, and what else there is among the points."""
+def _list_entries(quiet: pd.DataFrame, other: pd.DataFrame, *, face: str) -> list[Artist]:
+    """Of a legend: records, whose markers are filled so, and what else is among the points."""
     there = ((quiet, CROSS, "not oscillating"), (other, DIAMOND, "record of another cycle"))
-    record = Line2D([], [], ls="none", marker="o", label="record", **style)
+    record = Line2D([], [], ls="none", marker="o", mec=DATA, mfc=face, label="record")
     return [record, *(Line2D([], [], **mark, label=label) for of, mark, label in there if len(of))]
 
 

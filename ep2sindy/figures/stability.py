@@ -28,7 +28,7 @@ from ep2sindy.figures.style import (
 
 BREATHES = "oscillating"
 HATCHES = {"steady": "//", "decaying": "\\\\", "transit": "..", "diverged": "xx", "failed": "++"}
-MARKERS = {BREATHES: "o", "steady": "s", "decaying": "v", "transit": "D"}
+STATUS_MARKERS = {BREATHES: "o", "steady": "s", "decaying": "v", "transit": "D"}
 WORTHLESS = ("diverged", "failed")  # whose current says nothing
 CURVES = {  # column -> title, factor
     "I_d_mean": ("discharge current (A)", 1.0),
@@ -109,7 +109,7 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
         values = factor * points[name].to_numpy(float)
         if numbers:
             ax.plot(x[kept][order], values[kept][order], color=GREY, lw=1.0, zorder=1)
-        for status in MARKERS:
+        for status in STATUS_MARKERS:
             here = (points["status"] == status).to_numpy()
             reach = points["I_d_std"][here] if name == "I_d_mean" else None
             ax.errorbar(x[here], values[here], reach, capsize=3, ms=5, **_status_style(status))
@@ -129,7 +129,7 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
 
 def _status_style(status: str) -> dict[str, Any]:
     """A marker, or an upright line where the current says nothing."""
-    if status in MARKERS:
+    if status in STATUS_MARKERS:
         colour = COLOURS[0] if status == BREATHES else COLOURS[1]
-        return {"ls": "none", "marker": MARKERS[status], "color": colour}
+        return {"ls": "none", "marker": STATUS_MARKERS[status], "color": colour}
     return {"ls": ":" if status == "diverged" else "--", "color": COLOURS[3]}

@@ -112,14 +112,14 @@ def legend_above(
 
 
 def write_in_cell(ax: Axes, column: int, row: int, text: str, *, colour: str) -> Text:
-    """Small letters in the middle of a cell, of a map whose cells have a side of one."""
+    """Write small letters into the middle of a cell, on a map whose cells have a side of one."""
     return ax.text(
         column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7.5, color=colour
     )
 
 
 def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:
-    """Over a point something that cannot be seen, and says more."""
+    """Put a spot over a point that cannot be seen but says more, see `hover`."""
     (spot,) = ax.plot(x, y, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
     hover(spot, text)
 
@@ -134,7 +134,7 @@ def axis_label(name: str, unit: str) -> str:
 
 
 def name_label(name: str, labels: Mapping[str, str]) -> str:
-    """What axes and legends call a quantity; else its name as a symbol."""
+    """What axes and legends call a quantity: its label, or else its name as a symbol."""
     return labels.get(name, f"${latex_name(name)}$")
 
 
@@ -151,7 +151,10 @@ def _equals(label: str, value: float) -> str:
 def sample_line(
     x: pd.Series, along: str, held: Mapping[str, float], parameters: Sequence[str]
 ) -> tuple[Float[np.ndarray, " line"], Float[np.ndarray, "line parameters"]]:
-    """A line from the least to the largest x of one parameter, and its points of all of them."""
+    """From the least to the largest x of one parameter: values of it, and points of all of them.
+
+    held: the values of the others.
+    """
     line = np.linspace(x.min(), x.max(), N_LINE)
     columns = [line if name == along else np.full(N_LINE, held[name]) for name in parameters]
     return line, np.column_stack(columns)
