@@ -11,6 +11,7 @@ from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.types import RunMode
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from test_face import targets
 
 from ep2sindy._stubs import dotted_names
@@ -266,6 +267,20 @@ def test_text_that_becomes_a_group_is_looked_at_as_one(tmp_path: Path, monkeypat
     with pytest.raises(ValueError, match=r"data\.cache to a folder below"):
         check_places(resolved(OmegaConf.create(said)), [])
     check_places(resolved(OmegaConf.create(said)), ["data.cache=../elsewhere"])
+
+
+@pytest.mark.parametrize("cache", ["../elsewhere", "${place}"])
+def test_what_cannot_be_resolved_yet_hides_no_folder(
+    cache: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A variable of the environment may come while the package is loaded."""
+    monkeypatch.chdir(tmp_path)
+    said = {"place": "../elsewhere", "data": {"note": "${oc.env:NOT_YET_THERE}", "cache": cache}}
+    with pytest.raises(ValueError, match=r"data\.cache to a folder below"):
+        check_places(resolved(OmegaConf.create(said)), [])
+    later = {"data": {"cache": "${oc.env:NOT_YET_THERE}"}}
+    with pytest.raises(OmegaConfBaseException, match="NOT_YET_THERE"):
+        check_places(resolved(OmegaConf.create(later)), [])
 
 
 def test_what_is_typed_is_the_users_own_wish(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -167,11 +167,20 @@ def check_places(settings: Iterable[tuple[str, Any]], overrides: Sequence[str]) 
 def resolved(config: DictConfig) -> Iterator[tuple[str, Any]]:
     """All that a config says, by dotted place, as a run will read it: text may make a group."""
     for key in config:
-        with suppress(OmegaConfBaseException):  # told better by whoever reads it
+        try:
             node = config[key]
             is_group = OmegaConf.is_config(node)
             plain = OmegaConf.to_container(node, resolve=True) if is_group else node
             yield from _leaves(plain, str(key))
+        except OmegaConfBaseException:  # told better by whoever reads it; but it might be mended
+            yield from _resolved_one_by_one(config, key)  # by then, and must hide no folder
+
+
+def _resolved_one_by_one(config: DictConfig, key: Any) -> Iterator[tuple[str, Any]]:
+    """All below a key as it is written, but folders and servers as a run will read them."""
+    for place, value in _leaves(_written(config).get(key), str(key)):
+        known = place.rpartition(".")[2] in FOLDERS + SERVERS and "${" in str(value)
+        yield place, OmegaConf.select(config, place) if known else value
 
 
 def _written(config: DictConfig) -> dict[str, Any]:
