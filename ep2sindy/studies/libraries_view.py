@@ -58,6 +58,10 @@ FRONT = (
     "Error against number of terms: every support that the search proposed, and the best of each "
     "size; the star is selected. Carets at the upper edge: models far worse than none."
 )
+SCORED = (
+    "Score against number of terms, the best of each size; the star is selected. States and "
+    "coefficients were estimated together: there are no rows to have an error."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +133,8 @@ class Outcome:
         for name, result in self.results.items():
             found, label = result.discovery, result.recipe.selection.label
             front = partial(front_figure, found.fronts, found.scores, label=label)
-            drawn[f"front_{name}"] = Captioned(front, FRONT)
+            has_rows = any(each.problem is not None for each in found.fronts.values())
+            drawn[f"front_{name}"] = Captioned(front, FRONT if has_rows else SCORED)
         for name, living in self.living.items():
             drawn |= living_figures(name, living)
         return drawn
