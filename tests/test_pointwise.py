@@ -11,6 +11,7 @@ import xarray as xr
 
 from ep2sindy.data.zones import point
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.machine.parallel import Dask, Loky, Serial
