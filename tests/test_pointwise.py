@@ -112,7 +112,7 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     found = discover(
         [run],
         LIBRARY,
-        search.recipe,
+        search.method,
         seed=search.seed,
     )
     np.testing.assert_allclose(result["coef"].sel(equation="x"), found.model.coef[:, 0], rtol=1e-12)
