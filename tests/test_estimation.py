@@ -14,11 +14,10 @@ from benchmarks.known_systems import noisy
 from ep2sindy.constraints.relations import parse_relation
 from ep2sindy.estimation import problem as estimation_problem
 from ep2sindy.estimation.kernels import departures, eliminate
-from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, gram, squares
+from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scaled_problem
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
-from ep2sindy.thruster.plane.electron_kernels import fitted
 from ep2sindy.trust import memory
 
 
@@ -182,7 +181,7 @@ def fit_of_truth(problem: EstimationProblem, model: ep.SparseModel) -> Trajector
 def test_a_fit_is_where_the_squares_have_no_slope() -> None:
     problem, _ = lorenz_problem()
     level = Level((np.full((200, 3), 0.05),), 0.01)
-    fit = fitted(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    fit = fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
     step = np.where(fit.support, 1e-4 * np.abs(fit.free), 0.0)
     for j in np.flatnonzero(fit.support):
         change = step * (np.arange(len(step)) == j)
@@ -194,7 +193,7 @@ def test_a_fit_is_where_the_squares_have_no_slope() -> None:
 def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
     problem, _ = lorenz_problem()
     level = Level((np.full((200, 3), 0.05),), 0.1)
-    fit = fitted(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    fit = fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
     pair = gram(problem, fit, level)
     nothing = np.zeros(len(fit.free))
     assert penalise(pair, fit.support, nothing).score == pytest.approx(fit.total, abs=0.01)
@@ -203,14 +202,14 @@ def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
         foretold = penalise(pair, support, nothing)
         start = TrajectoryFit(fit.paths, foretold.free, support, fit.squares)
         if foretold.score < fit.total + 30.0:  # within the reach of a line
-            refit = fitted(problem, start, level)
+            refit = fit_paths(problem, start, level)
             assert refit.total == pytest.approx(foretold.score, rel=0.05)
 
 
 def test_block_by_block_finds_the_best_support_of_all() -> None:
     problem, _ = lorenz_problem()
     level = Level((np.full((200, 3), 0.05),), 0.1)
-    fit = fitted(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    fit = fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
     pair, prices = gram(problem, fit, level), term_prices(problem, 200.0)
     full = best_support(problem, pair, prices, np.ones_like(fit.support), max_terms=10)
     empty = best_support(problem, pair, prices, np.zeros_like(fit.support), max_terms=10)

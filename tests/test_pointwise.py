@@ -11,6 +11,7 @@ import xarray as xr
 
 from ep2sindy.data.zones import point_samples
 from ep2sindy.discovery.discover import discover
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.differential import Differential
@@ -111,7 +112,7 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     found = discover(
         [run],
         LIBRARY,
-        search.recipe,
+        search.method,
         seed=search.seed,
     )
     np.testing.assert_allclose(result["coef"].sel(equation="x"), found.model.coef[:, 0], rtol=1e-12)

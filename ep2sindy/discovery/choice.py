@@ -30,7 +30,6 @@ from ep2sindy.selection.rule import (
     SystemSelection,
     admissible,
     combinations,
-    selected,
     support_of,
 )
 
@@ -132,7 +131,7 @@ def choose(
         won = [f.with_scores(_won(f.scores, int(k))) for f, k in zip(scored, place, strict=True)]
         best = [front.candidates[k] for front, k in zip(won, place, strict=True)]
         return Choice(won, best, model, left={})
-    best = [selected(front, front.scores) for front in scored]
+    best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
     model = assemble_model(library, fits, units=units, provenance=provenance)
     left = {fit.equation: fit.left for fit in fits if fit.left is not None}
@@ -156,7 +155,7 @@ def choose_by_runs(
     decision = rule.decide(fronts, library, runs, relations, progress=progress)
     scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
     model = replace(decision.model, units=runs[0].units, provenance=provenance)
-    best = [selected(front, front.scores) for front in scored]
+    best = [front.best for front in scored]
     return Choice(scored, best, model, decision.note)
 
 

@@ -31,8 +31,8 @@ class Discovery:
     """What a search leaves: per state the candidates, and the model of those that were selected.
 
     fronts: by state, candidates with their scores, the lowest selected. chosen: by state, the
-    selected one as it stands in its front: coefficients of the model may be others, such as those
-    fitted with weights, and are `model.terms(state)`, with their covariance in the model.
+    selected one, with the coefficients that it has in the model: where the noise of the samples is
+    followed into the rows, fitted again with weights. Their covariance is the model's.
     method: that it was found by. noise_test: what the model leaves of the noise.
     ambiguities: terms that these data cannot tell apart, and rows that are few for the terms.
     note: how a rule that judges whole systems of equations came to its model, how sure a search of
@@ -130,7 +130,7 @@ def discover(
     withheld = bool(test.left and test.misfit)
     return Discovery(
         fronts={front.equation: front for front in choice.fronts},
-        chosen={candidate.equation: candidate for candidate in choice.chosen},
+        chosen={each.equation: _as_in(choice.model, each) for each in choice.chosen},
         model=replace(choice.model, covariance=None) if withheld else choice.model,
         method=method,
         ambiguities=found.ambiguities,
@@ -139,3 +139,9 @@ def discover(
         remarks=found.remarks,
         estimate=found.estimate,
     )
+
+
+def _as_in(model: SparseModel, candidate: Candidate) -> Candidate:
+    """A candidate with its coefficients as a model has them."""
+    terms = model.terms(candidate.equation)
+    return replace(candidate, coef=np.array([terms.get(name, 0.0) for name in candidate.terms]))

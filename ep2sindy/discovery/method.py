@@ -204,7 +204,7 @@ class TrajectorySearch:
         else:
             scores = self.selection.scores(fronts)
             scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
-            best = [selected(front, front.scores) for front in scored]
+            best = [front.best for front in scored]
             choice = Choice(scored, best, found.model, found.note)
         alike = _ambiguities_of_samples(runs, library)
         return IdentifiedEquations(choice, alike, found.remarks, found)

@@ -108,6 +108,11 @@ class ParetoFront:
         """Of the rule that selected among them, the lowest selected."""
         return np.array([candidate.score for candidate in self.candidates])
 
+    @property
+    def best(self) -> Candidate:
+        """The candidate of least score; of several, the smallest."""
+        return self.candidates[int(np.argmin(self.scores))]
+
     def with_scores(self, scores: Float[np.ndarray, " candidates"]) -> ParetoFront:
         """The same candidates, with what a rule says of them."""
         pairs = zip(self.candidates, scores.tolist(), strict=True)

@@ -53,6 +53,10 @@ FRONT = (
     "Error against number of terms: every support that the search proposed, and the best of each "
     "size; the star is selected. Carets at the upper edge: models far worse than none."
 )
+SCORED = (
+    "Score against number of terms, the best of each size; the star is selected. States and "
+    "coefficients were estimated together: there are no rows to have an error."
+)
 EVERY_RECORD = "the selected models, integrated from the first sample of every record"
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
@@ -299,7 +303,8 @@ class Outcome:
         for name, result in self.results.items():
             found = result.discovery
             front = partial(front_figure, found.fronts, found.scores, label=result.label)
-            drawn[f"front_{name}"] = Captioned(front, FRONT)
+            has_rows = any(each.problem is not None for each in found.fronts.values())
+            drawn[f"front_{name}"] = Captioned(front, FRONT if has_rows else SCORED)
         for name, living in self.living.items():
             drawn |= living.figures(name)
         return drawn
