@@ -13,7 +13,8 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.choice import map_points
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.studies.predict import Study, expand
+from ep2sindy.studies.predict import Study
+from ep2sindy.studies.source import expand
 from tests import programs
 
 POINTS = "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"

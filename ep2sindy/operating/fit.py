@@ -13,7 +13,7 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import FreeRunBounds, deviation
+from ep2sindy.model.likeness import FreeRunBounds, Verdict, deviation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
 from ep2sindy.operating.records import (
@@ -220,6 +220,33 @@ class LeaveOneOut:
         )
         found = deviation(run.f_error, amplitude, waveform, FreeRunBounds())
         return MOST if np.isnan(found) else min(found, MOST)
+
+
+def error_statistics(left_out: Sequence[LeaveOneOut]) -> dict[str, float | int]:
+    """How far points that were left out are missed: counts, medians, and nine in ten.
+
+    A point without a frequency counts as infinitely far off in it, and not in the medians of
+    amplitude and waveform, which are those of each point's worst state.
+    """
+    f = np.array([abs(each.run.f_error) for each in left_out])
+    f[np.isnan(f)] = np.inf
+    ratios = [np.array(list(each.run.amplitude_ratio.values())) for each in left_out]
+    amplitude = np.array([np.abs(ratio - 1.0).max() for ratio in ratios])
+    waveform = np.array([max(each.run.waveform_error.values()) for each in left_out])
+    return {
+        "n": len(left_out),
+        "n_lives": sum(each.run.verdict is Verdict.LIVES for each in left_out),
+        "diverging": sum(each.run.rollout.diverged for each in left_out),
+        "f_median": float(np.median(f)),
+        "f_90": float(np.quantile(f, 0.9, method="higher")),
+        "amplitude_median": _median(amplitude),
+        "waveform_median": _median(waveform),
+    }
+
+
+def _median(values: Float[np.ndarray, " points"]) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else float("nan")
 
 
 def leave_one_out(

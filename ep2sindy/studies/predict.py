@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import product
 from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from ep2sindy.data.scales import zero_to_one
 from ep2sindy.figures.operating import (
     frequency_scale,
     laws_figure,
@@ -21,7 +19,6 @@ from ep2sindy.figures.operating import (
     map_figure,
 )
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import (
     Branch,
@@ -31,10 +28,10 @@ from ep2sindy.operating.choice import (
     find_branch,
     group_by_cycle,
 )
-from ep2sindy.operating.fit import LeaveOneOut, Windows
+from ep2sindy.operating.fit import LeaveOneOut, Windows, error_statistics
 from ep2sindy.operating.law import law_basis
 from ep2sindy.operating.map import Fate, MapPoint
-from ep2sindy.operating.records import OperatingRecord, point_label, values_of
+from ep2sindy.operating.records import OperatingRecord, most_central, point_label
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -51,7 +48,7 @@ from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.simulated import compile_kernels
-from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.source import Source, expand, open_points, point_sources
 from ep2sindy.studies.study import Check, Count, Counts, Positive
 
 INTERVALS = (
@@ -201,26 +198,6 @@ class Study:
                 )
         windows = Windows(self.windows.n_windows, self.windows.periods)
         return How(library, structure, searched, self.degrees, windows, self.map_points, seed)
-
-
-def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of the values in each block; a point that comes again comes once.
-
-    That is, with the same data. 300 and 300.0 are one, in whatever order a block names parameters.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for block in blocks:
-        lists = {
-            name: value if isinstance(value, list) else [value]
-            for name, value in block.items()
-            if name in parameters
-        }
-        rest = {name: value for name, value in block.items() if name not in lists}
-        for values in product(*lists.values()):
-            point = {**dict(zip(lists, values, strict=True)), **rest}
-            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
-            found.setdefault(str(sorted(same.items(), key=lambda item: item[0])), point)
-    return list(found.values())
 
 
 def _records(
@@ -374,7 +351,7 @@ class Outcome:
 
     def _law(self, name: str, branch: Branch) -> Section:
         law, found = branch.law, branch.tied
-        middle = _middle(branch.fit.records)
+        middle = most_central(branch.fit.records)
         model = law.model_at(middle.parameters)
         equations: list[Block] = [
             Equation(state, model.terms(state), on_screen=True) for state in model.states
@@ -404,7 +381,7 @@ class Outcome:
         return [*lines, table, Picture("left_out")]
 
     def _spread(self, name: str) -> str:
-        found = self._numbers(name)
+        found = error_statistics(self.branches[name].left_out)
         smooth_f, smooth_amplitude = self.branches[name].smooth
         text = percent(2)
         lead = f"{name} cycle: " if len(self.members) > 1 else ""
@@ -420,23 +397,6 @@ class Outcome:
             f"interpolated by the same functions, miss by {text(float(np.median(smooth_f)))} "
             f"and {text(float(np.median(smooth_amplitude)))} in the median."
         )
-
-    def _numbers(self, name: str) -> dict[str, float | int]:
-        found = self.branches[name].left_out
-        f = np.array([abs(each.run.f_error) for each in found])
-        f[np.isnan(f)] = np.inf
-        ratios = [np.array(list(each.run.amplitude_ratio.values())) for each in found]
-        amplitude = np.array([np.abs(each - 1.0).max() for each in ratios])
-        waveform = np.array([max(each.run.waveform_error.values()) for each in found])
-        return {
-            "n": len(found),
-            "n_lives": sum(each.run.verdict is Verdict.LIVES for each in found),
-            "diverging": sum(each.run.rollout.diverged for each in found),
-            "f_median": float(np.median(f)),
-            "f_90": float(np.quantile(f, 0.9, method="higher")),
-            "amplitude_median": _median(amplitude),
-            "waveform_median": _median(waveform),
-        }
 
     def _map(self) -> list[Block]:
         right, n, quiet_right, quiet = agreement(self.branches, self.statuses)
@@ -459,7 +419,7 @@ class Outcome:
                     "degree": branch.choice.degree,
                     "status": branch.tied.status,
                     "loss": float(branch.tied.loss.mean()),
-                    "left_out": self._numbers(name),
+                    "left_out": error_statistics(branch.left_out),
                 }
                 for name, branch in self.branches.items()
             },
@@ -468,7 +428,7 @@ class Outcome:
 
     def headline(self) -> dict[str, float]:
         right, n, _, _ = agreement(self.branches, self.statuses)
-        numbers = self._numbers(next(iter(self.branches)))
+        numbers = error_statistics(next(iter(self.branches.values())).left_out)
         first = {key: float(value) for key, value in numbers.items()}
         return {"n_points": float(len(self.points)), **first, "map_right": right / n}
 
@@ -476,18 +436,6 @@ class Outcome:
 def n_points(n: int) -> str:
     """`1 point`, `3 points`."""
     return f"{n} point" if n == 1 else f"{n} points"
-
-
-def _middle(records: Sequence[OperatingRecord]) -> OperatingRecord:
-    """The one nearest to the mean of all."""
-    values = values_of(records)
-    off = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
-    return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
-
-
-def _median(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else float("nan")
 
 
 def _with_error(row: Mapping[Any, Any]) -> str:
