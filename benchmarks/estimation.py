@@ -23,11 +23,11 @@ import ep2sindy as ep
 from benchmarks.known_systems import KINDS, OTHERS, noisy
 from benchmarks.living import DOWNSTREAM_MM, POINTS, parts, record
 from ep2sindy.studies.living import start_of
-from ep2sindy.synthetic.draws import DRAWS
-from ep2sindy.synthetic.systems import System, lorenz
+from ep2sindy.systems.draws import DRAWS
+from ep2sindy.systems.systems import System, lorenz
 
 
-def judged(system: System, found: ep.Estimate, cpu_s: float) -> dict[str, float]:
+def judged(system: System, found: ep.discovery.Estimate, cpu_s: float) -> dict[str, float]:
     """Whether the support is right, and of a right one errors and coverage."""
     true, coef = system.model.coef, found.model.coef
     right = bool(((coef != 0.0) == (true != 0.0)).all())

@@ -13,7 +13,7 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.front import fit_support
-from ep2sindy.synthetic.draws import DRAWS, realization
+from ep2sindy.systems.draws import DRAWS, realization
 
 NOISE = 0.05
 

@@ -34,18 +34,18 @@ VOLTAGES, FLOWS = (250.0, 287.5, 325.0, 362.5, 400.0), (4.0, 4.5, 5.0, 5.5, 6.0)
 
 LOW, LEAN = (150.0, 175.0, 200.0, 225.0), (2.0, 3.0, 4.0, 5.0)  # at the edge of the quiet
 HIGH = (300.0, 400.0)
-TWO_CYCLES = ep.Thruster(  # conf/thruster/two_cycles.yaml
-    transport=ep.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3)
+TWO_CYCLES = ep.thruster.Thruster(  # conf/thruster/two_cycles.yaml
+    transport=ep.thruster.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3)
 )
 
 
 def recorded(
-    voltage: float, flow: float, thruster: ep.Thruster | None = None
+    voltage: float, flow: float, thruster: ep.thruster.Thruster | None = None
 ) -> OperatingRecord | None:
     """None where the simulation does not breathe."""
-    field = ep.simulate(
-        thruster or ep.Thruster(),
-        ep.OperatingPoint(float(voltage), float(flow)),
+    field = ep.thruster.simulate(
+        thruster or ep.thruster.Thruster(),
+        ep.thruster.OperatingPoint(float(voltage), float(flow)),
         cache=".cache/simulations",
         duration_s=6e-3,
         progress=False,

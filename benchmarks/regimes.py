@@ -20,7 +20,7 @@ from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.rule import Selection
-from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
+from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {

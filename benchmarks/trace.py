@@ -39,8 +39,10 @@ N_STARTS, STRIDE = 20, 11  # of the held-out samples, at most phases
 def current(point: str) -> Trajectory:
     """The simulator's, as +exp=trace takes it."""
     voltage, mass_flow = map(float, point.split("/"))
-    field = ep.simulate(
-        ep.Thruster(), ep.OperatingPoint(voltage, mass_flow), cache=".cache/simulations"
+    field = ep.thruster.simulate(
+        ep.thruster.Thruster(),
+        ep.thruster.OperatingPoint(voltage, mass_flow),
+        cache=".cache/simulations",
     )
     return Trajectory(field["time"].values, field[NAME].values[:, None], (NAME,), units={NAME: "A"})
 
@@ -58,7 +60,7 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     chosen = embed(from_one_signal(measured))
     states = chosen.embedded.run
     n = round(0.75 * states.n_samples)
-    bounds = ep.Bounds(frequency=0.005, amplitude=0.05)
+    bounds = ep.FreeRunBounds(frequency=0.005, amplitude=0.05)
     rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
     search = BestSubset(max_terms=5, n_best=8)
     recipe = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)

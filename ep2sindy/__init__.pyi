@@ -67,14 +67,15 @@ from ep2sindy.model.model import coef_matrix as coef_matrix
 # Refinement
 from ep2sindy.refinement.refine import refine as refine
 from ep2sindy.refinement.refine import Refinement as Refinement
+from ep2sindy.refinement.problem import RefinementSettings as RefinementSettings
 from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
 from ep2sindy.constraints.relations import constraint as constraint
 from ep2sindy.constraints.relations import Constraint as Constraint
 
 # Systems
-from ep2sindy.synthetic.systems import lorenz as lorenz  # for configs
-from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra  # for configs
-from ep2sindy.synthetic.systems import pendulum as pendulum  # for configs
+from ep2sindy.systems.systems import lorenz as lorenz  # for configs
+from ep2sindy.systems.systems import lotka_volterra as lotka_volterra  # for configs
+from ep2sindy.systems.systems import pendulum as pendulum  # for configs
 
 # Your own code
 from ep2sindy.library.functions import register_function as register_function

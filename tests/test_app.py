@@ -167,7 +167,7 @@ def test_a_group_left_out_does_not_become_another(group: str) -> None:
 
 def test_what_is_built_later_can_be_changed_by_place() -> None:
     point = {"voltage": 300.0, "mass_flow_mg_s": 5.0}
-    node = OmegaConf.create({"_target_": "ep2sindy.OperatingPoint", **point})
+    node = OmegaConf.create({"_target_": "ep2sindy.thruster.OperatingPoint", **point})
     later = Configured(node, "data")
     changed = later.changed({"voltage": 200.0}, {"neutral_speed": 190.0})
     assert changed.build().voltage == 200.0

@@ -12,7 +12,7 @@ from ep2sindy.model.rollout import Rollout
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.studies.benchmark import FirstRealizations, Variant, first_realizations
-from ep2sindy.synthetic.draws import realization
+from ep2sindy.systems.draws import realization
 
 SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]
 

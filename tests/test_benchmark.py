@@ -16,8 +16,8 @@ from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies.benchmark import Study, Variant, cells, merits
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import damped_oscillator
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import damped_oscillator
 
 TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
 # Draws random bootstraps and a random split: its outcome hangs on its stream.

@@ -10,7 +10,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.app.compare import main as compare
-from ep2sindy.app.sweep import parted, write_index
+from ep2sindy.app.sweep import split_varied, write_index
 from ep2sindy.report.results import LABELS, in_words
 from tests.browser import seen
 
@@ -167,7 +167,7 @@ def test_a_sweep_has_a_page_that_leads_to_its_jobs(tmp_path: Path) -> None:
 
 
 def test_what_was_varied_is_parted_from_the_rest(tmp_path: Path) -> None:
-    varied, shared = parted(sweep_of(tmp_path / "sweep"))
+    varied, shared = split_varied(sweep_of(tmp_path / "sweep"))
     assert varied == {"degree": ["1", "2", "3"]}
     assert shared == ["+exp=toy"]
 

@@ -22,7 +22,7 @@ from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.front import fit_support
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 LIBRARY = polynomial(["x", "y"], degree=2)
 SUPPORT = {"x": ["x", "x*y"], "y": ["y", "y*x"]}

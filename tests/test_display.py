@@ -10,13 +10,14 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.refinement.judge import RefinementStatus
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 UNITS = {"n_i": "m^-3", "n_n": "m^-3"}
 
@@ -187,6 +188,7 @@ def test_a_refinement_shows_status_loss_and_intervals(refinement: Refinement) ->
     assert "4 windows of 60 samples" in text
     assert "(±" in text
     assert "&plusmn;" in refinement._repr_html_()
-    failed = replace(refinement, status="non_finite", loss=float("inf"), model=breathing())
+    status = RefinementStatus.NON_FINITE
+    failed = replace(refinement, status=status, loss=float("inf"), model=breathing())
     assert "non_finite, loss inf" in repr(failed)
     assert "±" not in repr(failed)

@@ -18,8 +18,8 @@ from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, fit_support, pareto_front
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import System, lorenz, lotka_volterra
 
 EVERY_ROW = Weak(split=RandomSplit(0.0))
 

@@ -253,9 +253,9 @@ def test_prices_count_what_a_term_is_told_from() -> None:
 
 
 SYSTEMS = {
-    "oscillator": ep.damped_oscillator,
+    "oscillator": ep.systems.damped_oscillator,
     "lotka_volterra": ep.lotka_volterra,
-    "van_der_pol": ep.van_der_pol,
+    "van_der_pol": ep.systems.van_der_pol,
     "lorenz": ep.lorenz,
 }
 FAST = {
@@ -323,7 +323,7 @@ def test_lasting_noise_is_told_from_signal_and_buys_no_terms() -> None:
 
 
 def test_the_noise_is_measured_beside_the_model() -> None:
-    system = ep.van_der_pol()
+    system = ep.systems.van_der_pol()
     run = system.trajectory(noise=0.2, rng=1)
     clean = system.trajectory()
     found = ep.estimate([run], system.model.library)
@@ -334,7 +334,7 @@ def test_the_noise_is_measured_beside_the_model() -> None:
 
 
 def test_noise_that_grows_with_the_state_is_weighed_so() -> None:
-    system, rng = ep.damped_oscillator(), np.random.default_rng(0)
+    system, rng = ep.systems.damped_oscillator(), np.random.default_rng(0)
     clean = system.trajectory()
     noise = 0.05 * clean.states * rng.standard_normal(clean.states.shape)
     run = ep.Trajectory(clean.t, clean.states + noise, clean.state_names)
@@ -352,7 +352,7 @@ def test_a_linear_library_of_what_is_not_linear_is_called_a_misfit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("term", ["x^3", "x"])
 def test_a_library_without_a_true_term_is_called_a_misfit(term: str) -> None:
-    system = ep.van_der_pol()
+    system = ep.systems.van_der_pol()
     full = system.model.library
     library = full.take(np.arange(len(full)) != full.index(term))
     found = ep.estimate([system.trajectory(noise=0.05, rng=0)], library)
@@ -598,7 +598,7 @@ def test_more_coefficients_than_memory_holds_are_refused_first(
 def test_a_long_search_is_told_of() -> None:
     run = many_states(7)
     small, large = (ep.polynomial(run.state_names, degree=degree) for degree in (2, 3))
-    with pytest.warns(ep.SlowSearch, match=r"840 coefficients .* may take many minutes"):
+    with pytest.warns(ep.warnings.SlowSearch, match=r"840 coefficients .* may take many minutes"):
         estimation_problem.check_size([run], large, {})
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -123,7 +123,7 @@ def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
             r"the record holds \d\.\d periods, not six: chosen by windows held out instead",
         ),
         (
-            ep.damped_oscillator().trajectory(),
+            ep.systems.damped_oscillator().trajectory(),
             "record 'damped oscillator' has no period: chosen by windows held out",
         ),
     ],
@@ -138,9 +138,9 @@ def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
 @pytest.mark.parametrize("zeta", [pytest.param(-0.01, marks=pytest.mark.slow), 0.01])
 def test_a_spiral_is_no_cycle_to_stay_on(zeta):
     # Fourteen periods whose amplitude changes by a third from third to third.
-    system = replace(ep.damped_oscillator(zeta=zeta), rate_Hz=25.0)
+    system = replace(ep.systems.damped_oscillator(zeta=zeta), rate_Hz=25.0)
     run = system.trajectory(noise=0.05, rng=0)
-    assert ep.find_cycle(run.t, run.states) is not None
+    assert ep.signals.find_cycle(run.t, run.states) is not None
     other = ep.discover(run, system.model.library, recipe(formulation=ep.WeightedWeak(), n_best=1))
     assert "spirals: chosen by windows held out" in other.note
     for state in system.model.states:
@@ -218,7 +218,7 @@ def test_a_coefficient_keeps_the_value_it_is_given():
 
 
 def test_a_known_equation_is_not_searched():
-    oscillator = ep.damped_oscillator(zeta=0.05)
+    oscillator = ep.systems.damped_oscillator(zeta=0.05)
     run = oscillator.trajectory(noise=0.01, rng=0)
     known = ep.discover(
         run, ep.polynomial(["x", "v"], degree=2), terms={"x": ["v"]}, relations=["x: v == 1"]

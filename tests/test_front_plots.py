@@ -13,7 +13,7 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.front import ParetoFront, fit_supports
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 
 @pytest.fixture(scope="module")

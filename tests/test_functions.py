@@ -532,7 +532,7 @@ def test_a_pendulum_swings_on_closed_orbits() -> None:
     [
         {},
         pytest.param(  # torch.optim imports torch's compiler: five seconds
-            {"method": ep.GradientDescent(), "free_start": False}, marks=pytest.mark.slow
+            {"method": ep.refinement.GradientDescent(), "free_start": False}, marks=pytest.mark.slow
         ),
     ],
     ids=["shooting", "descent"],

@@ -28,7 +28,6 @@ ROOMS = [
     "constraints",
     "search",
     "estimation",
-    "synthetic",
     "systems",
     "refinement",
     "selection",
@@ -61,7 +60,7 @@ HEAVY = {
     "pandas": (
         "data",
         "thruster",
-        "synthetic",
+        "systems",
         "discovery",
         "operating",
         "figures",
@@ -70,9 +69,10 @@ HEAVY = {
         "app",
     ),
     "xarray": (
+        "trust.checksum",
         "data",
         "thruster",
-        "synthetic",
+        "systems",
         "discovery",
         "operating",
         "figures",

@@ -9,15 +9,15 @@ from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
-from ep2sindy.refinement.refine import Together, follow_together, refine_together
+from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.refined import RefinedScore, _refined
 from ep2sindy.selection.rule import FLOOR, MAX_ERROR, selected
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import System, damped_oscillator, lorenz, lotka_volterra
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra
 
 PREY = lotka_volterra()
 Terms = dict[str, float]
@@ -220,18 +220,18 @@ def test_models_of_different_terms_refined_together_are_those_refined_alone() ->
     )
     models = models_of_different_terms()
     method = MultipleShooting()
-    found = refine_together(models, batch, method=method)
+    found = refine_batch(models, batch, method=method)
     together = found.models
-    alone = refine_together(models, batch, method=method, points_per_batch=1).models
+    alone = refine_batch(models, batch, method=method, points_per_batch=1).models
     assert found.finished[0]
     assert found.loss[0] == pytest.approx(0.05**2 * 2.0, rel=0.5)
     for one, other, before in zip(together, alone, models, strict=True):
         np.testing.assert_allclose(one.coef, other.coef, rtol=1e-6)
         assert ((one.coef != 0.0) == (before.coef != 0.0)).all()
     assert not np.allclose(together[1].coef, models[1].coef, rtol=1e-3)
-    paths = follow_together(together, batch, method=method)
+    paths = smooth_batch(together, batch, method=method)
     for k, model in enumerate(together):
-        (path,) = follow_together([model], batch, method=method)
+        (path,) = smooth_batch([model], batch, method=method)
         np.testing.assert_allclose(paths[k], path, rtol=1e-8, equal_nan=True)
     # A fit of the starts alone is one of the noise alone, where the model is right.
     assert np.square(paths[0] - batch.data).mean() == pytest.approx(0.05**2 * 2.0, rel=0.5)
@@ -246,14 +246,14 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
         [PREY.trajectory()], states=("x", "y"), inputs=(), n_windows=3, window=50,
         rng=np.random.default_rng(0),
     )  # fmt: skip
-    found = refine_together([wild, sound], batch, method=MultipleShooting())
+    found = refine_batch([wild, sound], batch, method=MultipleShooting())
     kept, good = found.models
     assert found.finished.tolist() == [False, True]
     assert found.loss[0] == np.inf
     assert found.loss[1] < 1e-8
     np.testing.assert_array_equal(kept.coef, wild.coef)
     np.testing.assert_allclose(good.coef, sound.coef, rtol=1e-5, atol=1e-12)
-    paths = follow_together([wild, sound], batch, method=MultipleShooting())
+    paths = smooth_batch([wild, sound], batch, method=MultipleShooting())
     assert np.isnan(paths[0]).all()
     assert np.square(paths[1] - batch.data).mean() < 1e-8
 
@@ -263,11 +263,11 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
 ) -> None:
     off = replace(PREY.model, coef=1.2 * PREY.model.coef)
 
-    def unfinished(models: list[SparseModel], *_: object, **__: object) -> Together:
+    def unfinished(models: list[SparseModel], *_: object, **__: object) -> BatchRefinement:
         better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
-        return Together([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
+        return BatchRefinement([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
 
-    monkeypatch.setattr("ep2sindy.selection.refined.refine_together", unfinished)
+    monkeypatch.setattr("ep2sindy.selection.refined.refine_batch", unfinished)
     run = PREY.trajectory()
     batch = cut_windows(
         [run], states=("x", "y"), inputs=(), n_windows=3, window=50, rng=np.random.default_rng(0)

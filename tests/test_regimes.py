@@ -13,7 +13,7 @@ from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
+from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
 SIZES = {"fast": (8, 7, 600), "full": (20, 15, 1500)}
 ONE_EQUATION = dict.fromkeys(REGIONS, REGIONS["exit"])

@@ -12,7 +12,7 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra, van_der_pol
+from ep2sindy.systems.systems import System, lorenz, lotka_volterra, van_der_pol
 
 EVERY_ROW = Weak(split=RandomSplit(0.0))
 RANDOM = np.cumsum(np.random.default_rng(3).exponential(size=400))

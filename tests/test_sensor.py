@@ -15,7 +15,7 @@ from ep2sindy.data.sensor import bounds_of
 from ep2sindy.estimation.lateness import delayed_gram, move_channels
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, between, gram, observe
 from ep2sindy.estimation.problem import EstimationProblem, scaled_problem
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.systems import System
 
 LIMITS = [(-np.inf, 0.3), (0.3, np.inf), (-1.0, 0.5), (2.0, 2.5), (-9.0, -8.0), (30.0, np.inf)]
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.landmark import landmark_thruster, read_landmark_rates
-from ep2sindy.thruster.axial.grid import cell_faces
 from ep2sindy.thruster.axial.heavy_kernels import heavy_step
-from ep2sindy.thruster.axial.model import build_model, lengths_and_centres
+from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.axial.starts import GuessedStart

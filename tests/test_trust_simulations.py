@@ -41,11 +41,11 @@ class Data:
 STEPS: list[Step] = [
     lambda field: field / 2,
     lambda field: field.drop_attrs(),
-    lambda field: ep.crop(field, stop_s=4e-5),
-    lambda field: ep.decimate(field, factor=2),
-    lambda field: ep.low_pass(field, cutoff_Hz=1e5),
-    lambda field: ep.derive(field, name="twice", expression="2*n_i", units="m^-3"),
-    lambda field: ep.keep_where(field, condition="z > 0.015"),
+    lambda field: ep.prepare.crop(field, stop_s=4e-5),
+    lambda field: ep.prepare.decimate(field, factor=2),
+    lambda field: ep.prepare.low_pass(field, cutoff_Hz=1e5),
+    lambda field: ep.prepare.derive(field, name="twice", expression="2*n_i", units="m^-3"),
+    lambda field: ep.prepare.keep_where(field, condition="z > 0.015"),
     lambda field: xr.Dataset({"n_i": field["n_i"]}),
 ]
 

@@ -1,4 +1,4 @@
-"""How far a call walks: files of the package that it enters, counted by a profiler's hook."""
+"""How many files of the package a call enters: what a reader has to open to follow it."""
 
 import sys
 from collections.abc import Callable
@@ -9,25 +9,25 @@ import pandas as pd
 
 import ep2sindy as ep
 
-PACKAGE = Path(ep.__file__).resolve().parent
+PACKAGE = str(Path(ep.__file__).parent)
 
 
 def files_entered(call: Callable[[], object]) -> set[str]:
-    """Files below ep2sindy/ of whose functions one is entered, compiled kernels among them."""
+    """Paths below ep2sindy/ of all Python functions that a call enters."""
     entered: set[str] = set()
 
-    def hook(frame: FrameType, event: str, argument: object) -> None:
-        if event == "call":
-            entered.add(frame.f_code.co_filename)
+    def watch(frame: FrameType, event: str, argument: object) -> None:
+        path = frame.f_code.co_filename
+        if event == "call" and path.startswith(PACKAGE):
+            entered.add(Path(path).relative_to(PACKAGE).as_posix())
 
     before = sys.getprofile()
-    sys.setprofile(hook)
+    sys.setprofile(watch)
     try:
         call()
     finally:
         sys.setprofile(before)
-    below = [Path(name) for name in entered if name.startswith(str(PACKAGE))]
-    return {str(path.relative_to(PACKAGE)) for path in below}
+    return entered
 
 
 def test_a_discovery_by_the_default_enters_no_room_of_rows_but_to_compare_terms() -> None:
@@ -38,3 +38,20 @@ def test_a_discovery_by_the_default_enters_no_room_of_rows_but_to_compare_terms(
     rows = {name for name in entered if name.startswith("regression/")}
     assert rows == {"regression/ambiguity.py", "regression/gram_fits.py"}
     assert len(entered) <= 36, sorted(entered)  # 53 with rows
+
+
+def test_a_refinement_is_followed_through_few_files() -> None:
+    prey = ep.lotka_volterra()
+    run = prey.trajectory(noise=0.02, rng=0)
+    ep.refine(prey.model, [run], window=30, n_windows=4, rng=0)  # imports, and compiles
+    entered = files_entered(lambda: ep.refine(prey.model, [run], window=30, n_windows=4, rng=0))
+    assert {path for path in entered if path.startswith("refinement/")} == {
+        "refinement/judge.py",
+        "refinement/kernels.py",
+        "refinement/methods/multiple_shooting.py",
+        "refinement/ode.py",
+        "refinement/problem.py",
+        "refinement/refine.py",
+        "refinement/windows.py",
+    }
+    assert len(entered) <= 17, sorted(entered)

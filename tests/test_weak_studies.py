@@ -27,7 +27,7 @@ from ep2sindy.studies.weak_windows import (
     true_library,
     window_cells,
 )
-from ep2sindy.synthetic.systems import System, lotka_volterra
+from ep2sindy.systems.systems import System, lotka_volterra
 
 EVERY_ROW = RandomSplit(test_fraction=0.0)
 BOXES = Weak(

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import NUMBER, PRODUCT, VARIABLE
+from ep2sindy.runtime.arrays import read_only
 
 ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
 

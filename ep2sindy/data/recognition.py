@@ -52,7 +52,7 @@ class Recognised:
         if problems:
             text = "; ".join([*problems, *self.questions])
             raise ValueError(
-                f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect "
+                f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect_file "
                 "shows what it holds"
             )
 

@@ -324,9 +324,9 @@ def check_size(
     check_memory(
         8.0 * NUMBERS * n * (n + n_samples * len(states)),
         f"{what} that are estimated together from {n_samples} samples",
-        way_out="take fewer terms or a lower degree, every second sample (ep2sindy.decimate), or a "
-        "search equation by equation: Regression(WeightedWeak()), or search=best_subset "
-        "selection=ebic",
+        way_out="take fewer terms or a lower degree, every second sample "
+        "(ep2sindy.prepare.decimate), or a search equation by equation: "
+        "Regression(WeightedWeak()), or search=best_subset selection=ebic",
     )
     if n > SOON:
         warnings.warn(

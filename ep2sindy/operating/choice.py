@@ -29,7 +29,7 @@ from ep2sindy.operating.records import (
     check_records,
     interpolation_errors,
 )
-from ep2sindy.refinement.law import TiedRefinement
+from ep2sindy.refinement.law import LawRefinement
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -189,7 +189,7 @@ class Branch:
     trials: Sequence[StructureTrial]
     choice: StructureTrial
     law: OperatingLaw
-    tied: TiedRefinement
+    tied: LawRefinement
     left_out: Sequence[LeaveOneOut]
     smooth: tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]
     at_points: Sequence[MapPoint]

@@ -21,14 +21,16 @@ from ep2sindy.operating.records import (
     check_records,
     values_of,
 )
-from ep2sindy.refinement.law import TiedRefinement, refine_tied
+from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.refine import Refinement, refine_many
+from ep2sindy.refinement.problem import RefinementSettings
+from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import Progress, as_progress
+from ep2sindy.signals.spectrum import samples_in
 
 MOST = 10.0  # deviations count no more, however far a run is off, or where there is none
 
@@ -47,8 +49,9 @@ class Windows:
             raise ValueError(f"windows must be one or more, of positive length: {self} came")
 
     def samples(self, records: Sequence[OperatingRecord]) -> int:
-        each = [self.periods / (r.cycle.frequency_Hz * r.run.dt_s) for r in records]
-        wanted = round(float(np.median(each))) + 1
+        frequency_Hz = [record.cycle.frequency_Hz for record in records]
+        dt_s = [record.run.dt_s for record in records]
+        wanted = samples_in(self.periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
         return min(wanted, *(record.run.n_samples // 2 for record in records))
 
 
@@ -118,7 +121,7 @@ class OperatingFit:
         *,
         start: OperatingLaw | None = None,
         progress: Progress | bool = False,
-    ) -> tuple[OperatingLaw, TiedRefinement]:
+    ) -> tuple[OperatingLaw, LawRefinement]:
         """The law refined over all records at once, with intervals.
 
         start: a law that is close; the weighted one, and all stages, otherwise.
@@ -128,14 +131,12 @@ class OperatingFit:
         method = MultipleShooting()
         if start is not None:
             method = MultipleShooting(first_block=window, tolerance=1e-4)
-        found = refine_tied(
+        found = refine_law(
             [fit.model for fit in self.fits],
             [[record.run] for record in self.records],
             self.basis(functions),
-            window=window,
-            n_windows=self.windows.n_windows,
+            RefinementSettings(self.windows.n_windows, window, method=method, n_reweights=0),
             start=near.coef,
-            method=method,
             rng=self.seed,
             progress=progress,
         )
@@ -187,12 +188,12 @@ def operating_fit(
     for record in records:
         problems = rows.assemble([record.run], library, rng=np.random.default_rng(seed))
         starts.append(constrained_fit(problems, held, units=record.run.units))
-    fits = refine_many(
+    # States count by their standard deviation, as they are judged.
+    settings = RefinementSettings(windows.n_windows, windows.samples(records), n_reweights=0)
+    fits = refine(
         starts,
         [[record.run] for record in records],
-        window=windows.samples(records),
-        n_windows=windows.n_windows,
-        n_reweights=0,  # states count by their standard deviation, as they are judged
+        settings,
         rng=seed,
         progress=progress,
     )

@@ -11,11 +11,11 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.data.scales import column_norms
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.quantities import PointResult
 from ep2sindy.operating.records import check_varying
+from ep2sindy.runtime.arrays import read_only
 
 # A share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10

@@ -14,6 +14,7 @@ from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
+from ep2sindy.signals.spectrum import steps_in
 
 LEAST_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
 
@@ -99,7 +100,7 @@ class OperatingRecord:
 
         A free run starts here: in the pulse a small error of the model is a large one in phase.
         """
-        n = round(2.0 / (self.cycle.frequency_Hz * self.run.dt_s))
+        n = round(steps_in(2.0, frequency_Hz=self.cycle.frequency_Hz, dt_s=self.run.dt_s))
         x = self.run.states[: max(n, 3)] / zero_to_one(self.cycle.std)
         return int(np.argmin(np.linalg.norm(np.gradient(x, axis=0), axis=1)))
 

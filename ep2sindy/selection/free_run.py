@@ -17,7 +17,7 @@ from ep2sindy.model.likeness import FreeRunBounds, Verdict, against_cycle, devia
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.refinement.refine import refine_together
+from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.refined import RefinedScore
@@ -40,6 +40,7 @@ from ep2sindy.selection.systems import (
     systems_of,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.spectrum import samples_in, steps_in
 
 LEAST_WINDOWS = 30  # that the winner is refined on
 
@@ -161,11 +162,9 @@ class FreeRunScore:
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
         """Samples of a window."""
-        samples = [
-            self.window_periods / (cycle.frequency_Hz * run.dt_s)
-            for run, cycle in zip(records.runs, cycles, strict=True)
-        ]
-        return round(float(np.median(samples))) + 1
+        frequency_Hz = [cycle.frequency_Hz for cycle in cycles]
+        dt_s = [run.dt_s for run in records.runs]
+        return samples_in(self.window_periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
 
     def _trials(
         self,
@@ -207,7 +206,7 @@ class FreeRunScore:
         )
         method, together = budget(batch)
         with progress.stage(len(systems), "system", "refined without a fold") as advance:
-            refined = refine_together(
+            refined = refine_batch(
                 [system.model for system in systems],
                 batch,
                 method=method,
@@ -345,7 +344,7 @@ def paths_over(
     centre, spread = joined.mean(axis=0), joined.std(axis=0)
     for part in held:
         run, x, cycle = records.runs[part.run], records.smoothed[part.run], cycles[part.run]
-        per_period = 1.0 / (cycle.frequency_Hz * run.dt_s)
+        per_period = steps_in(1.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
         first, n_samples = part.start, part.stop - part.start
         if not ensemble.inputs:
             n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))

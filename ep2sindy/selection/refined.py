@@ -14,7 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.refine import follow_together, refine_together
+from ep2sindy.refinement.refine import refine_batch, smooth_batch
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.search.front import ParetoFront
@@ -213,7 +213,7 @@ def _refined(
     if not order.size:
         return ensemble
     method, together = budget(batch)
-    found = refine_together(
+    found = refine_batch(
         _models(ensemble, order),
         batch,
         method=method,
@@ -244,7 +244,7 @@ def _residuals(
     order = _by_size(ensemble)
     if order.size:
         method, together = budget(batch)
-        paths = follow_together(
+        paths = smooth_batch(
             _models(ensemble, order),
             batch,
             method=method,

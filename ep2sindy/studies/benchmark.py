@@ -44,8 +44,8 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.studies.study import Count, Deferred, Levels, Names
-from ep2sindy.synthetic.draws import DRAWS, check_systems, realization
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.draws import DRAWS, check_systems, realization
+from ep2sindy.systems.systems import System
 
 FIGURE = (
     "Realizations in which all true equations are among the candidates (left), and are the ones "

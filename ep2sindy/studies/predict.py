@@ -12,11 +12,11 @@ import pandas as pd
 from scipy.special import ndtri
 
 from ep2sindy.figures.operating import (
+    cycle_line_figure,
+    cycle_map_figure,
     frequency_scale,
     laws_figure,
     left_out_figure,
-    line_figure,
-    map_figure,
 )
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
@@ -293,8 +293,8 @@ class Outcome:
             )
             found[f"laws_{name}"] = Captioned(draw, CAPTIONS["laws"])
             if branch.map:
-                drawn, caption = (map_figure, "map") if len(self.parameters) == 2 else (
-                    line_figure, "line",
+                drawn, caption = (cycle_map_figure, "map") if len(self.parameters) == 2 else (
+                    cycle_line_figure, "line",
                 )  # fmt: skip
                 draw = partial(
                     drawn, self._of("map", name), self._tables["points"], branch.law.points,
