@@ -17,7 +17,6 @@ from ep2sindy.operating.fit import (
     LeaveOneOut,
     OperatingFit,
     Structure,
-    Windows,
     leave_one_out,
     operating_fit,
 )
@@ -30,6 +29,7 @@ from ep2sindy.operating.records import (
     interpolation_errors,
 )
 from ep2sindy.refinement.law import LawRefinement
+from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -88,7 +88,7 @@ def try_structures(
     structures: Sequence[Structure],
     degrees: Sequence[int],
     *,
-    windows: Windows,
+    settings: RefinementSettings,
     seed: int = 0,
     workers: Workers | None = None,
     progress: Progress = SILENT,
@@ -102,7 +102,7 @@ def try_structures(
         records=records,
         library=library,
         degrees=degrees,
-        windows=windows,
+        settings=settings,
         seed=seed,
     )
     stage = progress.stage(len(structures), "structure", "laws at points left out")
@@ -138,10 +138,10 @@ def _try_structure(
     records: Sequence[OperatingRecord],
     library: Library,
     degrees: Sequence[int],
-    windows: Windows,
+    settings: RefinementSettings,
     seed: int,
 ) -> list[StructureTrial]:
-    fit = operating_fit(records, library, structure, windows=windows, seed=seed)
+    fit = operating_fit(records, library, structure, settings=settings, seed=seed)
     found = []
     for degree in degrees:
         try:
@@ -171,7 +171,7 @@ class How:
     structure: Structure | None
     searched: Searched
     degrees: Sequence[int]
-    windows: Windows
+    settings: RefinementSettings
     n_map: int
     seed: int
 
@@ -235,7 +235,7 @@ def find_branch(
         how.library,
         structures,
         how.degrees,
-        windows=how.windows,
+        settings=how.settings,
         seed=how.seed,
         workers=workers,
         progress=progress,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Annotated, Any
 
@@ -28,7 +28,7 @@ from ep2sindy.operating.choice import (
     find_branch,
     group_by_cycle,
 )
-from ep2sindy.operating.fit import LeaveOneOut, Windows, error_statistics
+from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, error_statistics
 from ep2sindy.operating.law import law_basis
 from ep2sindy.operating.map import Fate, MapPoint
 from ep2sindy.operating.records import OperatingRecord, most_central, point_label
@@ -196,8 +196,8 @@ class Study:
                     f"a law's model runs freely, on its states {states} alone: {inputs} came in "
                     "model"
                 )
-        windows = Windows(self.windows.n_windows, self.windows.periods)
-        return How(library, structure, searched, self.degrees, windows, self.map_points, seed)
+        settings = replace(SETTINGS, n_windows=self.windows.n_windows, periods=self.windows.periods)
+        return How(library, structure, searched, self.degrees, settings, self.map_points, seed)
 
 
 def _records(
