@@ -151,25 +151,17 @@ def _try_structure(
     return found
 
 
-@dataclass(frozen=True)
-class Searched:
-    """Structures to try where none is given: supports of two to `max_terms` terms an equation."""
-
-    degree: int
-    max_terms: int
-
-
 @dataclass(frozen=True, eq=False)
-class How:
-    """How the law of a branch is found.
+class BranchSettings:
+    """BranchSettings the law of a branch is found.
 
-    structure: None searches. degrees: of the polynomials, tried in turn. n_map: points of the map
-    along each parameter.
+    structure: None tries supports of two to `max_terms` terms in each equation. degrees: of the
+    polynomials, tried in turn. n_map: points of the map along each parameter.
     """
 
     library: Library
     structure: Structure | None
-    searched: Searched
+    max_terms: int
     degrees: Sequence[int]
     settings: RefinementSettings
     n_map: int
@@ -217,7 +209,7 @@ def find_branch(
     name: str,
     records: Sequence[OperatingRecord],
     points: Sequence[Mapping[str, float]],
-    how: How,
+    how: BranchSettings,
     workers: Workers,
     *,
     progress: Progress = SILENT,
@@ -227,9 +219,12 @@ def find_branch(
     Raises ValueError where the records do not suffice for a law.
     """
     check_records(records)
-    structures = (
-        [how.structure] if how.structure is not None else _structures(records, how, progress)
-    )
+    if how.structure is None:
+        structures = candidate_structures(
+            records, how.library, max_terms=how.max_terms, progress=progress
+        )
+    else:
+        structures = [how.structure]
     trials = try_structures(
         records,
         how.library,
@@ -265,20 +260,11 @@ def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, 
     if len(names) > MOST_PARAMETERS:
         return []
     values = np.array([[point[name] for name in names] for point in points])
-    axes = [np.linspace(low, high, n).tolist() for low, high in zip(*_ends(values), strict=True)]
+    axes = [
+        np.linspace(low, high, n).tolist()
+        for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
+    ]
     return [dict(zip(names, each, strict=True)) for each in product(*axes)]
-
-
-def _ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return values.min(axis=0), values.max(axis=0)
-
-
-def _structures(
-    records: Sequence[OperatingRecord], how: How, progress: Progress
-) -> list[Structure]:
-    return candidate_structures(
-        records, how.library, max_terms=how.searched.max_terms, progress=progress
-    )
 
 
 def _follow(

@@ -22,8 +22,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import (
     Branch,
-    How,
-    Searched,
+    BranchSettings,
     StructureTrial,
     find_branch,
     group_by_cycle,
@@ -184,11 +183,10 @@ class Study:
         members_of = {name: [r.parameters for r in group] for name, group in groups.items()}
         return Outcome(everywhere, statuses, records, members_of, found, self.labels)
 
-    def _how(self, seed: int) -> How:
+    def _how(self, seed: int) -> BranchSettings:
         states = self.source.states
-        searched = Searched(self.structures.degree, self.structures.max_terms)
         structure = None
-        library = polynomial(states, degree=searched.degree)
+        library = polynomial(states, degree=self.structures.degree)
         if self.model is not None:
             library, structure = terms_of(self.model, states=states)
             if inputs := [name for name in library.variables if name not in states]:
@@ -197,7 +195,15 @@ class Study:
                     "model"
                 )
         settings = replace(SETTINGS, n_windows=self.windows.n_windows, periods=self.windows.periods)
-        return How(library, structure, searched, self.degrees, settings, self.map_points, seed)
+        return BranchSettings(
+            library=library,
+            structure=structure,
+            max_terms=self.structures.max_terms,
+            degrees=self.degrees,
+            settings=settings,
+            n_map=self.map_points,
+            seed=seed,
+        )
 
 
 def _records(
