@@ -73,8 +73,8 @@ class Case:
 class PointStudy:
     """What is done at every operating point.
 
-    library: holds the terms of all cases. searched: the library that terms are looked for in, by
-    the recipe, whose formulation makes the rows of the fits as well.
+    library: holds the terms of all cases, which are fitted to the rows of the formulation.
+    searched: the library that terms are looked for in, by the recipe.
     Raises ValueError for a quantity whose coefficient a case does not have.
     """
 
