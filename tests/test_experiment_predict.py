@@ -109,6 +109,13 @@ def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
             ["points=[{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}]"],
             "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs more points than these",
         ),
+        (
+            [
+                "points=[{V_D_V: 300, mdot_mg_s: 4}, {V_D_V: 310, mdot_mg_s: 5}, "
+                "{V_D_V: 320, mdot_mg_s: 6}, {V_D_V: 330, mdot_mg_s: 7}]"
+            ],
+            "4 points do not tell the 3 terms of a law apart",
+        ),
         (["points=[]"], "points must be a list like [{V_D_V: [250,300]"),
         (["parameters.V_D_V=operating_point.volts"], "parameters must name numbers of the data"),
         (["degrees=[]"], "degrees must be a list such as [a,b]"),
