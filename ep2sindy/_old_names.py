@@ -16,7 +16,7 @@ MOVED = {
     "library": "equation_text",
     "model": "Rollout r2",
     "operating": """
-        OperatingRecord branches_of operating_fit OperatingFit Windows OperatingLaw control_law
+        OperatingRecord branches_of operating_fit OperatingFit OperatingLaw control_law
         ControlLaw law_map MapPoint Quantity TimeBootstrap Refining
     """,
     "parallel": "Serial Loky Dask Progress",
@@ -84,6 +84,7 @@ GONE: dict[str, str] = {
     "STLSQRegressor": "take pysindy.STLSQ, or ep2sindy.STLSQ() as the search of a Regression",
     "SingleShooting": "take ep2sindy.refinement.MultipleShooting()",
     "loss_against_window": "call ep2sindy.refine in a loop over the lengths of windows",
+    "Windows": "take ep2sindy.RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)",
     "LANDMARK_POINT": "see benchmarks/landmark.py",
     "landmark_thruster": "see benchmarks/landmark.py",
 }

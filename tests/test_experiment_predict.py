@@ -13,7 +13,8 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.choice import map_points
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.studies.predict import Study, expand
+from ep2sindy.studies.predict import Study
+from ep2sindy.studies.source import expand
 from tests import programs
 
 POINTS = "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"
@@ -107,6 +108,13 @@ def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
         (
             ["points=[{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}]"],
             "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs more points than these",
+        ),
+        (
+            [
+                "points=[{V_D_V: 300, mdot_mg_s: 4}, {V_D_V: 310, mdot_mg_s: 5}, "
+                "{V_D_V: 320, mdot_mg_s: 6}, {V_D_V: 330, mdot_mg_s: 7}]"
+            ],
+            "4 points do not tell the 3 terms of a law apart",
         ),
         (["points=[]"], "points must be a list like [{V_D_V: [250,300]"),
         (["parameters.V_D_V=operating_point.volts"], "parameters must name numbers of the data"),

@@ -83,7 +83,7 @@ HEAVY = {
 # Functions over 50 lines, waiting to be shortened: none should be here for long.
 
 # Experiments whose settings, tables and views make one file.
-LONGER = {"studies.parametric": 640, "studies.predict": 680}
+LONGER = {"studies.parametric": 600, "studies.predict": 650}
 
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

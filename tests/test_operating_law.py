@@ -12,7 +12,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.operating.fit import LeaveOneOut, OperatingFit, Windows, leave_one_out, operating_fit
+from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, OperatingFit, leave_one_out, operating_fit
 from ep2sindy.operating.law import OperatingLaw, in_hull
 from ep2sindy.operating.records import (
     OperatingRecord,
@@ -50,8 +50,8 @@ def records() -> tuple[OperatingRecord, ...]:
 
 @cache
 def fit() -> OperatingFit:
-    windows = Windows(n_windows=3, periods=1.0)
-    return operating_fit(records(), LIBRARY, STRUCTURE, windows=windows)
+    settings = replace(SETTINGS, n_windows=3, periods=1.0)
+    return operating_fit(records(), LIBRARY, STRUCTURE, settings=settings)
 
 
 @cache

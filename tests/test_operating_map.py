@@ -9,7 +9,7 @@ import pytest
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.choice import StructureTrial, candidate_structures, choose, try_structures
-from ep2sindy.operating.fit import Windows
+from ep2sindy.operating.fit import SETTINGS
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate, eigenvalues, fixed_point, law_map
 from tests.test_operating_law import LIBRARY, STATES, STRUCTURE, recorded, records
@@ -22,6 +22,7 @@ HOPF = {
 
 
 ONES = np.ones(2)
+SHORT = replace(SETTINGS, n_windows=3, periods=1.0)
 
 
 @cache
@@ -29,9 +30,7 @@ def tries() -> list[StructureTrial]:
     """Three structures, the true one first, along one parameter of the known family."""
     line = [replace(recorded(a, 0.0), parameters={"a": a}) for a in (0.5, 0.75, 1.0, 1.25, 1.5)]
     structures = [STRUCTURE, {**STRUCTURE, "y": ["x", "y"]}, {**STRUCTURE, "x": ["x", "y"]}]
-    return try_structures(
-        line, LIBRARY, structures, [1, 2], windows=Windows(n_windows=3, periods=1.0)
-    )
+    return try_structures(line, LIBRARY, structures, [1, 2], settings=SHORT)
 
 
 def hopf() -> OperatingLaw:
@@ -116,7 +115,7 @@ def test_candidates_are_the_best_supports_of_every_size() -> None:
 def test_too_few_points_for_every_degree_are_refused() -> None:
     few = [records()[k] for k in (0, 1, 4)]
     with pytest.raises(ValueError, match="3 operating points suffice for no law of degree 1"):
-        try_structures(few, LIBRARY, [STRUCTURE], [1, 2], windows=Windows(3, 1.0))
+        try_structures(few, LIBRARY, [STRUCTURE], [1, 2], settings=SHORT)
 
 
 def test_of_equals_the_one_of_fewest_numbers_is_chosen() -> None:

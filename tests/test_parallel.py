@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import psutil
 import pytest
 from threadpoolctl import threadpool_info
 
-from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, rows_in_order
+from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, collect, rows_in_order
 
 PATIENCE_S = 300.0  # for what comes at once on an idle machine: only what hangs is longer
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
@@ -90,6 +91,22 @@ def test_rows_come_in_the_order_of_their_pieces() -> None:
     assert told == [1, 1, 1]
     with pytest.raises(ValueError, match="there must be something to run: 1 pieces came"):
         rows_in_order(Serial(), repeated, [0])
+
+
+def test_results_come_in_the_order_of_their_pieces_and_are_told_as_they_come() -> None:
+    advanced: list[int] = []
+    told: list[tuple[int, list[int]]] = []
+    results = collect(
+        Backwards(),
+        repeated,
+        [3, 0, 2],
+        nullcontext(advanced.append),
+        size=lambda piece: 10 * piece,
+        tell=lambda number, result: told.append((number, result)),
+    )
+    assert results == [[3, 3, 3], [], [2, 2]]
+    assert told == [(2, [2, 2]), (1, []), (0, [3, 3, 3])]
+    assert advanced == [20, 0, 30]
 
 
 def test_a_piece_has_one_thread(workers: Workers) -> None:

@@ -67,17 +67,15 @@ SEARCHED = polynomial(["x", "y", "R", "u"], degree=2, products=["x*y*R"])
 
 def study(*, weak: bool = True) -> PointStudy:
     every = RandomSplit(0.0)
+    rows = Weak(split=every) if weak else Differential(NoSmoothing(), split=every)
     return PointStudy(
         library=LIBRARY,
         cases=CASES,
         bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
         refining=Refining(n_windows=10, periods=0.5, max_iter=50),
         searched=SEARCHED,
-        recipe=Regression(
-            Weak(split=every) if weak else Differential(NoSmoothing(), split=every),
-            BestSubset(max_terms=3),
-            selection=Knee(n_norm="max_terms"),
-        ),
+        recipe=Regression(rows, BestSubset(max_terms=3), selection=Knee(n_norm="max_terms")),
+        formulation=rows,
     )
 
 
@@ -513,7 +511,7 @@ def test_smoothing_biases_least_squares_and_not_refinements(
 ) -> None:
     run = forced(**TRUTHS[0], dt=1.0 / samples_per_period, periods=20)
     form = Differential(split=RandomSplit(0.0))
-    smoothed = replace(study(), recipe=replace(study().recipe, formulation=form))
+    smoothed = replace(study(), recipe=replace(study().recipe, formulation=form), formulation=form)
     (result,) = results_of([OperatingRecord({"V": 1.0}, run)], smoothed)
     for name, value in TRUTHS[0].items():
         fitted, refined = (result.fits[f"constrained{end}"].estimates for end in ("", "_refined"))

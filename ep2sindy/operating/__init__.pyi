@@ -5,7 +5,6 @@ from ep2sindy.operating.fit import operating_fit as operating_fit
 from ep2sindy.operating.fit import OperatingFit as OperatingFit
 from ep2sindy.operating.fit import leave_one_out as leave_one_out
 from ep2sindy.operating.fit import LeaveOneOut as LeaveOneOut
-from ep2sindy.operating.fit import Windows as Windows  # for configs
 from ep2sindy.operating.law import OperatingLaw as OperatingLaw
 from ep2sindy.operating.law import fit_law as fit_law
 from ep2sindy.operating.law import LawFit as LawFit

@@ -17,7 +17,6 @@ from ep2sindy.operating.fit import (
     LeaveOneOut,
     OperatingFit,
     Structure,
-    Windows,
     leave_one_out,
     operating_fit,
 )
@@ -30,6 +29,7 @@ from ep2sindy.operating.records import (
     interpolation_errors,
 )
 from ep2sindy.refinement.law import LawRefinement
+from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -88,7 +88,7 @@ def try_structures(
     structures: Sequence[Structure],
     degrees: Sequence[int],
     *,
-    windows: Windows,
+    settings: RefinementSettings,
     seed: int = 0,
     workers: Workers | None = None,
     progress: Progress = SILENT,
@@ -102,7 +102,7 @@ def try_structures(
         records=records,
         library=library,
         degrees=degrees,
-        windows=windows,
+        settings=settings,
         seed=seed,
     )
     stage = progress.stage(len(structures), "structure", "laws at points left out")
@@ -138,10 +138,10 @@ def _try_structure(
     records: Sequence[OperatingRecord],
     library: Library,
     degrees: Sequence[int],
-    windows: Windows,
+    settings: RefinementSettings,
     seed: int,
 ) -> list[StructureTrial]:
-    fit = operating_fit(records, library, structure, windows=windows, seed=seed)
+    fit = operating_fit(records, library, structure, settings=settings, seed=seed)
     found = []
     for degree in degrees:
         try:
@@ -151,27 +151,19 @@ def _try_structure(
     return found
 
 
-@dataclass(frozen=True)
-class Searched:
-    """Structures to try where none is given: supports of two to `max_terms` terms an equation."""
-
-    degree: int
-    max_terms: int
-
-
 @dataclass(frozen=True, eq=False)
-class How:
-    """How the law of a branch is found.
+class BranchSettings:
+    """BranchSettings the law of a branch is found.
 
-    structure: None searches. degrees: of the polynomials, tried in turn. n_map: points of the map
-    along each parameter.
+    structure: None tries supports of two to `max_terms` terms in each equation. degrees: of the
+    polynomials, tried in turn. n_map: points of the map along each parameter.
     """
 
     library: Library
     structure: Structure | None
-    searched: Searched
+    max_terms: int
     degrees: Sequence[int]
-    windows: Windows
+    settings: RefinementSettings
     n_map: int
     seed: int
 
@@ -217,7 +209,7 @@ def find_branch(
     name: str,
     records: Sequence[OperatingRecord],
     points: Sequence[Mapping[str, float]],
-    how: How,
+    how: BranchSettings,
     workers: Workers,
     *,
     progress: Progress = SILENT,
@@ -227,15 +219,18 @@ def find_branch(
     Raises ValueError where the records do not suffice for a law.
     """
     check_records(records)
-    structures = (
-        [how.structure] if how.structure is not None else _structures(records, how, progress)
-    )
+    if how.structure is None:
+        structures = candidate_structures(
+            records, how.library, max_terms=how.max_terms, progress=progress
+        )
+    else:
+        structures = [how.structure]
     trials = try_structures(
         records,
         how.library,
         structures,
         how.degrees,
-        windows=how.windows,
+        settings=how.settings,
         seed=how.seed,
         workers=workers,
         progress=progress,
@@ -265,20 +260,11 @@ def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, 
     if len(names) > MOST_PARAMETERS:
         return []
     values = np.array([[point[name] for name in names] for point in points])
-    axes = [np.linspace(low, high, n).tolist() for low, high in zip(*_ends(values), strict=True)]
+    axes = [
+        np.linspace(low, high, n).tolist()
+        for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
+    ]
     return [dict(zip(names, each, strict=True)) for each in product(*axes)]
-
-
-def _ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return values.min(axis=0), values.max(axis=0)
-
-
-def _structures(
-    records: Sequence[OperatingRecord], how: How, progress: Progress
-) -> list[Structure]:
-    return candidate_structures(
-        records, how.library, max_terms=how.searched.max_terms, progress=progress
-    )
 
 
 def _follow(

@@ -13,7 +13,7 @@ from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import FreeRunBounds, deviation
+from ep2sindy.model.likeness import FreeRunBounds, Verdict, deviation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
 from ep2sindy.operating.records import (
@@ -37,22 +37,24 @@ MOST = 10.0  # deviations count no more, however far a run is off, or where ther
 Structure = Mapping[str, Sequence[str]]
 
 
-@dataclass(frozen=True)
-class Windows:
-    """How much of every record is followed: windows of so many periods of the median frequency."""
+# States count by their standard deviation, as free runs are judged: without passes of weights.
+SETTINGS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
 
-    n_windows: int = 20
-    periods: float = 2.0
 
-    def __post_init__(self) -> None:
-        if self.n_windows < 1 or not self.periods > 0.0:
-            raise ValueError(f"windows must be one or more, of positive length: {self} came")
+def in_samples(
+    settings: RefinementSettings, records: Sequence[OperatingRecord]
+) -> RefinementSettings:
+    """The same for records of one law: windows hold as many samples in all of them.
 
-    def samples(self, records: Sequence[OperatingRecord]) -> int:
-        frequency_Hz = [record.cycle.frequency_Hz for record in records]
-        dt_s = [record.run.dt_s for record in records]
-        wanted = samples_in(self.periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
-        return min(wanted, *(record.run.n_samples // 2 for record in records))
+    Periods are those of the median frequency; no window is longer than half of any record.
+    """
+    if settings.periods is None:
+        return settings
+    frequency_Hz = [record.cycle.frequency_Hz for record in records]
+    dt_s = [record.run.dt_s for record in records]
+    wanted = samples_in(settings.periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
+    window = min(wanted, *(record.run.n_samples // 2 for record in records))
+    return replace(settings, window=window, periods=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ class OperatingFit:
     records: Sequence[OperatingRecord]
     structure: Structure
     fits: Sequence[Refinement]
-    windows: Windows
+    settings: RefinementSettings
     seed: int
 
     @property
@@ -127,15 +129,15 @@ class OperatingFit:
         start: a law that is close; the weighted one, and all stages, otherwise.
         """
         near = self.weighted(functions) if start is None else start
-        window = self.windows.samples(self.records)
-        method = MultipleShooting()
-        if start is not None:
-            method = MultipleShooting(first_block=window, tolerance=1e-4)
+        settings = in_samples(self.settings, self.records)
+        if start is not None and settings.window is not None:
+            method = MultipleShooting(first_block=settings.window, tolerance=1e-4)
+            settings = replace(settings, method=method)
         found = refine_law(
             [fit.model for fit in self.fits],
             [[record.run] for record in self.records],
             self.basis(functions),
-            RefinementSettings(self.windows.n_windows, window, method=method, n_reweights=0),
+            settings,
             start=near.coef,
             rng=self.seed,
             progress=progress,
@@ -168,12 +170,13 @@ def operating_fit(
     library: Library,
     structure: Structure,
     *,
-    windows: Windows | None = None,
+    settings: RefinementSettings = SETTINGS,
     seed: int = 0,
     progress: Progress | bool = False,
 ) -> OperatingFit:
     """Refine every record on its own with the same terms, from least squares of the derivative.
 
+    settings: of these refinements and of the law's; their windows are as long in all records.
     Raises ValueError for records whose parameters do not vary or whose states differ, or a state
     or term that is not there.
     """
@@ -181,24 +184,21 @@ def operating_fit(
     states = list(records[0].run.state_names)
     if set(structure) != set(states):
         raise ValueError(f"a structure must have terms for each of {states}: {structure} came")
-    windows = windows or Windows()
     held = constraint(library, {state: structure[state] for state in states})
     rows = Differential(split=RandomSplit(test_fraction=0.0))
     starts = []
     for record in records:
         problems = rows.assemble([record.run], library, rng=np.random.default_rng(seed))
         starts.append(constrained_fit(problems, held, units=record.run.units))
-    # States count by their standard deviation, as they are judged.
-    settings = RefinementSettings(windows.n_windows, windows.samples(records), n_reweights=0)
     fits = refine(
         starts,
         [[record.run] for record in records],
-        settings,
+        in_samples(settings, records),
         rng=seed,
         progress=progress,
     )
     whole = {state: list(structure[state]) for state in states}
-    return OperatingFit(records, whole, fits, windows, seed)
+    return OperatingFit(records, whole, fits, settings, seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +221,33 @@ class LeaveOneOut:
         )
         found = deviation(run.f_error, amplitude, waveform, FreeRunBounds())
         return MOST if np.isnan(found) else min(found, MOST)
+
+
+def error_statistics(left_out: Sequence[LeaveOneOut]) -> dict[str, float | int]:
+    """How far points that were left out are missed: counts, medians, and nine in ten.
+
+    A point without a frequency counts as infinitely far off in it, and not in the medians of
+    amplitude and waveform, which are those of each point's worst state.
+    """
+    f = np.array([abs(each.run.f_error) for each in left_out])
+    f[np.isnan(f)] = np.inf
+    ratios = [np.array(list(each.run.amplitude_ratio.values())) for each in left_out]
+    amplitude = np.array([np.abs(ratio - 1.0).max() for ratio in ratios])
+    waveform = np.array([max(each.run.waveform_error.values()) for each in left_out])
+    return {
+        "n": len(left_out),
+        "n_lives": sum(each.run.verdict is Verdict.LIVES for each in left_out),
+        "diverging": sum(each.run.rollout.diverged for each in left_out),
+        "f_median": float(np.median(f)),
+        "f_90": float(np.quantile(f, 0.9, method="higher")),
+        "amplitude_median": _median(amplitude),
+        "waveform_median": _median(waveform),
+    }
+
+
+def _median(values: Float[np.ndarray, " points"]) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if known.size else float("nan")
 
 
 def leave_one_out(

@@ -32,6 +32,7 @@ from ep2sindy.operating.quantities import (
 )
 from ep2sindy.operating.records import OperatingRecord, check_alike, naming
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
+from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation, RegressionRows
@@ -40,7 +41,7 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.signals.spectrum import dominant_frequency, samples_in
 
 MIN_BLOCKS = 5  # in a record: fewer draws of blocks than these differ too little from another
 
@@ -73,8 +74,8 @@ class Case:
 class PointStudy:
     """What is done at every operating point.
 
-    library: holds the terms of all cases. searched: the library that terms are looked for in, by
-    the recipe, whose formulation makes the rows of the fits as well.
+    library: holds the terms of all cases, which are fitted to the rows of the formulation.
+    searched: the library that terms are looked for in, by the recipe.
     Raises ValueError for a quantity whose coefficient a case does not have.
     """
 
@@ -203,16 +204,14 @@ def _refined(
     rng: np.random.Generator,
 ) -> Fitted:
     """The same coefficients, moved until integrated windows follow the data."""
-    samples = round(study.refining.periods * period_s / run.dt_s) + 1
-    found = refine(
-        start,
-        [run],
+    samples = samples_in(study.refining.periods, frequency_Hz=1.0 / period_s, dt_s=run.dt_s)
+    settings = RefinementSettings(
         n_windows=study.refining.n_windows,
         window=int(np.clip(samples, MIN_SAMPLES, run.n_samples)),
         method=MultipleShooting(max_iter=study.refining.max_iter),
         constraint=case.constraint,
-        rng=rng,
     )
+    found = refine(start, [run], settings, rng=rng)
     known = found.model.covariance is not None
     return Fitted(
         model=found.model,

@@ -174,6 +174,13 @@ def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records 
     return np.array([[record.parameters[name] for name in names] for record in records])
 
 
+def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
+    """The record whose parameters are nearest to the mean of all."""
+    values = values_of(records)
+    off = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
+    return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
+
+
 def interpolation_errors(
     records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:

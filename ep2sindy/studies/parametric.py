@@ -72,7 +72,7 @@ class CaseSettings:
 
 
 @dataclass(frozen=True)
-class Searched:
+class SearchLibrary:
     """A polynomial library, the same for every point."""
 
     variables: Sequence[str]
@@ -141,7 +141,7 @@ class Study:
     cases: Cases
     bootstrap: TimeBootstrap
     refining: Refining
-    library: Searched
+    library: SearchLibrary
     law: LawSettings
     trends: Sequence[Trend]
     figures: Panels

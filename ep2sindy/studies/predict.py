@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import product
 from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from ep2sindy.data.scales import zero_to_one
 from ep2sindy.figures.operating import (
     cycle_line_figure,
     cycle_map_figure,
@@ -21,20 +19,18 @@ from ep2sindy.figures.operating import (
     left_out_figure,
 )
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import (
     Branch,
-    How,
-    Searched,
+    BranchSettings,
     StructureTrial,
     find_branch,
     group_by_cycle,
 )
-from ep2sindy.operating.fit import LeaveOneOut, Windows
+from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, error_statistics
 from ep2sindy.operating.law import law_basis
 from ep2sindy.operating.map import Fate, MapPoint
-from ep2sindy.operating.records import OperatingRecord, point_label, values_of
+from ep2sindy.operating.records import OperatingRecord, most_central, point_label
 from ep2sindy.report.document import (
     Block,
     Captioned,
@@ -45,12 +41,13 @@ from ep2sindy.report.document import (
     Text,
     places,
 )
+from ep2sindy.report.results import Metric, ResultTable, View, percent
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.simulated import compile_kernels
-from ep2sindy.studies.source import Source, open_points, point_sources
+from ep2sindy.studies.source import Source, expand, open_points, point_sources
 from ep2sindy.studies.study import Check, Count, Counts, Positive
 
 INTERVALS = (
@@ -186,11 +183,10 @@ class Study:
         members_of = {name: [r.parameters for r in group] for name, group in groups.items()}
         return Outcome(everywhere, statuses, records, members_of, found, self.labels)
 
-    def _how(self, seed: int) -> How:
+    def _how(self, seed: int) -> BranchSettings:
         states = self.source.states
-        searched = Searched(self.structures.degree, self.structures.max_terms)
         structure = None
-        library = polynomial(states, degree=searched.degree)
+        library = polynomial(states, degree=self.structures.degree)
         if self.model is not None:
             library, structure = terms_of(self.model, states=states)
             if inputs := [name for name in library.variables if name not in states]:
@@ -198,28 +194,16 @@ class Study:
                     f"a law's model runs freely, on its states {states} alone: {inputs} came in "
                     "model"
                 )
-        windows = Windows(self.windows.n_windows, self.windows.periods)
-        return How(library, structure, searched, self.degrees, windows, self.map_points, seed)
-
-
-def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of the values in each block; a point that comes again comes once.
-
-    That is, with the same data. 300 and 300.0 are one, in whatever order a block names parameters.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for block in blocks:
-        lists = {
-            name: value if isinstance(value, list) else [value]
-            for name, value in block.items()
-            if name in parameters
-        }
-        rest = {name: value for name, value in block.items() if name not in lists}
-        for values in product(*lists.values()):
-            point = {**dict(zip(lists, values, strict=True)), **rest}
-            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
-            found.setdefault(str(sorted(same.items(), key=lambda item: item[0])), point)
-    return list(found.values())
+        settings = replace(SETTINGS, n_windows=self.windows.n_windows, periods=self.windows.periods)
+        return BranchSettings(
+            library=library,
+            structure=structure,
+            max_terms=self.structures.max_terms,
+            degrees=self.degrees,
+            settings=settings,
+            n_map=self.map_points,
+            seed=seed,
+        )
 
 
 def _records(
@@ -270,13 +254,34 @@ class Outcome:
         return dict(self._tables)
 
     @cached_property
+    def _points_left_out(self) -> list[LeftOutPoint]:
+        return [
+            LeftOutPoint(name, result, ", ".join(self._also_there(result.record.label, name)))
+            for name, branch in self.branches.items()
+            for result in branch.left_out
+        ]
+
+    def _also_there(self, label: str, own: str) -> list[str]:
+        """Other cycles whose law oscillates at a point, inside its points."""
+        return [
+            name
+            for name, branch in self.branches.items()
+            for point in branch.at_points
+            if name != own
+            and point_label(point.parameters) == label
+            and point.inside
+            and point.fate is Fate.OSCILLATES
+        ]
+
+    @cached_property
     def _tables(self) -> dict[str, pd.DataFrame]:
+        left_out = self._points_left_out
         return {
             "points": points_table(self.points, self.statuses, self.records, self.members),
             "laws": laws_table(self.branches),
             "coefficients": coefficients_table(self.branches),
             "structures": structures_table(self.branches),
-            "left_out": left_out_table(self.branches),
+            "left_out": ResultTable(left_out, left_out_metrics(left_out)).csv(),
             "at_points": map_table(self.branches, "at_points"),
             "map": map_table(self.branches, "map"),
         }
@@ -343,18 +348,16 @@ class Outcome:
         return "" if len(self.members) == 1 else f" of the {name} cycle"
 
     def _structures(self, name: str) -> Section:
-        rows = self._of("structures", name).sort_values("error", kind="stable")
-        bold = np.flatnonzero(rows["chosen"]).tolist()
-        shown = rows.drop(columns=["branch", "chosen"]).rename(columns={"f_error": "f error"})
-        shown["f error"] = [_percent(value) for value in rows["f_error"]]
-        marks = np.where(rows["chosen"], "  <- chosen", "")
-        shown["terms"] = [text + mark for text, mark in zip(rows["terms"], marks, strict=True)]
+        branch = self.branches[name]
+        trials = sorted(branch.trials, key=lambda trial: float(trial.errors.mean()))
+        shown = ResultTable(trials, structure_metrics(name, branch)).screen()
+        bold = [k for k, trial in enumerate(trials) if trial is branch.choice]
         title = f"Structure and order{self._cycle(name)}"
         return Section(title, [Table(shown, bold=bold, note=TRIED)])
 
     def _law(self, name: str, branch: Branch) -> Section:
         law, found = branch.law, branch.tied
-        middle = _middle(branch.fit.records)
+        middle = most_central(branch.fit.records)
         model = law.model_at(middle.parameters)
         equations: list[Block] = [
             Equation(state, model.terms(state), on_screen=True) for state in model.states
@@ -376,60 +379,30 @@ class Outcome:
         return Section(f"Law{self._cycle(name)}", [*blocks, Picture(f"laws_{name}")])
 
     def _left_out(self) -> list[Block]:
-        rows = self._tables["left_out"]
-        rows = rows.sort_values(["branch", *self.parameters], kind="stable")
-        several = len(self.branches) > 1
-        columns: dict[str, list[str]] = {"cycle": rows["branch"].tolist()} if several else {}
-        columns |= {name: [f"{value:g}" for value in rows[name]] for name in self.parameters}
-        columns["enclosed"] = ["yes" if value else "no" for value in rows["enclosed"]]
-        factor, unit = frequency_scale(rows["f_kHz"])
-        columns[f"f ({unit})"] = [places(factor * value, 2) for value in rows["f_kHz"]]
-        columns["f error"] = [_percent(value, sign=True) for value in rows["f_error"]]
-        for state in states_of(rows):
-            ratios = rows[f"amplitude_{state}"]
-            columns[f"amplitude {state}"] = [_percent(r - 1.0, sign=True) for r in ratios]
-        for state in states_of(rows):
-            columns[f"waveform {state}"] = [places(v, 3) for v in rows[f"waveform_{state}"]]
-        columns["verdict"] = rows["verdict"].tolist()
-        if several:
-            columns["also"] = rows["also"].tolist()
+        points = self._points_left_out
+        shown = sorted(points, key=lambda point: (point.branch, *point.record.parameters.values()))
         lines: list[Block] = [Text(self._spread(name)) for name in self.branches]
-        table = Table(pd.DataFrame(columns), note=LEFT_OUT + (ALSO if several else ""))
+        note = LEFT_OUT + (ALSO if len(self.branches) > 1 else "")
+        table = Table(ResultTable(shown, left_out_metrics(points)).screen(), note=note)
         return [*lines, table, Picture("left_out")]
 
     def _spread(self, name: str) -> str:
-        found = self._numbers(name)
+        found = error_statistics(self.branches[name].left_out)
         smooth_f, smooth_amplitude = self.branches[name].smooth
+        text = percent(2)
         lead = f"{name} cycle: " if len(self.members) > 1 else ""
-        most = f"nine in ten within {_percent(found['f_90'])}"
+        most = f"nine in ten within {text(found['f_90'])}"
         if not np.isfinite(found["f_90"]):
             most = "more than one in ten do not oscillate"
         return (
             f"{lead}{found['n_lives']} of {found['n']} live, diverging: {found['diverging']}. "
-            f"Errors in the median: frequency {_percent(found['f_median'])} ({most}), the worst "
+            f"Errors in the median: frequency {text(found['f_median'])} ({most}), the worst "
             "state's amplitude "
-            f"{_percent(found['amplitude_median'])} and waveform "
+            f"{text(found['amplitude_median'])} and waveform "
             f"{places(found['waveform_median'], 3)}. The records' own frequencies and amplitudes, "
-            f"interpolated by the same functions, miss by {_percent(float(np.median(smooth_f)))} "
-            f"and {_percent(float(np.median(smooth_amplitude)))} in the median."
+            f"interpolated by the same functions, miss by {text(float(np.median(smooth_f)))} "
+            f"and {text(float(np.median(smooth_amplitude)))} in the median."
         )
-
-    def _numbers(self, name: str) -> dict[str, float | int]:
-        found = self.branches[name].left_out
-        f = np.array([abs(each.run.f_error) for each in found])
-        f[np.isnan(f)] = np.inf
-        ratios = [np.array(list(each.run.amplitude_ratio.values())) for each in found]
-        amplitude = np.array([np.abs(each - 1.0).max() for each in ratios])
-        waveform = np.array([max(each.run.waveform_error.values()) for each in found])
-        return {
-            "n": len(found),
-            "n_lives": sum(each.run.verdict is Verdict.LIVES for each in found),
-            "diverging": sum(each.run.rollout.diverged for each in found),
-            "f_median": float(np.median(f)),
-            "f_90": float(np.quantile(f, 0.9, method="higher")),
-            "amplitude_median": _median(amplitude),
-            "waveform_median": _median(waveform),
-        }
 
     def _map(self) -> list[Block]:
         right, n, quiet_right, quiet = agreement(self.branches, self.statuses)
@@ -452,7 +425,7 @@ class Outcome:
                     "degree": branch.choice.degree,
                     "status": branch.tied.status,
                     "loss": float(branch.tied.loss.mean()),
-                    "left_out": self._numbers(name),
+                    "left_out": error_statistics(branch.left_out),
                 }
                 for name, branch in self.branches.items()
             },
@@ -461,7 +434,7 @@ class Outcome:
 
     def headline(self) -> dict[str, float]:
         right, n, _, _ = agreement(self.branches, self.statuses)
-        numbers = self._numbers(next(iter(self.branches)))
+        numbers = error_statistics(next(iter(self.branches.values())).left_out)
         first = {key: float(value) for key, value in numbers.items()}
         return {"n_points": float(len(self.points)), **first, "map_right": right / n}
 
@@ -469,24 +442,6 @@ class Outcome:
 def n_points(n: int) -> str:
     """`1 point`, `3 points`."""
     return f"{n} point" if n == 1 else f"{n} points"
-
-
-def _middle(records: Sequence[OperatingRecord]) -> OperatingRecord:
-    """The one nearest to the mean of all."""
-    values = values_of(records)
-    off = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
-    return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
-
-
-def _median(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if known.size else float("nan")
-
-
-def _percent(value: float, *, sign: bool = False) -> str:
-    if not np.isfinite(value):
-        return "-"
-    return f"{100.0 * value:{'+' if sign else ''}.2f} %"
 
 
 def _with_error(row: Mapping[Any, Any]) -> str:
@@ -553,66 +508,109 @@ def coefficients_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def left_out_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
-    """One row per point: what the law of the others makes of it, and which cycles are there."""
-    rows: list[dict[str, Any]] = []
-    for name, branch in branches.items():
-        for each in branch.left_out:
-            rows.append({"branch": name, **_left_out_row(each, branches, name)})
-    return pd.DataFrame(rows)
+@dataclass(frozen=True, eq=False)
+class LeftOutPoint:
+    """What the law of the other points makes of one. also: other cycles whose law oscillates."""
+
+    branch: str
+    result: LeaveOneOut
+    also: str
+
+    @property
+    def record(self) -> OperatingRecord:
+        return self.result.record
+
+    @property
+    def f_kHz(self) -> float:
+        return 1e-3 * self.record.cycle.frequency_Hz
 
 
-def _left_out_row(each: LeaveOneOut, branches: Mapping[str, Branch], own: str) -> dict[str, Any]:
-    run, record = each.run, each.record
-    f_kHz = 1e-3 * record.cycle.frequency_Hz
-    label = record.label
-    also = [
-        name
-        for name, branch in branches.items()
-        for point in branch.at_points
-        if name != own
-        and point_label(point.parameters) == label
-        and point.inside
-        and point.fate is Fate.OSCILLATES
+def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint]]:
+    """Of points that were left out; which cycle they are on is shown where there are several."""
+    several = View.SHOWN if len({point.branch for point in points}) > 1 else View.FILES
+    factor, unit = frequency_scale(pd.Series([point.f_kHz for point in points]))
+    relative = percent(2, sign=True)
+    return [
+        Metric("branch", lambda p: p.branch, several, "cycle"),
+        *(_parameter(name) for name in points[0].record.parameters),
+        Metric("enclosed", lambda p: p.result.inside, View.SHOWN, format=_yes_or_no),
+        Metric(
+            "f_kHz",
+            lambda p: p.f_kHz,
+            View.SHOWN,
+            f"f ({unit})",
+            lambda f_kHz: places(factor * f_kHz, 2),
+        ),
+        Metric("f_model_kHz", lambda p: p.f_kHz * (1.0 + p.result.run.f_error)),
+        Metric("f_error", lambda p: p.result.run.f_error, View.SHOWN, format=relative),
+        Metric(
+            "amplitude",
+            lambda p: p.result.run.amplitude_ratio,
+            View.SHOWN,
+            "amplitude {}",
+            lambda ratio: relative(ratio - 1.0),
+        ),
+        Metric(
+            "waveform",
+            lambda p: p.result.run.waveform_error,
+            View.SHOWN,
+            "waveform {}",
+            lambda error: places(error, 3),
+        ),
+        Metric("verdict", lambda p: str(p.result.run.verdict), View.SHOWN),
+        Metric("also", lambda p: p.also, several),
     ]
-    return {
-        **record.parameters,
-        "enclosed": each.inside,
-        "f_kHz": f_kHz,
-        "f_model_kHz": f_kHz * (1.0 + run.f_error),
-        "f_error": run.f_error,
-        **{f"amplitude_{state}": ratio for state, ratio in run.amplitude_ratio.items()},
-        **{f"waveform_{state}": error for state, error in run.waveform_error.items()},
-        "verdict": str(run.verdict),
-        "also": ", ".join(also),
-    }
 
 
-def states_of(left_out: pd.DataFrame) -> list[str]:
-    """States of a table of points left out."""
-    names = [str(name) for name in left_out]
-    return [n.removeprefix("amplitude_") for n in names if n.startswith("amplitude_")]
+def _parameter(name: str) -> Metric[LeftOutPoint]:
+    return Metric(name, lambda p: p.record.parameters[name], View.SHOWN, name, "{:g}")
+
+
+def _yes_or_no(value: bool) -> str:
+    return "yes" if value else "no"
 
 
 def structures_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
     """One row per structure and degree that was tried, with weighted laws at points left out."""
-    rows = []
-    for name, branch in branches.items():
-        for each in branch.trials:
-            rows.append({"branch": name, **_tried_row(each), "chosen": each is branch.choice})
-    return pd.DataFrame(rows)
+    tables = [
+        ResultTable(branch.trials, structure_metrics(name, branch)).csv()
+        for name, branch in branches.items()
+    ]
+    return pd.concat(tables, ignore_index=True)
 
 
-def _tried_row(each: StructureTrial) -> dict[str, Any]:
-    f_error = np.array([abs(one.run.f_error) for one in each.found])
-    return {
-        "terms": "; ".join(f"{s}: {', '.join(t)}" for s, t in each.fit.structure.items()),
-        "degree": each.degree,
-        "numbers": each.n_numbers,
-        "error": float(each.errors.mean()),
-        "f_error": float(np.median(np.where(np.isnan(f_error), np.inf, f_error))),
-        "diverging": sum(one.run.rollout.diverged for one in each.found),
-    }
+def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]:
+    def is_chosen(trial: StructureTrial) -> bool:
+        return trial is branch.choice
+
+    def marked(trial: StructureTrial) -> str:
+        return _terms_text(trial) + ("  <- chosen" if is_chosen(trial) else "")
+
+    return [
+        Metric("branch", lambda trial: name),
+        Metric("terms", _terms_text),
+        Metric("terms", marked, View.SCREEN),
+        Metric("degree", lambda trial: trial.degree, View.SHOWN),
+        Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
+        Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),
+        Metric("f_error", _median_f_error, View.SHOWN, format=percent(2)),
+        Metric(
+            "diverging",
+            lambda trial: sum(point.run.rollout.diverged for point in trial.found),
+            View.SHOWN,
+        ),
+        Metric("chosen", is_chosen),
+    ]
+
+
+def _terms_text(trial: StructureTrial) -> str:
+    return "; ".join(f"{s}: {', '.join(terms)}" for s, terms in trial.fit.structure.items())
+
+
+def _median_f_error(trial: StructureTrial) -> float:
+    """Over the points left out; a run without a frequency is infinitely far off."""
+    errors = np.array([abs(point.run.f_error) for point in trial.found])
+    return float(np.median(np.where(np.isnan(errors), np.inf, errors)))
 
 
 def map_table(branches: Mapping[str, Branch], which: str) -> pd.DataFrame:

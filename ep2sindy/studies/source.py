@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
@@ -216,6 +217,26 @@ class PointSource:
                 return OperatingRecord(self.parameters, None, Oscillation.DIVERGED)
             except ConstantStateError:
                 return OperatingRecord(self.parameters, None, Oscillation.STEADY)
+
+
+def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
+    """Every combination of the values in each block; a point that comes again comes once.
+
+    That is, with the same data. 300 and 300.0 are one, in whatever order a block names parameters.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for block in blocks:
+        lists = {
+            name: value if isinstance(value, list) else [value]
+            for name, value in block.items()
+            if name in parameters
+        }
+        rest = {name: value for name, value in block.items() if name not in lists}
+        for values in product(*lists.values()):
+            point = {**dict(zip(lists, values, strict=True)), **rest}
+            same = {name: float(v) if type(v) is int else v for name, v in point.items()}
+            found.setdefault(str(sorted(same.items(), key=lambda item: item[0])), point)
+    return list(found.values())
 
 
 def point_sources(
