@@ -26,8 +26,8 @@ from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, fit_support, fit_supports, front_order
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso, Search
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import lorenz
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import lorenz
 
 NOISES = (0.05, 0.2)
 TRUTH = {state: set(lorenz().model.terms(state)) for state in lorenz().model.states}

@@ -23,11 +23,11 @@ import ep2sindy as ep
 from benchmarks.known_systems import KINDS, OTHERS, noisy
 from benchmarks.living import DOWNSTREAM_MM, POINTS, parts, record
 from ep2sindy.studies.living import start_of
-from ep2sindy.synthetic.draws import DRAWS
-from ep2sindy.synthetic.systems import System, lorenz
+from ep2sindy.systems.draws import DRAWS
+from ep2sindy.systems.systems import System, lorenz
 
 
-def judged(system: System, found: ep.Estimate, cpu_s: float) -> dict[str, float]:
+def judged(system: System, found: ep.discovery.Estimate, cpu_s: float) -> dict[str, float]:
     """Whether the support is right, and of a right one errors and coverage."""
     true, coef = system.model.coef, found.model.coef
     right = bool(((coef != 0.0) == (true != 0.0)).all())
@@ -70,9 +70,9 @@ def _line(rows: Sequence[dict[str, float]]) -> str:
 
 
 ROUTES = {
-    "joint": ep.Recipe(),
-    "weighted rows": ep.Recipe(ep.WeightedWeak()),
-    "differential rows": ep.Recipe(ep.Differential(), ep.BestSubset()),
+    "joint": ep.TrajectorySearch(),
+    "weighted rows": ep.Regression(ep.WeightedWeak()),
+    "differential rows": ep.Regression(ep.Differential(), ep.BestSubset()),
 }
 
 
@@ -120,7 +120,7 @@ def thruster() -> None:
         fitted, held = parts(record(label, DOWNSTREAM_MM), "last")
         for rule in (ep.Evidence(), ep.FreeRunScore()):
             start = time.process_time()
-            recipe = ep.Recipe(search=ep.Joint(max_terms=4), selection=rule, depth=2)
+            recipe = ep.TrajectorySearch(max_terms=4, selection=rule, depth=2)
             found = ep.discover(fitted, ep.polynomial(["n_i", "n_n"], degree=2), recipe)
             cpu_s = time.process_time() - start
             run = ep.free_run(found.model, held, initial=start_of(held, found.model))

@@ -23,8 +23,8 @@ PERIODS, PER_PERIOD = 10, 60
 # Each system with its period in its own unit of time.
 SYSTEMS = {
     "Lotka-Volterra": (ep.lotka_volterra(), 14.5),
-    "van der Pol": (ep.van_der_pol(), 7.63),
-    "damped oscillator": (ep.damped_oscillator(zeta=0.01, omega=1.0), 6.28),
+    "van der Pol": (ep.systems.van_der_pol(), 7.63),
+    "damped oscillator": (ep.systems.damped_oscillator(zeta=0.01, omega=1.0), 6.28),
 }
 
 
@@ -34,7 +34,7 @@ def run(rates: Callable, t: np.ndarray, y: np.ndarray, rtol: float) -> Solved:
     return solved(rates, free, t, y, blow_up=np.inf, bound="", rtol=rtol, limit_s=300.0)
 
 
-def equations(system: ep.System, curves: tuple[np.ndarray, np.ndarray]) -> Products:
+def equations(system: ep.systems.System, curves: tuple[np.ndarray, np.ndarray]) -> Products:
     """Of a system; a driven one is pushed by its first input in its first state."""
     model, n = system.model, len(system.model.states)
     table, coef = (

@@ -21,7 +21,7 @@ import xarray as xr
 import yaml
 
 import ep2sindy as ep
-from ep2sindy.thruster.landmark import read_landmark_rates
+from benchmarks.landmark import LANDMARK_POINT, landmark_thruster, read_landmark_rates
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"
@@ -72,7 +72,9 @@ def tutorial_run() -> xr.Dataset:
         path = Path(folder) / "spt100.json"
         path.with_name("bfield.csv").write_text("\n".join(rows) + "\n")
         path.write_text(json.dumps(given))
-        return ep.simulate_hallthruster_input(path, cache=folder, sample_s=1.5e-6, progress=False)
+        return ep.thruster.simulate_hallthruster_input(
+            path, cache=folder, sample_s=1.5e-6, progress=False
+        )
 
 
 def net_thrust(run: xr.Dataset) -> float:
@@ -81,16 +83,16 @@ def net_thrust(run: xr.Dataset) -> float:
     area = math.pi * (parameters["outer_radius"] ** 2 - parameters["inner_radius"] ** 2)
     mean = late(run).mean("time")
     first = mean.isel(z=0)
-    backwards = ep.XenonFits.mass * area * float(first["n_i"] * first["u_iz"] ** 2)
+    backwards = ep.thruster.XenonFits.mass * area * float(first["n_i"] * first["u_iz"] ** 2)
     return float(mean["thrust"]) - backwards
 
 
 def landmark_run(case: int) -> xr.Dataset:
     """LANDMARK's case as theirs: N = 200, inner radius 34.5 mm, first order in case 1."""
     rates = read_landmark_rates(RATE_TABLE)
-    thruster = replace(ep.landmark_thruster(case, rates), inner_radius=0.0345)
-    return ep.simulate(
-        thruster, ep.LANDMARK_POINT, duration_s=2e-3, warm_up_s=0.0, n_cells=200, stretch=1.0,
+    thruster = replace(landmark_thruster(case, rates), inner_radius=0.0345)
+    return ep.thruster.simulate(
+        thruster, LANDMARK_POINT, duration_s=2e-3, warm_up_s=0.0, n_cells=200, stretch=1.0,
         reconstruct=case > 1, progress=False,
     )  # fmt: skip
 

@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from ep2sindy.discovery.choice import reweighted
+from ep2sindy.discovery.choice import reweight
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.search.front import fit_support
-from ep2sindy.synthetic.draws import DRAWS, realization
+from ep2sindy.systems.draws import DRAWS, realization
 
 NOISE = 0.05
 
@@ -27,7 +27,7 @@ def held(name: str, number: int) -> list[bool]:
     for problem in formulation.assemble(runs, system.model.library, rng=rng):
         (state,) = problem.equations
         truth = system.model.terms(state)
-        candidate = reweighted(problem, fit_support(problem, state, list(truth)))
+        candidate = reweight(problem, fit_support(problem, state, list(truth)))
         assert candidate.covariance is not None
         error = candidate.coef - [truth[term] for term in candidate.terms]
         inside += (np.abs(error) < 1.96 * np.sqrt(np.diag(candidate.covariance))).tolist()

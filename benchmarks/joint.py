@@ -15,26 +15,26 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
+from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
-from ep2sindy.operating.law import tied_fit
+from ep2sindy.operating.law import fit_law
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.runtime.parallel import Loky, Workers
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 
 
-def find(recipe: Recipe, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:
+def find(recipe: AnyMethod, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:
     """The same search for all points jointly and for one alone."""
     return discover_jointly(points, LIBRARY, recipe, seed=0)
 
 
 def run_family(
-    recipe: Recipe,
+    recipe: AnyMethod,
     *,
     noises: Sequence[float],
     n_realizations: int,
@@ -62,7 +62,7 @@ def run_family(
     return pd.DataFrame([rows[k] for k in range(len(tasks))])
 
 
-def outcome(recipe: Recipe, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
+def outcome(recipe: AnyMethod, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
     """One realization: one row of `run_family`."""
     noise, number = task
     points = realization(noise, number, seed=seed)
@@ -81,18 +81,18 @@ ERRORS = ("error_free", "error_tied", "p_value")
 
 
 def _errors(joint: JointDiscovery) -> dict[str, float]:
-    tied = tied_fit(joint, LAW, parameters=PARAMETERS)
+    tied = fit_law(joint, LAW, parameters=PARAMETERS)
     errors: dict[str, list[float]] = {"error_free": [], "error_tied": []}
     for point, parameters in PARAMETERS.items():
         truth = system_at(parameters).model
         for name, model in (
             ("error_free", joint.models[point]),
-            ("error_tied", tied.model_at(parameters)),
+            ("error_tied", tied.law.model_at(parameters)),
         ):
             used = truth.coef != 0.0
             errors[name] += (model.coef[used] / truth.coef[used] - 1.0).tolist()
     found = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
-    return found | {"p_value": min(e.p_value for e in tied.equations.values())}
+    return found | {"p_value": min(e.p_value for e in tied.tests.values())}
 
 
 def rates(outcomes: pd.DataFrame) -> pd.DataFrame:
@@ -106,7 +106,7 @@ NOISES = (0.0, 0.05, 0.1)
 # fewer windows than terms in a record this short. Five candidates of each size: the rows are
 # weighted under the whole library, where a wrong support can lead its size by a hair; the
 # criterion weighs them again under the candidate.
-METHOD = Recipe(
+METHOD = Regression(
     WeightedWeak(Weak(test_functions=Bumps(half_width_s=1.5), split=RandomSplit(0.0))),
     BestSubset(n_best=5),
     selection=EBIC(),

@@ -14,8 +14,8 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.synthetic.draws import DRAWS, realization
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.draws import DRAWS, realization
+from ep2sindy.systems.systems import System
 
 KINDS = ("white", "lasting", "heavy", "proportional", "thinned300", "thinned100", "missing")
 MEMORY, FREEDOM, MISSING = 0.7, 3.0, 0.3  # of AR(1), of Student's t, of samples

@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from ep2sindy.studies.living import start_of
 
-POINTS = {point.label: point for point in ep.OPERATING_POINTS}
+POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 BREATHING = "300V_5mgs"
 ZONES_MM = ((0, 10), (5, 15), (10, 20), (15, 25), (20, 30))
 DOWNSTREAM_MM = (15, 25)
@@ -55,8 +55,8 @@ class Case:
 @cache
 def record(label: str, zone_mm: tuple[int, int]) -> ep.Trajectory:
     """Zone averages of the default simulation."""
-    field = ep.simulate_cached(
-        ep.Thruster(), POINTS[label], cache=Path(".cache/simulations"), progress=False
+    field = ep.thruster.simulate(
+        ep.thruster.Thruster(), POINTS[label], cache=Path(".cache/simulations"), progress=False
     )
     zone = ep.Zone(z=(1e-3 * zone_mm[0], 1e-3 * zone_mm[1]))
     return ep.zone_average(field, zone, states=["n_i", "n_n"], label=label)
@@ -64,11 +64,11 @@ def record(label: str, zone_mm: tuple[int, int]) -> ep.Trajectory:
 
 def selected(fitted: ep.Trajectory, *, seed: int, weak: bool = False) -> ep.Discovery:
     """By free runs, from the library of degree 2, up to 4 + 4 terms."""
-    recipe = ep.Recipe(
+    recipe = ep.Regression(
         ep.WeightedWeak() if weak else ep.Differential(),
         ep.BestSubset(max_terms=4, n_best=2),
-        ep.Bootstraps(n=0),
         ep.FreeRunScore(seed=seed),
+        ep.Bootstraps(n=0),
         depth=2,
     )
     library = ep.polynomial(["n_i", "n_n"], degree=2)
@@ -172,7 +172,7 @@ def print_zones() -> None:
 
 def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> ep.Trajectory:
     """The first periods of a record with white noise, a share of each state's RMS."""
-    cycle = ep.find_cycle(run.t, run.states)
+    cycle = ep.signals.find_cycle(run.t, run.states)
     assert cycle is not None
     n = round(n_periods / (cycle.frequency_Hz * run.dt_s)) + 1
     rms = np.sqrt(np.square(run.states).mean(axis=0))

@@ -28,8 +28,8 @@ from threadpoolctl import threadpool_limits
 from benchmarks.timing import cpu_s
 from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import RegressionRows
@@ -46,11 +46,11 @@ BLOCK_POINTS = 128
 SEARCH = PointSearch(
     states=["n_i", "n_n"],
     library=named_terms(list(UNITS), TERMS),
-    recipe=Recipe(
+    method=Regression(
         formulation=Differential(),
         search=BestSubset(max_terms=5),
-        bootstraps=Bootstraps(n=32, n_culled=0),
         selection=Knee(),
+        bootstraps=Bootstraps(n=32, n_culled=0),
     ),
 )
 

@@ -17,12 +17,12 @@ from itertools import product
 import numpy as np
 
 import ep2sindy as ep
-from ep2sindy.operating.fit import LeftOut, OperatingFit, left_out, operating_fit
+from ep2sindy.operating.fit import LeaveOneOut, OperatingFit, leave_one_out, operating_fit
 from ep2sindy.operating.map import Fate, law_map
 from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
-    measured_left_out,
+    interpolation_errors,
     point_label,
 )
 
@@ -34,18 +34,18 @@ VOLTAGES, FLOWS = (250.0, 287.5, 325.0, 362.5, 400.0), (4.0, 4.5, 5.0, 5.5, 6.0)
 
 LOW, LEAN = (150.0, 175.0, 200.0, 225.0), (2.0, 3.0, 4.0, 5.0)  # at the edge of the quiet
 HIGH = (300.0, 400.0)
-TWO_CYCLES = ep.Thruster(  # conf/thruster/two_cycles.yaml
-    transport=ep.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3)
+TWO_CYCLES = ep.thruster.Thruster(  # conf/thruster/two_cycles.yaml
+    transport=ep.thruster.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3)
 )
 
 
 def recorded(
-    voltage: float, flow: float, thruster: ep.Thruster | None = None
+    voltage: float, flow: float, thruster: ep.thruster.Thruster | None = None
 ) -> OperatingRecord | None:
     """None where the simulation does not breathe."""
-    field = ep.simulate_cached(
-        thruster or ep.Thruster(),
-        ep.OperatingPoint(float(voltage), float(flow)),
+    field = ep.thruster.simulate(
+        thruster or ep.thruster.Thruster(),
+        ep.thruster.OperatingPoint(float(voltage), float(flow)),
         cache=".cache/simulations",
         duration_s=6e-3,
         progress=False,
@@ -66,7 +66,7 @@ def one_branch(records: Sequence[OperatingRecord | None]) -> list[OperatingRecor
     return [record for record, number in zip(known, branch, strict=True) if not number]
 
 
-def line(name: str, found: Sequence[LeftOut]) -> str:
+def line(name: str, found: Sequence[LeaveOneOut]) -> str:
     f = np.array([abs(each.run.f_error) for each in found])
     f[np.isnan(f)] = np.inf
     amplitude = [max(abs(v - 1) for v in e.run.amplitude_ratio.values()) for e in found]
@@ -81,15 +81,15 @@ def line(name: str, found: Sequence[LeftOut]) -> str:
 
 def judged(fit: OperatingFit, degree: int) -> None:
     functions = fit.functions(degree)
-    f, amplitude = measured_left_out(fit.records, fit.basis(functions))
+    f, amplitude = interpolation_errors(fit.records, fit.basis(functions))
     print(
         f"the records' own, by as many functions: f {np.median(f):.2%}, 9 in 10 "
         f"{np.quantile(f, 0.9, method='higher'):.2%}; amplitude {np.median(amplitude):.1%}"
     )
     print(f"{fit.n_coefs} coefficients, {fit.n_coefs * len(functions)} numbers")
-    print(line("weighted", left_out(fit, functions)), flush=True)
+    print(line("weighted", leave_one_out(fit, functions)), flush=True)
     law, found = fit.tied(functions)
-    inside = left_out(fit, functions, start=law)
+    inside = leave_one_out(fit, functions, start=law)
     print(f"tied: {found.status}, loss {found.loss.mean():.4f}")
     print(line("tied", inside))
     print(line("tied, enclosed only", [each for each in inside if each.inside]))

@@ -28,11 +28,11 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.methods.nelder_mead import window_paths
-from ep2sindy.refinement.methods.single_shooting import SingleShooting
 from ep2sindy.refinement.ode import ODE, HermiteSimpson
-from ep2sindy.refinement.problem import Iteration, Problem
-from ep2sindy.refinement.refine import refine, refine_many
+from ep2sindy.refinement.problem import Iteration, RefinementProblem, RefinementSettings
+from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
+from tests.single_shooting import SingleShooting
 
 DT_S, N_SAMPLES, N_WINDOWS, WINDOW = 1.5e-6, 12001, 30, 100
 CLOSE = 1e-4  # of the optimal loss
@@ -115,7 +115,7 @@ def forced(rng: np.random.Generator) -> Case:
     return Case("forced", Trajectory(t, states, STATES, inputs(t), ["u", "R"]), start)
 
 
-def problem(case: Case) -> Problem:
+def problem(case: Case) -> RefinementProblem:
     batch = cut_windows(
         [case.data],
         states=STATES,
@@ -125,7 +125,9 @@ def problem(case: Case) -> Problem:
         rng=np.random.default_rng(0),
     )
     ode = ODE(case.start, scale=batch.scale, step_s=batch.step_s)
-    return Problem((ode,), (batch,), free_start=False, n_reweights=0, observe=lambda _: None)
+    return RefinementProblem(
+        (ode,), (batch,), free_start=False, n_reweights=0, observe=lambda _: None
+    )
 
 
 def by_hand(batch: WindowBatch, coef: np.ndarray, scaling: np.ndarray) -> np.ndarray:
@@ -158,7 +160,7 @@ def forced_by_hand(batch: WindowBatch, coef: np.ndarray, scaling: np.ndarray) ->
     return np.stack([odeint(rhs, data[0], t, args=(cubics,)) for data, cubics in paths])
 
 
-def by_model(work: Problem, model: SparseModel, scaling: np.ndarray) -> np.ndarray:
+def by_model(work: RefinementProblem, model: SparseModel, scaling: np.ndarray) -> np.ndarray:
     """Trajectories by scipy's odeint on the model's own right-hand side."""
     batch = work.batches[0]
     coef = np.zeros_like(model.coef.T)
@@ -198,7 +200,7 @@ def simplex_s(
     return reached[0] if reached else float("nan")
 
 
-def descent_s(work: Problem, method: GradientDescent, *, goal: float) -> float:
+def descent_s(work: RefinementProblem, method: GradientDescent, *, goal: float) -> float:
     """CPU time until the step that met the goal was done: its loss is reported by the next."""
     times, losses = [time.process_time()], [np.inf]
 
@@ -265,9 +267,9 @@ def many(n_points: int, rng: np.random.Generator, *, points_per_batch: int) -> N
     t, states = breathing_states(1500)
     data = [[Trajectory(t, contaminated(states, t, rng), STATES)] for _ in range(n_points)]
     begin = time.process_time()
-    found = refine_many(
-        [START] * n_points, data, n_windows=10, window=WINDOW, points_per_batch=points_per_batch,
-        rng=rng,
+    found = refine(
+        [START] * n_points, data, RefinementSettings(n_windows=10, window=WINDOW),
+        points_per_batch=points_per_batch, rng=rng,
     )  # fmt: skip
     each_ms = 1e3 * (time.process_time() - begin) / n_points
     n_converged = sum(each.status == "converged" for each in found)

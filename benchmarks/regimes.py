@@ -11,8 +11,8 @@ import argparse
 import numpy as np
 from sklearn.metrics import adjusted_rand_score
 
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Loky
@@ -20,7 +20,7 @@ from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.rule import Selection
-from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
+from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
 RULES: dict[str, Selection] = {
@@ -35,11 +35,11 @@ def found(truth: RegionField, rule: Selection, *, noise: float, seed: int) -> Re
     search = PointSearch(
         states=STATES,
         library=truth.library,
-        recipe=Recipe(
+        method=Regression(
             formulation=Differential(),
             search=BestSubset(max_terms=5),
-            bootstraps=Bootstraps(n=32, n_culled=0, block=35),
             selection=rule,
+            bootstraps=Bootstraps(n=32, n_culled=0, block=35),
         ),
         seed=seed,
     )

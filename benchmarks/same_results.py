@@ -89,7 +89,7 @@ PROGRAMS: dict[str, str] = {
 import json, sys
 from pathlib import Path
 import ep2sindy as ep
-field = ep.simulate_2d(duration_s=3e-5, warm_up_s=5e-6, n_z=24, n_r=10, progress=False)
+field = ep.thruster.simulate_2d(duration_s=3e-5, warm_up_s=5e-6, n_z=24, n_r=10, progress=False)
 values = {str(name): field[name].values.ravel().tolist() for name in field.data_vars}
 Path(sys.argv[1], "field.json").write_text(json.dumps(values | {"status": field.attrs["status"]}))
 """,
@@ -109,7 +109,8 @@ torch.nn.init.zeros_(last.bias)
 network = torch.nn.Sequential(torch.nn.Linear(2, 4), torch.nn.Tanh(), last)
 run = prey.trajectory(noise=0.01, rng=0)
 fit = ep.refine_with_correction(
-    known, [run], network, window=15, n_windows=4, rng=0, method=ep.GradientDescent(max_iter=4)
+    known, [run], network, window=15, n_windows=4, rng=0,
+    method=ep.refinement.GradientDescent(max_iter=4),
 )
 states = run.states[::50]
 values = {

@@ -20,7 +20,7 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import ParetoFront, pareto_front
 from ep2sindy.search.searches import AdaptiveLasso
-from ep2sindy.synthetic.systems import lorenz
+from ep2sindy.systems.systems import lorenz
 
 BOOTSTRAPS = Bootstraps(n=32, n_culled=1)
 # scikit-learn 1.7 renamed the argument.

@@ -15,18 +15,25 @@ from matplotlib.figure import Figure
 import ep2sindy as ep
 
 TARGETS_CPU_S_PER_MS = {100: 0.25, 200: 0.9}  # on the uniform grid, one core
-POINT = ep.OperatingPoint(300.0, 5.0)
+POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 
 
 def cost(n_cells: int, *, duration_s: float = 2e-3, n_repeats: int = 3) -> tuple[float, float]:
     """Least and median CPU seconds of a millisecond, averages recorded, after its warm-up."""
     settings = {"n_cells": n_cells, "stretch": 1.0, "progress": False}
-    started = ep.simulate(ep.Thruster(), POINT, duration_s=3e-4, warm_up_s=1e-3, **settings)
+    started = ep.thruster.simulate(
+        ep.thruster.Thruster(), POINT, duration_s=3e-4, warm_up_s=1e-3, **settings
+    )
     spent = []
     for _ in range(n_repeats):
         began = time.process_time()
-        ep.simulate(
-            ep.Thruster(), POINT, duration_s=duration_s, warm_up_s=0.0, initial=started, **settings
+        ep.thruster.simulate(
+            ep.thruster.Thruster(),
+            POINT,
+            duration_s=duration_s,
+            warm_up_s=0.0,
+            initial=started,
+            **settings,
         )
         spent.append((time.process_time() - began) / (1e3 * duration_s))
     return min(spent), float(np.median(spent))
@@ -38,10 +45,12 @@ def draw_stability_map(path: Path) -> None:
     amplitude = np.full((len(ohms), len(inverse_c2)), np.nan)  # nan where a run diverged
     for i, resistance in enumerate(ohms):
         for j, inverse in enumerate(inverse_c2):
-            thruster = ep.Thruster()
+            thruster = ep.thruster.Thruster()
             transport = replace(thruster.transport, c_plume=1 / inverse)
             thruster = replace(thruster, transport=transport, series_resistance=resistance)
-            run = ep.simulate(thruster, POINT, duration_s=2e-3, warm_up_s=3e-3, progress=False)
+            run = ep.thruster.simulate(
+                thruster, POINT, duration_s=2e-3, warm_up_s=3e-3, progress=False
+            )
             if run.attrs["status"] != "diverged":
                 amplitude[i, j] = run.attrs["I_d_std"]
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
@@ -70,7 +79,7 @@ def main() -> None:
         )
         print(f"{n_cells:5d}  {least:.3f}, {median:.3f}{verdict}")
     began = time.process_time()
-    ep.simulate(ep.Thruster(), POINT, progress=False)
+    ep.thruster.simulate(ep.thruster.Thruster(), POINT, progress=False)
     print(f"18 ms and 2 ms of warm-up: {time.process_time() - began:.1f} CPU-s, target 5")
     if len(sys.argv) > 1:
         draw_stability_map(Path(sys.argv[1]))

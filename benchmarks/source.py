@@ -20,7 +20,7 @@ from ep2sindy.library.library import named_terms
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.search.front import fit_support
 
-POINTS = {point.label: point for point in ep.OPERATING_POINTS}
+POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 DOWNSTREAM = (1.5e-2, 2.5e-2)  # m
 EQUATIONS = (
     ("n_i", ("n_i", "n_i*n_n")),
@@ -30,8 +30,8 @@ EQUATIONS = (
 )
 VARIANTS: dict[str, dict] = {
     "guessed start, N = 100": {},
-    "hard start": {"initial": ep.ColdStart()},
-    "soft start": {"initial": ep.SoftStart()},
+    "hard start": {"initial": ep.thruster.ColdStart()},
+    "soft start": {"initial": ep.thruster.SoftStart()},
     "N = 200": {"n_cells": 200},
     "CFL 0.2": {"cfl": 0.2},
     "uniform, N = 100": {"stretch": 1.0},
@@ -42,9 +42,9 @@ NEIGHBOURS = (160, 145, 130, 115, 100, 80)  # 1/c2; the default is 145, two_cycl
 @cache
 def full_run(label: str, variant: str, *, warm_up_s: float = 4e-3, duration_s: float = 4e-3):
     """One operating point of the default thruster, after its start is forgotten."""
-    return ep.simulate(
-        ep.Thruster(), POINTS[label], duration_s=duration_s, warm_up_s=warm_up_s, progress=False,
-        **VARIANTS[variant],
+    return ep.thruster.simulate(
+        ep.thruster.Thruster(), POINTS[label], duration_s=duration_s, warm_up_s=warm_up_s,
+        progress=False, **VARIANTS[variant],
     )  # fmt: skip
 
 
@@ -67,8 +67,8 @@ def alternation_eV(label: str, *, n_steps: int = 4000) -> float:
     What fast ion transits do within two or three steps is physics, not numerics.
     """
     run = full_run(label, "guessed start, N = 100")
-    steps = ep.simulate(
-        ep.Thruster(), POINTS[label], initial=run, averaged=False, sample_s=1.5e-8,
+    steps = ep.thruster.simulate(
+        ep.thruster.Thruster(), POINTS[label], initial=run, averaged=False, sample_s=1.5e-8,
         duration_s=1.5e-8 * n_steps, warm_up_s=0.0, progress=False,
     )  # fmt: skip
     return lasting_swing(steps["T_e_eV"].values.astype(float))
@@ -106,7 +106,7 @@ def print_balances() -> None:
     print("\nbalances: zone residual / largest term, outflow / mass flow, mass, energy; T_e turns")
     for label in POINTS:
         run = full_run(label, "guessed start, N = 100")
-        balance = ep.zone_balance(run, DOWNSTREAM)
+        balance = ep.thruster.zone_balance(run, DOWNSTREAM)
         top = max(float(abs(balance[n]).max()) for n in balance if n != "residual")
         residual = float(abs(balance["residual"]).max()) / top
         out = float((run["mass_flow_i"] + run["mass_flow_n"]).mean())
@@ -121,13 +121,15 @@ def print_neighbours() -> None:
     print("\nI_d std (A) / f (kHz) from a guessed | a hard start, 4 to 8 ms, by c2")
     for label in ("300V_2mgs", "400V_5mgs"):
         for inverse in NEIGHBOURS:
-            thruster = ep.Thruster(transport=ep.AnomalousTransport(c_plume=1 / inverse))
+            thruster = ep.thruster.Thruster(
+                transport=ep.thruster.AnomalousTransport(c_plume=1 / inverse)
+            )
             runs = [
-                ep.simulate(
+                ep.thruster.simulate(
                     thruster, POINTS[label], duration_s=4e-3, warm_up_s=4e-3, initial=initial,
                     progress=False,
                 )
-                for initial in (None, ep.ColdStart())
+                for initial in (None, ep.thruster.ColdStart())
             ]  # fmt: skip
             cells = [f"{r.attrs['I_d_std']:.2f} / {r.attrs['f_kHz']:.1f}" for r in runs]
             print(f"{label:10s} 1/{inverse:<4d} {cells[0]:14s} | {cells[1]}")

@@ -20,8 +20,8 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.known_systems import OTHERS, noisy
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.synthetic.draws import DRAWS
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.draws import DRAWS
+from ep2sindy.systems.systems import System
 
 SYSTEMS = ("lorenz", "van_der_pol", "lotka_volterra", "rossler")
 Spoil = Callable[[System, Trajectory, float, np.random.Generator], np.ndarray]
@@ -154,7 +154,7 @@ def main() -> None:
     parser.add_argument("--align", action="store_true", help="bring late channels together")
     parser.add_argument("--words", action="store_true", help="what was said of doubtful ones")
     asked = parser.parse_args()
-    recipe = ep.Recipe(search=ep.Joint(align=asked.align))
+    recipe = ep.TrajectorySearch(align=asked.align)
     total: Counter[str] = Counter()
     for kind, name in product(asked.kinds, asked.systems):
         counts: Counter[str] = Counter()

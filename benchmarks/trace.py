@@ -20,7 +20,7 @@ import pandas as pd
 import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import free_run
 from ep2sindy.model.likeness import Verdict
@@ -39,8 +39,10 @@ N_STARTS, STRIDE = 20, 11  # of the held-out samples, at most phases
 def current(point: str) -> Trajectory:
     """The simulator's, as +exp=trace takes it."""
     voltage, mass_flow = map(float, point.split("/"))
-    field = ep.simulate_cached(
-        ep.Thruster(), ep.OperatingPoint(voltage, mass_flow), cache=".cache/simulations"
+    field = ep.thruster.simulate(
+        ep.thruster.Thruster(),
+        ep.thruster.OperatingPoint(voltage, mass_flow),
+        cache=".cache/simulations",
     )
     return Trajectory(field["time"].values, field[NAME].values[:, None], (NAME,), units={NAME: "A"})
 
@@ -58,12 +60,10 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     chosen = embed(from_one_signal(measured))
     states = chosen.embedded.run
     n = round(0.75 * states.n_samples)
-    bounds = ep.Bounds(frequency=0.005, amplitude=0.05)
+    bounds = ep.FreeRunBounds(frequency=0.005, amplitude=0.05)
     rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
-    recipe = Recipe(
-        search=BestSubset(max_terms=5, n_best=8), bootstraps=Bootstraps(n=0), selection=rule,
-        depth=8,
-    )  # fmt: skip
+    search = BestSubset(max_terms=5, n_best=8)
+    recipe = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
     library = polynomial(states.state_names, degree=3)
     known = {"relations": chosen.embedded.relations, "terms": chosen.embedded.terms}
     model = discover(states.window(0, n), library, recipe, **known).model

@@ -24,7 +24,7 @@ from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import Selection, selected
-from ep2sindy.synthetic.draws import realization
+from ep2sindy.systems.draws import realization
 
 SYSTEMS = ("lotka_volterra", "van_der_pol", "oscillator", "lorenz")
 NOISES = (0.0, 0.05, 0.2)

@@ -28,7 +28,8 @@ from ep2sindy.discovery.pointwise import pointwise as pointwise
 from ep2sindy.estimation.estimate import estimate as estimate
 
 # Searches
-from ep2sindy.estimation.solver import Joint as Joint  # for configs
+from ep2sindy.discovery.method import TrajectorySearch as TrajectorySearch  # for configs
+from ep2sindy.discovery.method import Regression as Regression  # for configs
 from ep2sindy.search.searches import BestSubset as BestSubset  # for configs
 from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso  # for configs
 from ep2sindy.search.searches import STLSQ as STLSQ  # for configs
@@ -66,14 +67,15 @@ from ep2sindy.model.model import coef_matrix as coef_matrix
 # Refinement
 from ep2sindy.refinement.refine import refine as refine
 from ep2sindy.refinement.refine import Refinement as Refinement
+from ep2sindy.refinement.problem import RefinementSettings as RefinementSettings
 from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
 from ep2sindy.constraints.relations import constraint as constraint
 from ep2sindy.constraints.relations import Constraint as Constraint
 
 # Systems
-from ep2sindy.synthetic.systems import lorenz as lorenz  # for configs
-from ep2sindy.synthetic.systems import lotka_volterra as lotka_volterra  # for configs
-from ep2sindy.synthetic.systems import pendulum as pendulum  # for configs
+from ep2sindy.systems.systems import lorenz as lorenz  # for configs
+from ep2sindy.systems.systems import lotka_volterra as lotka_volterra  # for configs
+from ep2sindy.systems.systems import pendulum as pendulum  # for configs
 
 # Your own code
 from ep2sindy.library.functions import register_function as register_function

@@ -16,9 +16,8 @@ MOVED = {
     "library": "equation_text",
     "model": "Rollout r2",
     "operating": """
-        OperatingRecord branches_of operating_fit OperatingFit left_out LeftOut Windows
-        OperatingLaw tied_fit TiedFit control_law ControlLaw law_map MapPoint
-        Quantity TimeBootstrap Refining
+        OperatingRecord branches_of operating_fit OperatingFit Windows OperatingLaw control_law
+        ControlLaw law_map MapPoint Quantity TimeBootstrap Refining
     """,
     "parallel": "Serial Loky Dask Progress",
     "prepare": """
@@ -26,43 +25,69 @@ MOVED = {
         radial_from_middle
     """,
     "refinement": """
-        MultipleShooting SingleShooting GradientDescent NelderMead RungeKutta HermiteSimpson ODE
-        cut_windows WindowBatch refine_many loss_against_window Corrected refine_tied
-        TiedRefinement
+        MultipleShooting GradientDescent NelderMead RungeKutta HermiteSimpson ODE
+        cut_windows WindowBatch Corrected
     """,
     "regression": """
-        Regression fit_support constrained_fit Relation relations_from_matrix
-        pareto_front ParetoFront Candidate pooled_supports STLSQRegressor
+        fit_support constrained_fit Relation relations_from_matrix
+        pareto_front ParetoFront Candidate pooled_supports
     """,
-    "selection": "selected BIC LogKnee IntegralScore CrossValidation Stability",
+    "selection": "selected",
     "signals": """
         KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing power_spectrum dominant_frequency
         Cycle find_cycle Trace Rate LogRate Delays embed Embedded
     """,
     "systems": "System damped_oscillator van_der_pol three_regions",
     "thruster": """
-        Thruster OperatingPoint OPERATING_POINTS simulate simulate_cached simulate_2d
-        simulate_2d_cached THRUSTER_2D OPERATING_POINT_2D ColdStart GuessedStart Restart SoftStart
+        Thruster OperatingPoint OPERATING_POINTS simulate simulate_2d THRUSTER_2D
+        OPERATING_POINT_2D ColdStart GuessedStart Restart SoftStart
         zone_balance propellant read_propellant PropellantTable TabulatedRates XenonFits
         ionization_rate MagneticField MagneticFieldTable read_magnetic_field AnomalousTransport
         GaussianTransport MultiLogTransport ExponentialWall SheathWall wall_material AnodeSheath
         FixedAnode HallThrusterInput read_hallthruster_input simulate_hallthruster_input
-        LANDMARK_POINT landmark_thruster
     """,
     "warnings": "MissingSamples DoubtfulUnit SlowSearch",
 }
 # Old name -> the name in the stubs that means the same.
 RENAMED = {
     "Bounds": "FreeRunBounds",
+    "LeftOut": "operating.LeaveOneOut",
+    "TiedFit": "operating.LawFit",
     "inspect": "inspect_file",
+    "left_out": "operating.leave_one_out",
     "point": "point_samples",
     "regimes": "discovery.find_regimes",
+    "tied_fit": "operating.fit_law",
     "trace": "signals.from_one_signal",
+    "Joint": "TrajectorySearch",
+    "refine_many": "refine",
+    "refine_tied": "refinement.refine_law",
+    "TiedRefinement": "refinement.LawRefinement",
+    "simulate_cached": "thruster.simulate",
+    "simulate_2d_cached": "thruster.simulate_2d",
 } | {name: f"{room}.{name}" for room, names in MOVED.items() for name in names.split()}
 # Old name -> what to write besides, where the new name is not called as the old one was.
-NOTES: dict[str, str] = {}
+NOTES: dict[str, str] = {
+    "refine_many": "which takes a list of models as well",
+    "refine_tied": "which takes RefinementSettings(window=..., n_windows=...)",
+    "simulate_cached": "with cache=folder as before",
+    "simulate_2d_cached": "with cache=folder as before",
+    "TiedFit": "with `law` and `tests` in place of `equations`",
+    "tied_fit": "which gives `law` and `tests` in place of `equations`",
+}
 # Old name -> what to use instead, where nothing does the same.
-GONE: dict[str, str] = {}
+GONE: dict[str, str] = {
+    "BIC": "write ep2sindy.EBIC(gamma=0.0, coarsening=None), which is the same",
+    "LogKnee": 'write ep2sindy.Knee(scale="log"), which is the same',
+    "IntegralScore": "take ep2sindy.RefinedScore(), which selects the truth more often",
+    "CrossValidation": "take ep2sindy.EBIC() or ep2sindy.RefinedScore()",
+    "Stability": "take ep2sindy.EBIC()",
+    "STLSQRegressor": "take pysindy.STLSQ, or ep2sindy.STLSQ() as the search of a Regression",
+    "SingleShooting": "take ep2sindy.refinement.MultipleShooting()",
+    "loss_against_window": "call ep2sindy.refine in a loop over the lengths of windows",
+    "LANDMARK_POINT": "see benchmarks/landmark.py",
+    "landmark_thruster": "see benchmarks/landmark.py",
+}
 
 
 def new_name(old: str) -> str | None:

@@ -17,7 +17,7 @@ from ep2sindy.app.build import Configured
 from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_config, study_class
 from ep2sindy.app.schema import keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.runtime.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
@@ -36,7 +36,7 @@ class Inner:
 class Toy:
     """A study's signature with every kind of key."""
 
-    recipe: Recipe
+    recipe: AnyMethod
     n: Count
     share: Share
     span: PositiveOrAll
@@ -167,7 +167,7 @@ def test_a_group_left_out_does_not_become_another(group: str) -> None:
 
 def test_what_is_built_later_can_be_changed_by_place() -> None:
     point = {"voltage": 300.0, "mass_flow_mg_s": 5.0}
-    node = OmegaConf.create({"_target_": "ep2sindy.OperatingPoint", **point})
+    node = OmegaConf.create({"_target_": "ep2sindy.thruster.OperatingPoint", **point})
     later = Configured(node, "data")
     changed = later.changed({"voltage": 200.0}, {"neutral_speed": 190.0})
     assert changed.build().voltage == 200.0

@@ -15,7 +15,7 @@ from ep2sindy.signals.attractor import (
     waveform_errors,
     white_variance,
 )
-from ep2sindy.synthetic.systems import lorenz
+from ep2sindy.systems.systems import lorenz
 
 F_HZ, DT_S = 12.345, 1.5e-3
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.identified import attractor_figure
 from ep2sindy.figures.style import OFF_SCALE
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.studies.benchmark import FirstRealizations, Variant, first_realizations
-from ep2sindy.synthetic.draws import realization
+from ep2sindy.systems.draws import realization
 
 SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]
 
@@ -20,8 +20,8 @@ SYSTEMS, NOISES = ["lorenz", "oscillator"], [0.05, 0.0]
 @pytest.fixture(scope="module")
 def first() -> FirstRealizations:
     variants: dict[str, Variant] = {
-        "bagged": Recipe(bootstraps=Bootstraps(n=2)),
-        "ours": Recipe(WeightedWeak()),
+        "bagged": Regression(bootstraps=Bootstraps(n=2)),
+        "ours": Regression(WeightedWeak()),
     }
     found = first_realizations(variants, SYSTEMS, NOISES, n_trajectories=1, seed=0)
     assert found is not None

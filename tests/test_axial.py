@@ -7,10 +7,10 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.thruster.axial.electron_kernels import solve_from_both_ends
-from ep2sindy.thruster.axial.grid import cell_faces
+from ep2sindy.thruster.axial.model import cell_faces
 from ep2sindy.thruster.verdict import diagnose, judge_status
 
-POINT = ep.OperatingPoint(300.0, 5.0)
+POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 BRIEF = {
     "duration_s": 3e-4, "warm_up_s": 1e-4, "n_cells": 40, "stretch": 1.0, "progress": False,
 }  # fmt: skip
@@ -18,7 +18,7 @@ ZONE = (0.015, 0.025)
 
 
 def simulate(thruster=None, point=POINT, **settings):
-    return ep.simulate(thruster or ep.Thruster(), point, **(BRIEF | settings))
+    return ep.thruster.simulate(thruster or ep.thruster.Thruster(), point, **(BRIEF | settings))
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def largest(balance):
 
 @pytest.mark.parametrize("settings", [{}, {"stretch": 2.0}, {"reconstruct": False}])
 def test_the_balance_of_a_zone_closes_over_every_sample(settings):
-    balance = ep.zone_balance(simulate(**settings), ZONE)
+    balance = ep.thruster.zone_balance(simulate(**settings), ZONE)
     assert float(np.abs(balance["residual"]).max()) < 1e-6 * largest(balance)  # float32 fields
     ions = balance["change_i"] - balance["inflow_i"] - balance["ionization"] + balance["wall_loss"]
     assert float(np.abs(ions).max()) < 1e-6 * largest(balance)
@@ -41,10 +41,10 @@ def test_the_balance_of_a_zone_closes_over_every_sample(settings):
 @pytest.mark.parametrize(
     "thruster",
     [
-        ep.Thruster(),
-        ep.Thruster(anode=ep.AnodeSheath()),
-        ep.Thruster(propellant=ep.propellant("xenon"), charge_states=2),
-        ep.Thruster(propellant=ep.propellant("krypton"), conduction_coulomb=0.7),
+        ep.thruster.Thruster(),
+        ep.thruster.Thruster(anode=ep.thruster.AnodeSheath()),
+        ep.thruster.Thruster(propellant=ep.thruster.propellant("xenon"), charge_states=2),
+        ep.thruster.Thruster(propellant=ep.thruster.propellant("krypton"), conduction_coulomb=0.7),
     ],
     ids=["default", "anode sheath", "two charges", "krypton"],
 )
@@ -58,7 +58,9 @@ def test_where_the_power_goes_adds_up(run):
     lost = sum(run[name] for name in ("P_inelastic", "P_wall", "P_anode", "P_cathode"))
     heated = run["P_in"] - run["P_ions"]
     assert float(lost.mean()) == pytest.approx(float(heated.mean()), rel=0.3)  # the rest is stored
-    bare = simulate(ep.Thruster(series_resistance=0.0))  # what the cathode leaves to the plasma
+    bare = simulate(
+        ep.thruster.Thruster(series_resistance=0.0)
+    )  # what the cathode leaves to the plasma
     np.testing.assert_allclose(bare["P_in"], 280.0 * bare["I_d"], rtol=1e-9)
 
 
@@ -118,7 +120,7 @@ def test_a_restart_goes_on_to_the_last_digit(tmp_path):
     whole = simulate(duration_s=6e-4)
     first = simulate(duration_s=3e-4)
     first.to_netcdf(tmp_path / "first.nc", engine="h5netcdf")
-    for initial in (first, tmp_path / "first.nc", ep.Restart(first)):
+    for initial in (first, tmp_path / "first.nc", ep.thruster.Restart(first)):
         rest = simulate(initial=initial, warm_up_s=0.0, duration_s=2e-4)
         after = whole.isel(time=slice(first.sizes["time"], None))
         np.testing.assert_array_equal(rest["n_i"], after["n_i"].values[: rest.sizes["time"]])
@@ -137,7 +139,7 @@ def test_a_restart_on_another_grid_is_interpolated_and_says_so(run):
 
 
 def test_a_restart_at_another_operating_point_is_a_continuation(run):
-    field = simulate(point=ep.OperatingPoint(310.0, 5.0), initial=run, warm_up_s=0.0)
+    field = simulate(point=ep.thruster.OperatingPoint(310.0, 5.0), initial=run, warm_up_s=0.0)
     assert "interpolated" not in field.attrs["initial"]
     same = simulate(initial=run, warm_up_s=0.0)
     np.testing.assert_allclose(field["n_n"][0], same["n_n"][0], rtol=1e-3)
@@ -147,9 +149,10 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda run: simulate(ep.Thruster(inner_radius=0.034), initial=run),
+        (lambda run: simulate(ep.thruster.Thruster(inner_radius=0.034), initial=run),
          r"only in the same thruster: inner_radius was 0\.035 and is 0\.034; start from ColdStart"),
-        (lambda run: simulate(ep.Thruster(propellant=ep.propellant("krypton")), initial=run),
+        (lambda run: simulate(
+            ep.thruster.Thruster(propellant=ep.thruster.propellant("krypton")), initial=run),
          r"only in the same thruster: propellant was"),
         (lambda run: simulate(initial=run.assign_attrs(status="diverged")),
          r"only from one that lived: this one diverged, .* start from ColdStart or SoftStart"),
@@ -157,9 +160,11 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
         (lambda run: simulate(initial="there/is/none.nc"), r"no such run to go on from: /"),
         (lambda run: simulate(stretch=0.5), r"stretch must be between 1 .* got 0\.5"),
         (lambda run: simulate(cfl=1.5), r"cfl must be above 0 and at most 1, got 1\.5"),
-        (lambda run: ep.SoftStart(resistance=-1.0), r"SoftStart\.resistance must be .* positive"),
-        (lambda run: ep.zone_balance(run, (0.03, 0.06)), r"must hold cells and end before the la"),
-        (lambda run: ep.zone_balance(run[["n_i"]], ZONE), r"simulate with averaged=True"),
+        (lambda run: ep.thruster.SoftStart(resistance=-1.0),
+         r"SoftStart\.resistance must be .* positive"),
+        (lambda run: ep.thruster.zone_balance(run, (0.03, 0.06)),
+         r"must hold cells and end before the la"),
+        (lambda run: ep.thruster.zone_balance(run[["n_i"]], ZONE), r"simulate with averaged=True"),
     ],
 )  # fmt: skip
 def test_bad_input_says_the_way_out(run, make, message):
@@ -167,7 +172,10 @@ def test_bad_input_says_the_way_out(run, make, message):
         make(run)
 
 
-@pytest.mark.parametrize("start", [ep.ColdStart(), ep.SoftStart(hold_s=1e-4), ep.GuessedStart()])
+@pytest.mark.parametrize(
+    "start",
+    [ep.thruster.ColdStart(), ep.thruster.SoftStart(hold_s=1e-4), ep.thruster.GuessedStart()],
+)
 def test_every_start_runs_and_is_named(start):
     field = simulate(initial=start)
     assert field.attrs["status"] != "diverged"
@@ -177,7 +185,7 @@ def test_every_start_runs_and_is_named(start):
 def test_a_soft_start_holds_back_until_it_is_released():
     held, free = (
         simulate(initial=start, warm_up_s=0.0)["I_d"].values
-        for start in (ep.SoftStart(hold_s=5e-4), ep.ColdStart())
+        for start in (ep.thruster.SoftStart(hold_s=5e-4), ep.thruster.ColdStart())
     )
     assert held[0] < 6.0  # of 280 V over 40 ohm, 7 A, most is the plasma's
     assert held.max() > 2.0 * held[0]  # let go
@@ -185,9 +193,9 @@ def test_a_soft_start_holds_back_until_it_is_released():
 
 
 def test_two_charges_are_ionised_further():
-    thruster = ep.Thruster(propellant=ep.propellant("xenon"), charge_states=2)
+    thruster = ep.thruster.Thruster(propellant=ep.thruster.propellant("xenon"), charge_states=2)
     field = simulate(thruster)
-    balance = ep.zone_balance(field, ZONE)
+    balance = ep.thruster.zone_balance(field, ZONE)
     assert float(np.abs(balance["residual"]).max()) < 1e-6 * largest(balance)
     assert "average_of" not in field["ionization"].attrs  # rates of its own ionise the second
     share = float((field["n_i2"] / field["n_i"]).mean())
@@ -202,7 +210,7 @@ def test_first_order_fluxes_damp():
 
 
 def test_a_stretched_grid_has_long_cells_in_the_plume():
-    thruster = ep.Thruster()
+    thruster = ep.thruster.Thruster()
     lengths = np.diff(cell_faces(thruster, 100, 2.0))
     assert lengths.sum() == pytest.approx(thruster.domain_length)
     assert lengths[-1] / lengths[0] == pytest.approx(2.0, rel=0.02)
@@ -228,15 +236,15 @@ def test_a_result_names_its_cycle(amplitude, cycle):
 
 def cold_xenon(hottest_eV):
     T = np.linspace(1.0, hottest_eV, 30)
-    xenon = ep.XenonFits()
-    table = ep.PropellantTable(
+    xenon = ep.thruster.XenonFits()
+    table = ep.thruster.PropellantTable(
         name="cold xenon", mass=xenon.mass, ionization_eV=12.13, excitation_eV=8.32,
         T_e_eV=tuple(T),
         ionization_rate=tuple(xenon.ionization(T)),
         excitation_rate=tuple(xenon.events(T) - xenon.ionization(T)),
         momentum_rate=tuple(xenon.momentum(T)),
     )  # fmt: skip
-    return ep.Thruster(propellant=table)
+    return ep.thruster.Thruster(propellant=table)
 
 
 def test_rates_that_do_not_cover_the_run_say_so():

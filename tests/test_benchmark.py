@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Finding, Recipe
+from ep2sindy.discovery.method import Finding, Regression
 from ep2sindy.figures.identified import benchmark_figure, merit_table
 from ep2sindy.library.library import Library
 from ep2sindy.regression.differential import Differential
@@ -16,13 +16,13 @@ from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies.benchmark import Study, Variant, cells, merits
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import damped_oscillator
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import damped_oscillator
 
 TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
 # Draws random bootstraps and a random split: its outcome hangs on its stream.
-BALASSO = Recipe(Differential(), AdaptiveLasso(), Bootstraps(n=4), Knee())
-STLSQ_ = Recipe(Differential(), STLSQ(), Bootstraps(n=0), Knee())
+BALASSO = Regression(Differential(), AdaptiveLasso(), Knee(), Bootstraps(n=4))
+STLSQ_ = Regression(Differential(), STLSQ(), Knee(), Bootstraps(n=0))
 
 
 @dataclass

@@ -10,11 +10,14 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.app.compare import main as compare
-from ep2sindy.app.sweep import parted, write_index
+from ep2sindy.app.sweep import split_varied, write_index
 from ep2sindy.report.results import LABELS, in_words
 from tests.browser import seen
 
-CONFIG = "experiment: discover\nseed: 0\nsearch: {_target_: ep2sindy.Joint, max_terms: MOST}\n"
+CONFIG = (
+    "experiment: discover\nseed: 0\n"
+    "search: {_target_: ep2sindy.TrajectorySearch, max_terms: MOST}\n"
+)
 
 
 def model(slope: float, width: float, *more: str) -> ep.SparseModel:
@@ -164,7 +167,7 @@ def test_a_sweep_has_a_page_that_leads_to_its_jobs(tmp_path: Path) -> None:
 
 
 def test_what_was_varied_is_parted_from_the_rest(tmp_path: Path) -> None:
-    varied, shared = parted(sweep_of(tmp_path / "sweep"))
+    varied, shared = split_varied(sweep_of(tmp_path / "sweep"))
     assert varied == {"degree": ["1", "2", "3"]}
     assert shared == ["+exp=toy"]
 

@@ -14,7 +14,7 @@ from ep2sindy.constraints.relations import (
     relations_from_matrix,
 )
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import reweighted
+from ep2sindy.discovery.choice import reweight
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.differential import Differential
@@ -22,7 +22,7 @@ from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.search.front import fit_support
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 LIBRARY = polynomial(["x", "y"], degree=2)
 SUPPORT = {"x": ["x", "x*y"], "y": ["y", "y*x"]}
@@ -319,7 +319,7 @@ def test_no_relations_reproduce_the_separate_fits(formulation: Formulation) -> N
     for state, problem in zip("xy", problems if len(problems) == 2 else 2 * problems, strict=True):
         alone = fit_support(problem, state, SUPPORT[state])
         if problem.noisy is not None:
-            alone = reweighted(problem, alone)
+            alone = reweight(problem, alone)
         found = [model.terms(state)[LIBRARY.names[LIBRARY.index(t)]] for t in alone.terms]
         np.testing.assert_allclose(found, alone.coef, rtol=1e-6)
 

@@ -18,7 +18,7 @@ from ep2sindy.search.front import Candidate, pareto_front
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.selection.rule import selected
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 PREY = lotka_volterra()
 DENSITY = 1e18

@@ -5,7 +5,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.regression.differential import Differential
@@ -14,7 +14,7 @@ from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 # Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.
 HARE = [30, 47.2, 70.2, 77.4, 36.3, 20.6, 18.1, 21.4, 22, 25.4, 27.1, 40.3, 57, 76.6, 52.3, 19.5]
@@ -23,7 +23,7 @@ LYNX = [4, 6.1, 9.8, 35.2, 59.4, 41.7, 19, 13, 8.3, 9.1, 7.4, 8, 12.3, 19.5, 45.
 LYNX += [15.8, 9.7, 10.1, 8.6]
 PELTS = Trajectory(np.arange(1900.0, 1921.0), np.stack([HARE, LYNX], axis=1), ["hare", "lynx"])
 
-RECIPE = Recipe(Differential(), AdaptiveLasso(), Bootstraps(n=8), Knee("library"))
+RECIPE = Regression(Differential(), AdaptiveLasso(), Knee("library"), Bootstraps(n=8))
 
 
 def test_predator_and_prey_are_found_in_noisy_data() -> None:
@@ -91,13 +91,14 @@ def test_the_model_may_use_inputs() -> None:
 # By the joint search, and by regression; what is said where 21 counts are few.
 FEW = {
     None: "21 samples do not tell which of 6 terms (30 would): 2 an equation at most were tried",
-    Recipe(WeightedWeak()): "13 rows are few for 6 terms: equations of lynx were searched with at "
-    "most 2",
+    Regression(
+        WeightedWeak()
+    ): "13 rows are few for 6 terms: equations of lynx were searched with at most 2",
 }
 
 
 @pytest.mark.parametrize("recipe", FEW, ids=["joint", "regression"])
-def test_hare_and_lynx_are_predator_and_prey_in_21_counts(recipe: Recipe | None) -> None:
+def test_hare_and_lynx_are_predator_and_prey_in_21_counts(recipe: AnyMethod | None) -> None:
     """Least squares of whole trajectories gives 0.481, 0.0248, 0.926 and 0.0275."""
     found = discover(PELTS, None, recipe)
     truth = {"hare": {"hare": 0.481, "hare*lynx": -0.0248}}
@@ -114,27 +115,32 @@ def test_hare_and_lynx_are_predator_and_prey_in_21_counts(recipe: Recipe | None)
 def test_an_equation_that_is_given_is_not_held_down() -> None:
     given = ["1", "hare", "lynx"]
     known = {"hare": given, "lynx": ["lynx", "hare*lynx"]}
-    found = discover(PELTS, None, Recipe(WeightedWeak()), terms=known)
+    found = discover(PELTS, None, Regression(WeightedWeak()), terms=known)
     assert set(found.model.terms("hare")) == set(given)
     assert not any("rows are few" in a.message for a in found.ambiguities)
 
 
-ROWS = [Recipe(WeightedWeak()), Recipe(Differential(), BestSubset(), Bootstraps(n=0))]
+ROWS = [
+    Regression(WeightedWeak()),
+    Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0)),
+]
 
 
 @pytest.mark.parametrize("recipe", ROWS, ids=["weighted", "differential"])
-def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: Recipe) -> None:
+def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMethod) -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     full = polynomial(["x", "y"], degree=2)
     found = discover(run, full, recipe)
-    for chosen in found.chosen.values():
-        assert chosen.chi_squared == pytest.approx(1.0, abs=0.3)
-        assert chosen.autocorrelation == pytest.approx(0.0, abs=0.2)
-        assert chosen.leaves_noise
+    assert list(found.noise_test.left) == ["x", "y"]
+    for left in found.noise_test.left.values():
+        assert left.chi_squared == pytest.approx(1.0, abs=0.3)
+        assert left.autocorrelation == pytest.approx(0.0, abs=0.2)
+        assert left.leaves_noise
     assert found.misfit == ""
     lacking = discover(run, full.take(np.array(full.names) != "x*y"), recipe)
-    assert not any(chosen.leaves_noise for chosen in lacking.chosen.values())
-    assert min(chosen.autocorrelation for chosen in lacking.chosen.values()) > 0.3
+    left = lacking.noise_test.left.values()
+    assert not any(each.leaves_noise for each in left)
+    assert min(each.autocorrelation for each in left) > 0.3
     assert "no equation of this library leaves white noise of x'" in lacking.misfit
     assert lacking.model.covariance is None
 
@@ -145,7 +151,7 @@ def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
     found = discover(
         run,
         only_one,
-        Recipe(Differential(), BestSubset(), Bootstraps(n=0), EBIC(gamma=0.0, coarsening=None)),
+        Regression(Differential(), BestSubset(), EBIC(gamma=0.0, coarsening=None), Bootstraps(n=0)),
     )
     assert {chosen.terms for chosen in found.chosen.values()} == {()}
     assert "x'" in found.misfit
@@ -153,7 +159,7 @@ def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
 
 def test_intervals_under_relations_are_withheld_where_a_term_is_missing() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
-    full, recipe = polynomial(["x", "y"], degree=2), Recipe(WeightedWeak())
+    full, recipe = polynomial(["x", "y"], degree=2), Regression(WeightedWeak())
     relation = "x: x*y == -1 * y: x*y"
     found = discover(run, full, recipe, relations=[relation])
     assert found.misfit == ""
@@ -167,15 +173,15 @@ def test_intervals_under_relations_are_withheld_where_a_term_is_missing() -> Non
 def test_a_rule_that_judges_free_runs_says_nothing_of_the_noise_of_rows() -> None:
     run = replace(lotka_volterra(), rate_Hz=5.0).trajectory(noise=0.05, rng=0)
     rule = FreeRunScore(n_windows=4, n_folds=2)
-    recipe = Recipe(WeightedWeak(), BestSubset(max_terms=2), Bootstraps(n=0), rule)
+    recipe = Regression(WeightedWeak(), BestSubset(max_terms=2), rule, Bootstraps(n=0))
     found = discover(run, named_terms(["x", "y"], ["x", "y", "x*y"]), recipe)
-    assert [chosen.chi_squared for chosen in found.chosen.values()] == [None, None]
+    assert not found.noise_test.left
     assert found.misfit == ""
 
 
 def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     few = Trajectory(t=run.t[:12], states=run.states[:12], state_names=run.state_names)
-    recipe = Recipe(Differential(), BestSubset(), Bootstraps(n=0))
+    recipe = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0))
     found = discover(few, polynomial(["x", "y"], degree=1), recipe)
     assert found.misfit == ""

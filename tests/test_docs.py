@@ -22,7 +22,7 @@ from ep2sindy._stubs import dotted_names
 from ep2sindy.app.runner import check_overrides, study_class
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.synthetic.regions import three_regions
+from ep2sindy.systems.regions import three_regions
 from tests.pages import FENCE, PAGES, ROOT, arguments, blocks, commands, difference
 from tests.programs import EXPERIMENTS, composed
 

@@ -7,7 +7,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import coef_matrix
-from ep2sindy.synthetic.systems import (
+from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
     lorenz,

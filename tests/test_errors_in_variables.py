@@ -5,9 +5,9 @@ import pytest
 
 from benchmarks.intervals import held
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import reweighted
+from ep2sindy.discovery.choice import reweight
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
@@ -18,8 +18,8 @@ from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.front import Candidate, fit_support, pareto_front
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import System, lorenz, lotka_volterra
 
 EVERY_ROW = Weak(split=RandomSplit(0.0))
 
@@ -34,7 +34,7 @@ def noisy_runs(system: System, noise: float, n: int = 1) -> list[Trajectory]:
 
 def fitted(system: System, problem: RegressionRows) -> Candidate:
     (state,) = problem.equations
-    return reweighted(problem, fit_support(problem, state, list(system.model.terms(state))))
+    return reweight(problem, fit_support(problem, state, list(system.model.terms(state))))
 
 
 def mask_and_coef(problem: RegressionRows, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +76,7 @@ def test_noise_in_a_linear_term_does_not_shrink_its_coefficient() -> None:
         problem = raw.assemble([run], polynomial(["x", "v"], degree=1), rng=rng)[1]
         plain = fit_support(problem, "v", ["x"])
         ratios["plain"].append(plain.coef[0] / -9.0)
-        ratios["followed"].append(reweighted(problem, plain).coef[0] / -9.0)
+        ratios["followed"].append(reweight(problem, plain).coef[0] / -9.0)
     assert np.mean(ratios["plain"]) < 0.97
     assert np.mean(ratios["followed"]) == pytest.approx(1.0, abs=0.01)
 
@@ -130,25 +130,25 @@ def test_a_noise_free_signal_keeps_its_exact_coefficients() -> None:
 def test_terms_that_cannot_explain_the_data_still_give_finite_rows() -> None:
     system = lorenz()
     problem = problems_of(system, noisy_runs(system, 0.2))[1]
-    candidate = reweighted(problem, fit_support(problem, "y", ["1", "z^2"]))
+    candidate = reweight(problem, fit_support(problem, "y", ["1", "z^2"]))
     assert np.isfinite(candidate.coef).all()
-    assert candidate.chi_squared > 2.0
+    assert candidate.left.chi_squared > 2.0
     assert candidate.covariance is None  # it would not hold the truth
 
 
 @pytest.mark.parametrize(
     ("left_out", "recipe"),
     [
-        pytest.param(None, Recipe(), id="None-joint"),
-        pytest.param(None, Recipe(WeightedWeak()), id="None-regression"),
-        pytest.param("x", Recipe(), id="x-joint", marks=pytest.mark.slow),
-        pytest.param("x", Recipe(WeightedWeak()), id="x-regression"),
-        pytest.param("x*y", Recipe(), id="x*y-joint", marks=pytest.mark.slow),
-        pytest.param("x*y", Recipe(WeightedWeak()), id="x*y-regression"),
+        pytest.param(None, TrajectorySearch(), id="None-joint"),
+        pytest.param(None, Regression(WeightedWeak()), id="None-regression"),
+        pytest.param("x", TrajectorySearch(), id="x-joint", marks=pytest.mark.slow),
+        pytest.param("x", Regression(WeightedWeak()), id="x-regression"),
+        pytest.param("x*y", TrajectorySearch(), id="x*y-joint", marks=pytest.mark.slow),
+        pytest.param("x*y", Regression(WeightedWeak()), id="x*y-regression"),
     ],
 )
 def test_a_library_without_a_true_term_is_told_and_gives_no_intervals(
-    recipe: Recipe, left_out: str | None
+    recipe: AnyMethod, left_out: str | None
 ) -> None:
     system = lotka_volterra()
     library = system.model.library
@@ -215,8 +215,11 @@ def test_a_discovered_model_knows_its_intervals() -> None:
     found = discover(
         noisy_runs(system, 0.05),
         system.model.library,
-        Recipe(
-            formulation=EVERY_ROW, search=BestSubset(), bootstraps=Bootstraps(n=0), selection=EBIC()
+        Regression(
+            formulation=EVERY_ROW,
+            search=BestSubset(),
+            selection=EBIC(),
+            bootstraps=Bootstraps(n=0),
         ),
         seed=np.random.default_rng(0),
     )
@@ -242,7 +245,7 @@ def test_an_input_may_be_noisy_too() -> None:
     )
     library = named_terms(["x", "u"], ["x", "u"])
     (problem,) = EVERY_ROW.assemble([run], library, rng=rng)
-    candidate = reweighted(problem, fit_support(problem, "x", ["x", "u"]))
+    candidate = reweight(problem, fit_support(problem, "x", ["x", "u"]))
     error = np.abs(candidate.coef - [-1.0, 1.0]) / np.sqrt(np.diag(candidate.covariance))
     assert error.max() < 3.5
     assert np.sqrt(np.diag(candidate.covariance)).max() < 0.05

@@ -12,12 +12,13 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy.constraints.relations import parse_relation
-from ep2sindy.estimation import problem as size
-from ep2sindy.estimation.kernels import departures, eliminated
-from ep2sindy.estimation.likelihood import Fit, Gram, Level, fitted, gram, squares
+from ep2sindy.estimation import problem as estimation_problem
+from ep2sindy.estimation.kernels import departures, eliminate
+from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, gram, squares
 from ep2sindy.estimation.noise import noise_beside
-from ep2sindy.estimation.problem import Problem, scaled_problem
-from ep2sindy.estimation.supports import alternatives, best_support, priced, term_prices
+from ep2sindy.estimation.problem import EstimationProblem, scaled_problem
+from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
+from ep2sindy.thruster.plane.electron_kernels import fitted
 from ep2sindy.trust import memory
 
 
@@ -72,7 +73,7 @@ def dense_rows(
 def test_eliminated_states_leave_the_squares_of_the_dense_problem(rng: np.random.Generator) -> None:
     case = linear_case(rng)
     rows, targets = dense_rows(*case, 10.0)
-    hessian, gradient, least, _ = eliminated(*case, 10.0)
+    hessian, gradient, least, _ = eliminate(*case, 10.0)
     n_states = rows.shape[1] - len(gradient)
     states, own = rows[:, :n_states], rows[:, n_states:]
     off = np.eye(len(rows)) - states @ np.linalg.pinv(states)
@@ -85,7 +86,7 @@ def test_the_spread_of_innovations_is_the_determinant_of_the_samples(
     rng: np.random.Generator,
 ) -> None:
     flow, misses, residuals, variance, process = linear_case(rng, n=4, p=0)
-    _, _, _, log_spread = eliminated(flow, misses, residuals, variance, process, 10.0)
+    _, _, _, log_spread = eliminate(flow, misses, residuals, variance, process, 10.0)
     n, d = residuals.shape
     # Covariance of all states, from the first one's and the steps'.
     to = np.zeros((n * d, n * d))
@@ -109,12 +110,12 @@ def test_departures_are_those_of_the_dense_problem(rng: np.random.Generator) -> 
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
-def lorenz_problem(**settings: object) -> tuple[Problem, ep.Trajectory]:
+def lorenz_problem(**settings: object) -> tuple[EstimationProblem, ep.Trajectory]:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 200)
     return scaled_problem([run], ep.lorenz().model.library, **settings), run  # type: ignore[arg-type]
 
 
-def truth(problem: Problem, model: ep.SparseModel) -> np.ndarray:
+def truth(problem: EstimationProblem, model: ep.SparseModel) -> np.ndarray:
     """Scaled coefficients of a model, where the problem has no relations."""
     return model.coef[problem.column, problem.equation] / problem.to_SI
 
@@ -168,9 +169,9 @@ def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> 
         np.testing.assert_allclose(flow.slopes[:, :, i], (up - down) / (2 * h), atol=1e-7)
 
 
-def fit_of_truth(problem: Problem, model: ep.SparseModel) -> Fit:
+def fit_of_truth(problem: EstimationProblem, model: ep.SparseModel) -> TrajectoryFit:
     free = truth(problem, model)
-    return Fit(
+    return TrajectoryFit(
         tuple(r.samples.copy() for r in problem.records),
         free,
         free != 0.0,
@@ -196,11 +197,11 @@ def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
     fit = fitted(problem, fit_of_truth(problem, ep.lorenz().model), level)
     pair = gram(problem, fit, level)
     nothing = np.zeros(len(fit.free))
-    assert priced(pair, fit.support, nothing).score == pytest.approx(fit.total, abs=0.01)
+    assert penalise(pair, fit.support, nothing).score == pytest.approx(fit.total, abs=0.01)
     for j in np.flatnonzero(fit.support):
         support = fit.support & (np.arange(len(nothing)) != j)
-        foretold = priced(pair, support, nothing)
-        start = Fit(fit.paths, foretold.free, support, fit.squares)
+        foretold = penalise(pair, support, nothing)
+        start = TrajectoryFit(fit.paths, foretold.free, support, fit.squares)
         if foretold.score < fit.total + 30.0:  # within the reach of a line
             refit = fitted(problem, start, level)
             assert refit.total == pytest.approx(foretold.score, rel=0.05)
@@ -216,7 +217,7 @@ def test_block_by_block_finds_the_best_support_of_all() -> None:
     assert full.score == pytest.approx(empty.score)
     for j in range(len(prices)):
         changed = full.support ^ (np.arange(len(prices)) == j)
-        assert priced(pair, changed, prices).score >= full.score - 1e-6
+        assert penalise(pair, changed, prices).score >= full.score - 1e-6
 
 
 def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alone() -> None:
@@ -252,9 +253,9 @@ def test_prices_count_what_a_term_is_told_from() -> None:
 
 
 SYSTEMS = {
-    "oscillator": ep.damped_oscillator,
+    "oscillator": ep.systems.damped_oscillator,
     "lotka_volterra": ep.lotka_volterra,
-    "van_der_pol": ep.van_der_pol,
+    "van_der_pol": ep.systems.van_der_pol,
     "lorenz": ep.lorenz,
 }
 FAST = {
@@ -322,7 +323,7 @@ def test_lasting_noise_is_told_from_signal_and_buys_no_terms() -> None:
 
 
 def test_the_noise_is_measured_beside_the_model() -> None:
-    system = ep.van_der_pol()
+    system = ep.systems.van_der_pol()
     run = system.trajectory(noise=0.2, rng=1)
     clean = system.trajectory()
     found = ep.estimate([run], system.model.library)
@@ -333,7 +334,7 @@ def test_the_noise_is_measured_beside_the_model() -> None:
 
 
 def test_noise_that_grows_with_the_state_is_weighed_so() -> None:
-    system, rng = ep.damped_oscillator(), np.random.default_rng(0)
+    system, rng = ep.systems.damped_oscillator(), np.random.default_rng(0)
     clean = system.trajectory()
     noise = 0.05 * clean.states * rng.standard_normal(clean.states.shape)
     run = ep.Trajectory(clean.t, clean.states + noise, clean.state_names)
@@ -351,7 +352,7 @@ def test_a_linear_library_of_what_is_not_linear_is_called_a_misfit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("term", ["x^3", "x"])
 def test_a_library_without_a_true_term_is_called_a_misfit(term: str) -> None:
-    system = ep.van_der_pol()
+    system = ep.systems.van_der_pol()
     full = system.model.library
     library = full.take(np.arange(len(full)) != full.index(term))
     found = ep.estimate([system.trajectory(noise=0.05, rng=0)], library)
@@ -361,11 +362,11 @@ def test_a_library_without_a_true_term_is_called_a_misfit(term: str) -> None:
 def test_an_equation_with_all_the_terms_that_it_may_have_is_a_misfit() -> None:
     system = ep.lorenz()
     run, library = system.trajectory(noise=0.05, rng=0), system.model.library
-    found = ep.estimate([run], library, ep.Joint(max_terms=3))
+    found = ep.estimate([run], library, max_terms=3)
     assert found.misfit.startswith("y' with as many terms as may be (max_terms=3): they may stand")
     assert found.model.covariance is None
     known = {"y": ["x", "y", "x*z"]}
-    assert ep.estimate([run], library, ep.Joint(max_terms=3), terms=known).misfit == ""
+    assert ep.estimate([run], library, max_terms=3, terms=known).misfit == ""
 
 
 def test_random_times_serve_as_well() -> None:
@@ -411,7 +412,7 @@ def test_relations_and_known_equations_hold() -> None:
     run = system.trajectory(noise=0.1, rng=0)
     found = ep.discover(
         run,
-        recipe=ep.Recipe(search=ep.Joint()),
+        method=ep.TrajectorySearch(),
         relations=["x: x == -1 * x: y", "y: y == -1"],
         terms={"z": ["z", "x*y"]},
     )
@@ -489,32 +490,56 @@ def test_the_search_is_the_same_in_other_units() -> None:
 )
 def test_a_rule_of_rows_is_refused_for_trajectories(recipe: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ep.Recipe(search=ep.Joint(), **recipe)
+        ep.TrajectorySearch(**recipe)
 
 
-def test_a_recipe_is_a_regression_where_something_of_one_is_asked_for() -> None:
-    assert ep.Recipe() == ep.Recipe(search=ep.Joint(), selection=ep.Evidence())
-    for asked in (
-        {"formulation": ep.WeightedWeak()},
-        {"bootstraps": ep.Bootstraps(n=0)},
-        {"selection": ep.EBIC()},
-        {"search": ep.BestSubset()},
-    ):
+RULE = ep.FreeRunScore(n_folds=2)
+PUBLIC = {name: getattr(ep, name) for name in ep._MODULES if name[0].isupper()}
+
+
+@pytest.mark.parametrize(
+    ("asked", "method"),
+    [
+        ({}, ep.TrajectorySearch()),
+        ({"selection": ep.Evidence()}, ep.TrajectorySearch()),
+        ({"formulation": ep.WeightedWeak()}, ep.Regression()),
+        (
+            {"search": ep.TrajectorySearch(max_terms=4), "selection": RULE, "depth": 2},
+            ep.TrajectorySearch(max_terms=4, selection=RULE, depth=2),
+        ),
+        ({"formulation": ep.Differential()}, ep.Regression(ep.Differential())),
+        ({"bootstraps": ep.Bootstraps(n=2)}, ep.Regression(bootstraps=ep.Bootstraps(n=2))),
+        ({"selection": ep.EBIC()}, ep.Regression()),
+        ({"search": ep.BestSubset(max_terms=2)}, ep.Regression(search=ep.BestSubset(max_terms=2))),
+        ({"selection": RULE}, ep.Regression(selection=RULE)),
+    ],
+)
+def test_a_recipe_is_the_method_that_it_stands_for_and_warns(asked: dict, method: object) -> None:
+    with pytest.warns(FutureWarning, match="goes with the next version: write ep") as told:
         recipe = ep.Recipe(**asked)
-        assert recipe.search == ep.BestSubset()
-        assert recipe.selection == ep.EBIC()
-    assert isinstance(ep.Recipe(selection=ep.FreeRunScore()).search, ep.BestSubset)
+    assert recipe == method
+    written = str(told[0].message).partition("write ep.")[2].partition(", and pass it")[0]
+    assert eval(written, PUBLIC) == method
+
+
+def test_the_old_name_of_the_argument_warns() -> None:
+    run = ep.lotka_volterra().trajectory(rng=0).window(0, 100)
+    rows = ep.Regression(ep.Differential(), ep.BestSubset(max_terms=2))
+    with pytest.warns(FutureWarning, match="write method=") as told:
+        old = ep.discover(run, recipe=rows).model
+    assert told[0].filename == __file__
+    assert old.text() == ep.discover(run, method=rows).model.text()
 
 
 def test_bootstraps_are_refused_where_there_are_no_rows() -> None:
     with pytest.raises(ValueError, match=r"draws no bootstraps: .*bootstraps=none"):
-        ep.Recipe(search=ep.Joint(), bootstraps=ep.Bootstraps(n=2))
+        ep.Recipe(search=ep.TrajectorySearch(), bootstraps=ep.Bootstraps(n=2))
 
 
 def test_evidence_is_refused_for_fronts_of_rows() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    with pytest.raises(ValueError, match="Evidence weighs what a joint search found"):
-        ep.discover(run, recipe=ep.Recipe(search=ep.BestSubset(), selection=ep.Evidence()))
+    with pytest.raises(ValueError, match="Evidence weighs what a search of trajectories found"):
+        ep.discover(run, method=ep.Regression(search=ep.BestSubset(), selection=ep.Evidence()))
 
 
 def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
@@ -526,7 +551,7 @@ def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
     with pytest.raises(ValueError, match="a run must have five samples or more: .* has 2"):
         ep.estimate([run, run.window(0, 2)], ep.polynomial(["x", "y"], degree=2))
     with pytest.raises(ValueError, match="max_terms must be at least 1: 0 came"):
-        ep.Joint(max_terms=0)
+        ep.TrajectorySearch(max_terms=0)
 
 
 def test_a_library_without_the_constant_where_a_state_drifts_is_a_misfit() -> None:
@@ -542,7 +567,7 @@ def test_noise_that_the_model_leaves_is_measured_by_state() -> None:
     problem, run = lorenz_problem()
     fit = fit_of_truth(problem, ep.lorenz().model)
     clean = ep.lorenz().trajectory().states[:200] / problem.scale
-    fit = Fit((clean,), fit.free, fit.support, fit.squares)
+    fit = TrajectoryFit((clean,), fit.free, fit.support, fit.squares)
     noise = noise_beside(problem, fit)
     np.testing.assert_allclose(
         noise.std * problem.scale, (run.states - clean * problem.scale).std(axis=0), rtol=0.05
@@ -563,26 +588,26 @@ def test_more_coefficients_than_memory_holds_are_refused_first(
     run = many_states(10)
     library = ep.polynomial(run.state_names, degree=3)
     said = r"2860 coefficients \(286 terms, 10 states\) .* 400 samples would take 0.628 GB"
-    monkeypatch.setattr(size, "NUMBERS", 4.0)
+    monkeypatch.setattr(estimation_problem, "NUMBERS", 4.0)
     with pytest.raises(ValueError, match=said):
         ep.estimate([run], library)
     run_of_known_terms = {name: ["x0", "x1"] for name in run.state_names}
-    size.check_size([run], library, run_of_known_terms)
+    estimation_problem.check_size([run], library, run_of_known_terms)
 
 
 def test_a_long_search_is_told_of() -> None:
     run = many_states(7)
     small, large = (ep.polynomial(run.state_names, degree=degree) for degree in (2, 3))
-    with pytest.warns(ep.SlowSearch, match=r"840 coefficients .* may take many minutes"):
-        size.check_size([run], large, {})
+    with pytest.warns(ep.warnings.SlowSearch, match=r"840 coefficients .* may take many minutes"):
+        estimation_problem.check_size([run], large, {})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        size.check_size([run], small, {})
+        estimation_problem.check_size([run], small, {})
 
 
 def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
     nothing = np.zeros(0)
-    fit = Fit((), nothing, nothing.astype(np.bool_), np.full(2, 1.5e308))
+    fit = TrajectoryFit((), nothing, nothing.astype(np.bool_), np.full(2, 1.5e308))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert fit.total == np.inf

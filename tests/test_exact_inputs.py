@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import reweighted
+from ep2sindy.discovery.choice import reweight
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import polynomial
 from ep2sindy.regression.rows import NoisyRows
 from ep2sindy.regression.splits import RandomSplit
@@ -85,7 +85,7 @@ def test_only_inputs_can_be_exact() -> None:
 @pytest.mark.parametrize("degree", [2, 3])
 def test_a_switched_input_is_found_in_noise_and_what_repeats_it_named(degree: int) -> None:
     run = driven(SWITCH, noise=0.05)
-    found = discover(run, polynomial(run.names, degree=degree), Recipe(WeightedWeak()))
+    found = discover(run, polynomial(run.names, degree=degree), Regression(WeightedWeak()))
     assert set(found.model.terms("x")) == {"x", "u"}
     for term, truth in (("x", -1.0), ("u", 2.0)):
         # The trapezoidal rule takes a jump for half a step late or early: 5 ms in some 1 s.
@@ -100,7 +100,7 @@ def test_corrections_of_nearly_equal_terms_do_not_run_away() -> None:
     form = replace(EVERY_ROW, exact_inputs=[])
     library = polynomial(run.names, degree=2)
     (problem,) = form.assemble([run], library, rng=np.random.default_rng(0))
-    x, u, square = reweighted(problem, fit_support(problem, "x", ["u", "u^2", "x"])).coef
+    x, u, square = reweight(problem, fit_support(problem, "x", ["u", "u^2", "x"])).coef
     assert abs(u) < 20.0
     assert u + 30.0 * square == pytest.approx(2.0, rel=0.02)
     assert x == pytest.approx(-1.0, rel=0.02)

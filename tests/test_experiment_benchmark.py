@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from ep2sindy.app.runner import run_config
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.studies.benchmark import Variant, published_cells
 from tests import programs
 
@@ -110,7 +110,7 @@ def test_every_definition_makes_a_variant() -> None:
     assert set(config.variants) == set(config.definitions)
     for name, definition in config.definitions.items():
         if not name.startswith("PySINDy"):
-            assert isinstance(instantiate(definition), Recipe)
+            assert isinstance(instantiate(definition), AnyMethod)
     made = {n: instantiate(config.definitions[n]) for n in ("ALASSO", "BALASSO", "BALASSO_depth3")}
     assert (made["ALASSO"].bootstraps.n, made["BALASSO"].bootstraps.n) == (0, 32)
     assert (made["BALASSO"].depth, made["BALASSO_depth3"].depth) == (1, 3)

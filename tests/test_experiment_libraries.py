@@ -365,7 +365,7 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this field has"),
         (["bootstraps.n_culled=6"], "n_culled must leave a term: 6 of 6 would go"),
         (
-            ["prepare=[{_target_:ep2sindy.crop,start:1}]"],
+            ["prepare=[{_target_:ep2sindy.prepare.crop,start:1}]"],
             "prepare[0], crop: got an unexpected keyword argument 'start'",
         ),
         (["output=Makefile"], "choose another with output=PATH"),

@@ -19,7 +19,7 @@ from ep2sindy.data.open import write_field
 from ep2sindy.discovery.pointwise import Block, Kept
 from ep2sindy.studies import pointwise
 from ep2sindy.studies.pointwise import Outcome
-from ep2sindy.synthetic.regions import TERMS, three_regions
+from ep2sindy.systems.regions import TERMS, three_regions
 from tests import programs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -181,7 +181,7 @@ def test_a_rate_table_that_has_changed_has_other_blocks(grid: Path, tmp_path: Pa
     table = tmp_path / "rates.csv"
     overrides = [
         *on_file(grid, tmp_path),
-        f"prepare=[{{_target_: ep2sindy.ionization_rate, table: {table}}}]",
+        f"prepare=[{{_target_: ep2sindy.thruster.ionization_rate, table: {table}}}]",
     ]
     table.write_text("1,1e-15\n100,1e-13\n")
     before = key_of(*overrides)

@@ -13,7 +13,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.choice import map_points
 from ep2sindy.operating.law import OperatingLaw
-from ep2sindy.studies.predict import Study, expanded
+from ep2sindy.studies.predict import Study, expand
 from tests import programs
 
 POINTS = "points=[{V_D_V: [280.0, 320.0], mdot_mg_s: [5.0, 5.5]}, {V_D_V: 150.0, mdot_mg_s: 2.0}]"
@@ -76,11 +76,11 @@ def test_the_law_of_a_run_gives_models_in_python(folder: Path) -> None:
 
 def test_ranges_of_points_are_every_combination_once() -> None:
     blocks = [{"a": [1.0, 2.0], "b": [3.0, 4.0]}, {"a": 2.0, "b": [4.0, 5.0]}]
-    found = expanded(blocks, ["a", "b"])
+    found = expand(blocks, ["a", "b"])
     assert [(p["a"], p["b"]) for p in found] == [(1, 3), (1, 4), (2, 3), (2, 4), (2, 5)]
-    whole = expanded([{"a": 300, "b": 5.0}, {"b": [5], "a": 300.0}], ["a", "b"])
+    whole = expand([{"a": 300, "b": 5.0}, {"b": [5], "a": 300.0}], ["a", "b"])
     assert whole == [{"a": 300, "b": 5.0}]
-    (own,) = expanded([{"a": 1.0, "data": {"path": "a.nc"}}], ["a"])
+    (own,) = expand([{"a": 1.0, "data": {"path": "a.nc"}}], ["a"])
     assert own == {"a": 1.0, "data": {"path": "a.nc"}}
 
 
@@ -101,12 +101,12 @@ def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
         (["points=[{V_D_V: [250, 300]}]"], "a point must have ['V_D_V', 'mdot_mg_s']"),
         (
             ["points=[{V_D_V: 300, mdot_mg_s: [4, 5, 6, 7]}]"],
-            "points must vary in every parameter: V_D_V is 300 at all 4; give it more values, or "
-            "leave it out (~parameters.V_D_V)",
+            "a parameter must vary: 'V_D_V' is 300 at all 4 operating points; give it more values, "
+            "or leave it out (~parameters.V_D_V)",
         ),
         (
             ["points=[{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}]"],
-            "a law of degree 1 has 3 functions of ['V_D_V', 'mdot_mg_s'] and needs more points",
+            "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs more points than these",
         ),
         (["points=[]"], "points must be a list like [{V_D_V: [250,300]"),
         (["parameters.V_D_V=operating_point.volts"], "parameters must name numbers of the data"),

@@ -118,9 +118,9 @@ def test_every_panel_of_a_run_shows_something(field: xr.Dataset) -> None:
     assert seconds == pytest.approx(3e-3 / field.attrs["f_kHz"], abs=4e-6)
     drawn = [
         breathing.current_figure(field, window),
-        breathing.spectrum_figure(field, f_kHz=14.0, f_max_Hz=3e5, transit_Hz=6e4),
+        breathing.current_spectrum_figure(field, f_kHz=14.0, f_max_Hz=3e5, transit_Hz=6e4),
         breathing.profile_figure(field),
-        breathing.map_figure(field, window),
+        breathing.space_time_figure(field, window),
     ]
     for figure in drawn:
         assert figure.axes
@@ -210,7 +210,7 @@ def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
     points = scan_points(data, {"thruster.transport.c_plume": [0.01, 0.02], "cfl": [0.5]})
     transport = [point.data.settings["thruster"]["transport"] for point in points]
     assert [each["c_plume"] for each in transport] == [0.01, 0.02]
-    assert transport[0]["_target_"] == "ep2sindy.AnomalousTransport"
+    assert transport[0]["_target_"] == "ep2sindy.thruster.AnomalousTransport"
     assert transport[0]["c_channel"] == transport[1]["c_channel"] > 0.0
     assert points[0].label == "thruster.transport.c_plume=0.01, cfl=0.5"
     assert points[0].data.settings["progress"] is False
@@ -354,8 +354,8 @@ def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_pa
         ("BN", "BN"),
         (None, "null"),
         ([1, 2.5], "[1, 2.5]"),
-        ({"_target_": "ep2sindy.ColdStart"}, "ColdStart"),
-        ({"_target_": "ep2sindy.ColdStart", "n_i": 1e17}, "ColdStart(n_i=1e+17)"),
+        ({"_target_": "ep2sindy.thruster.ColdStart"}, "ColdStart"),
+        ({"_target_": "ep2sindy.thruster.ColdStart", "n_i": 1e17}, "ColdStart(n_i=1e+17)"),
     ],
 )
 def test_values_as_tables_have_them(value: object, text: str) -> None:

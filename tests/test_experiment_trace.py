@@ -75,7 +75,7 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
 @pytest.mark.parametrize("embedding", ["rate", "delays"])
 def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) -> None:
     t = 0.12 * np.arange(850)  # 16 periods
-    run = ep.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
+    run = ep.systems.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
     settings = {"rate": toy(path, tmp_path, "search.max_terms=3", "degree=3")}
     settings |= {"delays": glance(path, tmp_path, "degree=1")}

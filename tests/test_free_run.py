@@ -11,7 +11,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import free_run, samples_in
 from ep2sindy.model.likeness import FreeRunBounds, Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.synthetic.systems import lorenz
+from ep2sindy.systems.systems import lorenz
 
 LIBRARY = polynomial(["x", "y"], degree=3)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.constraints.relations import binding, completed, parse_relation
+from ep2sindy.constraints.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.selection.systems import folds_of
 
@@ -33,11 +33,11 @@ def record(n_periods=24.0, *, noise=0.0, seed=0):
 
 
 def recipe(*, max_terms=3, n_best=2, formulation=None, **settings):
-    return ep.Recipe(
+    return ep.Regression(
         formulation or ep.Differential(),
         ep.BestSubset(max_terms=max_terms, n_best=n_best),
-        ep.Bootstraps(n=0),
         ep.FreeRunScore(n_windows=4, n_folds=2, **settings),
+        ep.Bootstraps(n=0),
         depth=n_best,
     )
 
@@ -123,7 +123,7 @@ def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
             r"the record holds \d\.\d periods, not six: chosen by windows held out instead",
         ),
         (
-            ep.damped_oscillator().trajectory(),
+            ep.systems.damped_oscillator().trajectory(),
             "record 'damped oscillator' has no period: chosen by windows held out",
         ),
     ],
@@ -138,9 +138,9 @@ def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
 @pytest.mark.parametrize("zeta", [pytest.param(-0.01, marks=pytest.mark.slow), 0.01])
 def test_a_spiral_is_no_cycle_to_stay_on(zeta):
     # Fourteen periods whose amplitude changes by a third from third to third.
-    system = replace(ep.damped_oscillator(zeta=zeta), rate_Hz=25.0)
+    system = replace(ep.systems.damped_oscillator(zeta=zeta), rate_Hz=25.0)
     run = system.trajectory(noise=0.05, rng=0)
-    assert ep.find_cycle(run.t, run.states) is not None
+    assert ep.signals.find_cycle(run.t, run.states) is not None
     other = ep.discover(run, system.model.library, recipe(formulation=ep.WeightedWeak(), n_best=1))
     assert "spirals: chosen by windows held out" in other.note
     for state in system.model.states:
@@ -193,8 +193,12 @@ SHARED = "x: x*y == -1 * y: x*y"
 )
 def test_relations_hold_to_the_last_digit(rule):
     run = PREY.trajectory(noise=0.02, rng=0)
-    how = ep.Recipe(
-        ep.WeightedWeak(), ep.BestSubset(max_terms=2), ep.Bootstraps(n=0), rule, depth=1
+    how = ep.Regression(
+        ep.WeightedWeak(),
+        ep.BestSubset(max_terms=2),
+        rule,
+        ep.Bootstraps(n=0),
+        depth=1,
     )
     library = ep.polynomial(["x", "y"], degree=2)
     tied = ep.discover(run, library, how, relations=[SHARED]).model
@@ -204,7 +208,7 @@ def test_relations_hold_to_the_last_digit(rule):
 
 def test_a_coefficient_keeps_the_value_it_is_given():
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    value, how = "x: x*y == -1.1", ep.Recipe(ep.WeightedWeak())
+    value, how = "x: x*y == -1.1", ep.Regression(ep.WeightedWeak())
     free, fixed = (ep.discover(run, None, how, relations=r).model for r in ((), [value]))
     assert fixed.terms("x")["x*y"] == -1.1
     together = ep.discover(run, relations=[value])
@@ -214,7 +218,7 @@ def test_a_coefficient_keeps_the_value_it_is_given():
 
 
 def test_a_known_equation_is_not_searched():
-    oscillator = ep.damped_oscillator(zeta=0.05)
+    oscillator = ep.systems.damped_oscillator(zeta=0.05)
     run = oscillator.trajectory(noise=0.01, rng=0)
     known = ep.discover(
         run, ep.polynomial(["x", "v"], degree=2), terms={"x": ["v"]}, relations=["x: v == 1"]
@@ -242,10 +246,10 @@ def test_supports_are_completed_by_what_relations_ask():
     library = ep.polynomial(["x", "y"], degree=2)  # 1, x, y, x^2, x*y, y^2
     masks = np.array([[0, 1, 0, 0, 0, 0], [0, 1, 0, 0, 1, 0]], dtype=bool)
     shared = [parse_relation(SHARED)]
-    both = completed(masks, library, "x", shared)
+    both = complete(masks, library, "x", shared)
     assert both.tolist() == [[False, True, False, False, False, False],
                              [False, True, False, False, True, False]]  # fmt: skip
-    valued = completed(masks, library, "x", [parse_relation("x: 1 == 2")])
+    valued = complete(masks, library, "x", [parse_relation("x: 1 == 2")])
     assert valued[:, 0].all()
     assert len(valued) == 2
     assert binding(shared, {"x": ("x*y",), "y": ("y",)}) is None

@@ -7,13 +7,13 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.fronts import FLOOR, TOP, front_figure
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.front import ParetoFront, fit_supports
 from ep2sindy.search.searches import BestSubset
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +21,10 @@ def searched() -> tuple[ParetoFront, np.ndarray]:
     """A front of three candidates per size, and the supports that it was taken from."""
     system = lotka_volterra()
     run = system.trajectory(noise=0.05, rng=np.random.default_rng(0))
-    recipe = Recipe(Differential(), BestSubset(max_terms=4), Bootstraps(n=12), depth=3)
-    equation = recipe.searched([run], system.model.library, rng=0)[0]
+    recipe = Regression(
+        Differential(), BestSubset(max_terms=4), bootstraps=Bootstraps(n=12), depth=3
+    )
+    equation = recipe.search_equations([run], system.model.library, rng=0)[0]
     return equation.front, equation.supports.masks
 
 

@@ -285,9 +285,9 @@ def test_a_sample_outside_a_domain_is_named(recipe: str) -> None:
     x = 1.5 + np.cos(T)
     x[412] = -0.03
     chosen = {
-        "weak": ep.Recipe(),
-        "differential": ep.Recipe(ep.Differential()),
-        "joint": ep.Recipe(search=ep.Joint()),
+        "weak": ep.TrajectorySearch(),
+        "differential": ep.Regression(ep.Differential()),
+        "joint": ep.TrajectorySearch(),
     }[recipe]
     library = polynomial(["x", "v"], degree=1, functions=["log(x)"])
     message = r"log\(x\) needs x > 0: x\[412\] = -0.03 at t = 4.12 s of 'probe'; name functions"
@@ -428,7 +428,7 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(search: str, noise: fl
     """theta' = w, w' = -g/L sin(theta); its energy w^2/2 - g/L cos(theta) stays."""
     system = ep.pendulum()
     run = system.trajectory(noise=noise, rng=3)
-    recipe = ep.Recipe(search=ep.Joint()) if search == "joint" else None
+    recipe = ep.TrajectorySearch() if search == "joint" else None
     library = polynomial(run.names, degree=3, functions=["sin", "cos"])
     found = ep.discover(run, library, recipe)
     assert {s: set(found.model.terms(s)) for s in found.model.states} == {
@@ -476,7 +476,7 @@ def test_a_joint_search_takes_a_function_of_ones_own(tanh: str) -> None:
     noisy = clean.states + 0.03 * np.random.default_rng(1).standard_normal(clean.states.shape)
     run = ep.Trajectory(clean.t, noisy, ["x", "y"])
     library = polynomial(["x", "y"], degree=3, functions=["tanh(3*x)"])
-    found = ep.discover(run, library, ep.Recipe(search=ep.Joint())).model
+    found = ep.discover(run, library, ep.TrajectorySearch()).model
     assert found.terms("x") == pytest.approx({"y": 1.0}, rel=0.02)
     assert set(found.terms("y")) == {"tanh(3*x)", "y"}
     assert found.terms("y")["tanh(3*x)"] == pytest.approx(-4.0, rel=0.02)
@@ -496,7 +496,7 @@ def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
     library = polynomial(
         ["s", "u"], degree=1, functions=["log(s)", "sqrt(s)"], products=[f"s/({K:g}+s)"]
     )
-    recipe = ep.Recipe(search=ep.Joint()) if search == "joint" else None
+    recipe = ep.TrajectorySearch() if search == "joint" else None
     found = ep.discover(noisy, library, recipe).model
     expected = {"u": 1.0, "s/(4e+17+s)": -3e24}
     assert found.terms("s") == pytest.approx(expected, rel=0.05)
@@ -508,7 +508,7 @@ def test_saturation_is_found_in_units_far_from_one(search: str) -> None:
 def test_rules_that_run_models_take_functions(selection: object) -> None:
     run = ep.pendulum().trajectory(noise=0.02, rng=0)
     library = polynomial(run.names, degree=1, functions=["sin(theta)"])
-    recipe = ep.Recipe(search=ep.BestSubset(max_terms=1), selection=selection)
+    recipe = ep.Regression(search=ep.BestSubset(max_terms=1), selection=selection)
     found = ep.discover(run, library, recipe).model
     assert set(found.terms("w")) == {"sin(theta)"}
 
@@ -532,7 +532,7 @@ def test_a_pendulum_swings_on_closed_orbits() -> None:
     [
         {},
         pytest.param(  # torch.optim imports torch's compiler: five seconds
-            {"method": ep.GradientDescent(), "free_start": False}, marks=pytest.mark.slow
+            {"method": ep.refinement.GradientDescent(), "free_start": False}, marks=pytest.mark.slow
         ),
     ],
     ids=["shooting", "descent"],

@@ -4,7 +4,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.given import trajectories_of
-from ep2sindy.discovery.recipe import check_kind
+from ep2sindy.discovery.method import check_kind
 from ep2sindy.selection.rule import Selection
 
 T = np.linspace(0.0, 3.0, 31)
@@ -96,9 +96,9 @@ def test_discover_needs_no_more_than_data() -> None:
 
 def test_a_seed_and_its_generator_give_the_same() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=np.random.default_rng(0))
-    recipe = ep.Recipe(ep.Differential(), ep.AdaptiveLasso(), ep.Bootstraps(n=4), ep.Knee())
-    one = ep.discover(run, recipe=recipe, seed=3)
-    other = ep.discover(run, recipe=recipe, seed=np.random.default_rng(3))
+    recipe = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps(n=4))
+    one = ep.discover(run, method=recipe, seed=3)
+    other = ep.discover(run, method=recipe, seed=np.random.default_rng(3))
     assert np.array_equal(one.model.coef, other.model.coef)
 
 

@@ -45,7 +45,7 @@ def folder(tmp_path: Path) -> Path:
 def read(folder: Path, content: object):
     path = folder / "input.json"
     path.write_text(json.dumps(content))
-    return ep.read_hallthruster_input(path)
+    return ep.thruster.read_hallthruster_input(path)
 
 
 def changed(**config: object) -> dict:
@@ -61,18 +61,18 @@ def test_the_tutorial_has_the_defaults_that_its_stored_run_names(folder: Path) -
     assert (thruster.channel_length, thruster.domain_length) == (0.025, 0.08)
     assert (thruster.inner_radius, thruster.outer_radius) == (0.035, 0.05)
     assert thruster.area == pytest.approx(0.0040055306333269865)
-    assert thruster.transport == ep.AnomalousTransport(1 / 160, 1 / 16, 0.1 * 0.025)
-    assert thruster.wall == ep.wall_material(
+    assert thruster.transport == ep.thruster.AnomalousTransport(1 / 160, 1 / 16, 0.1 * 0.025)
+    assert thruster.wall == ep.thruster.wall_material(
         "BN-SiO2", electron_scale=1.0, ion_scale=0.0, plume_collisions=0.0, transition=0.1 * 0.025
     )
-    assert thruster.propellant == ep.propellant("xenon_5eV")
+    assert thruster.propellant == ep.thruster.propellant("xenon_5eV")
     assert thruster.propellant.mass == pytest.approx(2.1801715574645584e-25)
-    assert thruster.anode == ep.AnodeSheath(2.0, potential_weight=2.0)
+    assert thruster.anode == ep.thruster.AnodeSheath(2.0, potential_weight=2.0)
     assert (thruster.cathode_T_e_eV, thruster.cathode_potential) == (2.0, 0.0)
     assert (thruster.ion_temperature, thruster.series_resistance) == (1000.0, 0.0)
     assert thruster.conduction_factor == pytest.approx(3.6)  # 2.4 on the gradient of 1.5 T
     assert thruster.conduction_coulomb == pytest.approx(2.0**-0.5)
-    assert made.operating_point == ep.OperatingPoint(300.0, 5.0, 150.0)
+    assert made.operating_point == ep.thruster.OperatingPoint(300.0, 5.0, 150.0)
     run = made.run
     assert (run.n_cells, run.duration_s, run.n_samples) == (100, 2e-3, 1001)
     assert run.sample_s == pytest.approx(2e-6)
@@ -106,7 +106,7 @@ def test_the_keys_of_older_versions(folder: Path) -> None:
     assert made.thruster.propellant.name == "krypton"
     assert made.thruster.charge_states == 2
     assert made.thruster.ion_temperature == 800.0
-    assert made.operating_point == ep.OperatingPoint(300.0, 4.0, 278.0)
+    assert made.operating_point == ep.thruster.OperatingPoint(300.0, 4.0, 278.0)
 
 
 def test_a_temperature_alone_gives_the_neutrals_a_quarter_of_their_thermal_speed(
@@ -118,18 +118,18 @@ def test_a_temperature_alone_gives_the_neutrals_a_quarter_of_their_thermal_speed
     assert made.operating_point.neutral_speed == pytest.approx(0.25 * speed)
 
 
-TWO_ZONES = ep.AnomalousTransport(0.01, 0.05, 0.1 * 0.025)
+TWO_ZONES = ep.thruster.AnomalousTransport(0.01, 0.05, 0.1 * 0.025)
 MODELS = [
-    ({"type": "Bohm", "c": 0.02}, ep.AnomalousTransport(0.02, 0.02, 0.0)),
+    ({"type": "Bohm", "c": 0.02}, ep.thruster.AnomalousTransport(0.02, 0.02, 0.0)),
     ({"type": "TwoZoneBohm", "c1": 0.01, "c2": 0.05}, TWO_ZONES),
     ({"type": "TwoZoneBohm", "coeffs": [0.01, 0.05]}, TWO_ZONES),
     (
         {"type": "GaussianBohm", "hall_min": 0.1, "hall_max": 0.07, "center": 0.025, "width": 5e-3},
-        ep.GaussianTransport(c_far=0.07, trough=0.1, center=0.0, width=5e-3),
+        ep.thruster.GaussianTransport(c_far=0.07, trough=0.1, center=0.0, width=5e-3),
     ),
     (
         {"type": "MultiLogBohm", "zs": [0.0, 0.025, 0.05], "cs": [0.1, 0.01, 0.1]},
-        ep.MultiLogTransport([-0.025, 0.0, 0.025], [0.1, 0.01, 0.1]),
+        ep.thruster.MultiLogTransport([-0.025, 0.0, 0.025], [0.1, 0.01, 0.1]),
     ),
 ]
 
@@ -153,12 +153,12 @@ def test_walls_conduction_and_anode_follow_the_file(folder: Path) -> None:
             electron_ion_collisions=False,
         ),
     ).thruster
-    assert made.wall == ep.wall_material(
+    assert made.wall == ep.thruster.wall_material(
         "alumina", electron_scale=0.5, ion_scale=0.5, plume_collisions=0.0, plume_power=0.2,
         transition=4e-3,
     )  # fmt: skip
     assert (made.conduction_factor, made.conduction_coulomb) == (pytest.approx(6.99), 0.0)
-    assert made.anode == ep.FixedAnode(3.0)
+    assert made.anode == ep.thruster.FixedAnode(3.0)
     assert np.all(made.propellant.coulomb(np.ones(3)) == 0.0)
 
 
@@ -222,9 +222,9 @@ def test_a_file_that_is_no_input_is_refused(tmp_path: Path, content: str, messag
     path = tmp_path / "input.json"
     path.write_text(content)
     with pytest.raises(ValueError, match=message):
-        ep.read_hallthruster_input(path)
+        ep.thruster.read_hallthruster_input(path)
     with pytest.raises(ValueError, match=r"no such input of HallThruster\.jl"):
-        ep.read_hallthruster_input(tmp_path / "none.json")
+        ep.thruster.read_hallthruster_input(tmp_path / "none.json")
 
 
 def test_a_file_is_simulated_as_it_says(folder: Path) -> None:
@@ -232,7 +232,7 @@ def test_a_file_is_simulated_as_it_says(folder: Path) -> None:
         anode_boundary_condition="dirichlet", conductivity_model={"type": "Braginskii"}
     )
     read(folder, content)
-    field = ep.simulate_hallthruster_input(
+    field = ep.thruster.simulate_hallthruster_input(
         folder / "input.json", cache=folder, duration_s=4e-5, n_cells=20, progress=False
     )
     assert dict(field.sizes) == {"time": 21, "z": 20}  # 2 us, as the file's frames
@@ -256,4 +256,4 @@ def test_numerics_that_are_not_here_are_refused_before_a_run(
         content[key] |= values
     read(folder, content)
     with pytest.raises(ValueError, match=message):
-        ep.simulate_hallthruster_input(folder / "input.json", cache=folder, progress=False)
+        ep.thruster.simulate_hallthruster_input(folder / "input.json", cache=folder, progress=False)

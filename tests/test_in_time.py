@@ -36,7 +36,7 @@ def test_resampling_finer_follows_a_smooth_signal_to_fourth_order() -> None:
     errors = []
     for n in (50, 100, 200):
         t = np.linspace(0.0, 1.0, n + 1)
-        fine = ep.resample(field_of(t, x=np.sin(OMEGA * t)), dt_s=0.37 / n)
+        fine = ep.prepare.resample(field_of(t, x=np.sin(OMEGA * t)), dt_s=0.37 / n)
         errors.append(np.abs(fine["x"].values - np.sin(OMEGA * fine["time"].values)).max())
         assert np.ptp(np.diff(fine["time"].values)) < 1e-12
     slopes = np.diff(np.log2(errors))
@@ -45,7 +45,9 @@ def test_resampling_finer_follows_a_smooth_signal_to_fourth_order() -> None:
 
 def test_resampling_coarser_takes_means_of_what_lies_between() -> None:
     t = np.linspace(0.0, 1.0, 1001)
-    coarse = ep.resample(field_of(t, line=2 + 3 * t, fast=np.sin(2 * np.pi * 250 * t)), dt_s=0.1)
+    coarse = ep.prepare.resample(
+        field_of(t, line=2 + 3 * t, fast=np.sin(2 * np.pi * 250 * t)), dt_s=0.1
+    )
     at = coarse["time"].values
     np.testing.assert_allclose(at, 0.05 + 0.1 * np.arange(10), rtol=1e-12)
     np.testing.assert_allclose(coarse["line"].values, 2 + 3 * at, rtol=1e-12)
@@ -53,7 +55,7 @@ def test_resampling_coarser_takes_means_of_what_lies_between() -> None:
 
 
 def test_resampling_takes_unequal_steps_and_leaves_masks_and_maps(tmp_path: Path) -> None:
-    even = ep.resample(plane(T), dt_s=0.001)
+    even = ep.prepare.resample(plane(T), dt_s=0.001)
     assert even["x"].dims == ("time", "z")
     np.testing.assert_allclose(even["x"].values[:, 1], 2 * even["time"].values, atol=1e-12)
     assert np.isnan(even["x"].values[:, 2]).all()
@@ -70,21 +72,21 @@ def gappy() -> xr.Dataset:
 
 
 def test_interpolation_fills_gaps_by_straight_lines() -> None:
-    np.testing.assert_allclose(ep.interpolate(gappy())["x"].values, 2 * np.arange(11.0))
-    outside = ep.interpolate(plane(T))
+    np.testing.assert_allclose(ep.prepare.interpolate(gappy())["x"].values, 2 * np.arange(11.0))
+    outside = ep.prepare.interpolate(plane(T))
     assert np.isnan(outside["x"].values[:, 2]).all()
 
 
 def test_gaps_too_long_or_at_an_end_are_refused() -> None:
     with pytest.raises(ValueError, match="max_gap_s = 2 s: x is missing from 2 to 5 s"):
-        ep.interpolate(gappy(), max_gap_s=2.0)
+        ep.prepare.interpolate(gappy(), max_gap_s=2.0)
     with pytest.raises(ValueError, match="x holds numbers from 5 to 10 s, .*; crop it first"):
-        ep.interpolate(gappy().isel(time=slice(3, None)))
+        ep.prepare.interpolate(gappy().isel(time=slice(3, None)))
 
 
 def test_a_delay_is_the_signals_past() -> None:
     t = np.linspace(0.0, 1.0, 101)
-    field = ep.delay(field_of(t, x=np.sin(3 * t)), variable="x", delay_s=0.105)
+    field = ep.prepare.delay(field_of(t, x=np.sin(3 * t)), variable="x", delay_s=0.105)
     later = field["time"].values
     assert later[0] == pytest.approx(0.11)
     # straight lines over 0.01 s: x'' h^2 / 8
@@ -94,7 +96,7 @@ def test_a_delay_is_the_signals_past() -> None:
 
 
 def test_derivatives_at_unequal_steps_are_exact_for_parabolas() -> None:
-    field = ep.derivative(plane(T), variable="I_d")
+    field = ep.prepare.derivative(plane(T), variable="I_d")
     np.testing.assert_allclose(field["dI_d_dt"].values, 2 * T, atol=1e-9)
     assert field["dI_d_dt"].attrs["units"] == "A s^-1"
 
@@ -102,10 +104,10 @@ def test_derivatives_at_unequal_steps_are_exact_for_parabolas() -> None:
 @pytest.mark.parametrize("degree", [1, 2])
 def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> None:
     field = field_of(T, x=5 + (T**degree - (T**degree).mean()) * 7, y=T)
-    flat = ep.detrend(field, variables=["x"], degree=degree)
+    flat = ep.prepare.detrend(field, variables=["x"], degree=degree)
     np.testing.assert_allclose(flat["x"].values, 5.0, atol=1e-10)
     np.testing.assert_array_equal(flat["y"].values, T)
-    both = ep.detrend(plane(T), degree=degree)
+    both = ep.prepare.detrend(plane(T), degree=degree)
     assert np.isnan(both["x"].values[:, 2]).all()
     np.testing.assert_allclose(both["x"].values[:, 1], 2 * T.mean(), atol=1e-10)
 
@@ -113,16 +115,21 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
 @pytest.mark.parametrize(
     ("step", "settings", "message"),
     [
-        (ep.resample, {"dt_s": 2.0}, "leave two samples or more: 2 s came for a record of 1 s"),
-        (ep.resample, {"dt_s": 0.0}, "dt_s must be positive"),
-        (ep.delay, {"variable": "q", "delay_s": 0.1}, r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
-        (ep.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
-        (ep.delay, {"variable": "x", "delay_s": 1.5}, "leave two samples or more: 1.5 s came"),
-        (ep.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"}, "a new name .*'I_d' came"),
-        (ep.derivative, {"variable": "B"}, "unknown variable of time 'B'"),
-        (ep.derivative, {"variable": "x", "name": "a b"}, "letters, digits and _: 'a b' came"),
-        (ep.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
-        (ep.detrend, {"variables": ["q"]}, "unknown variable of time 'q'"),
+        (ep.prepare.resample, {"dt_s": 2.0},
+         "leave two samples or more: 2 s came for a record of 1 s"),
+        (ep.prepare.resample, {"dt_s": 0.0}, "dt_s must be positive"),
+        (ep.prepare.delay, {"variable": "q", "delay_s": 0.1},
+         r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
+        (ep.prepare.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
+        (ep.prepare.delay, {"variable": "x", "delay_s": 1.5},
+         "leave two samples or more: 1.5 s came"),
+        (ep.prepare.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"},
+         "a new name .*'I_d' came"),
+        (ep.prepare.derivative, {"variable": "B"}, "unknown variable of time 'B'"),
+        (ep.prepare.derivative, {"variable": "x", "name": "a b"},
+         "letters, digits and _: 'a b' came"),
+        (ep.prepare.detrend, {"degree": 0}, "degree must be 1 or more, .*: 0 came"),
+        (ep.prepare.detrend, {"variables": ["q"]}, "unknown variable of time 'q'"),
     ],
 )  # fmt: skip
 def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: str) -> None:
@@ -132,10 +139,10 @@ def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: st
 
 def test_steps_that_need_every_sample_name_a_gap() -> None:
     for step, settings in (
-        (ep.resample, {"dt_s": 0.5}),
-        (ep.delay, {"variable": "x", "delay_s": 1.0}),
-        (ep.derivative, {"variable": "x"}),
-        (ep.detrend, {}),
+        (ep.prepare.resample, {"dt_s": 0.5}),
+        (ep.prepare.delay, {"variable": "x", "delay_s": 1.0}),
+        (ep.prepare.derivative, {"variable": "x"}),
+        (ep.prepare.detrend, {}),
     ):
         with pytest.raises(ValueError, match=r"x = nan at time = 3 s \(3 such values\)"):
             step(gappy(), **settings)
@@ -177,7 +184,7 @@ def test_lorenz_is_found_through_gaps() -> None:
     missing = np.random.default_rng(1).choice(len(table), 150, replace=False)
     table.loc[missing, "y"] = np.nan
     table.loc[800:830, "x"] = np.nan
-    with pytest.warns(ep.MissingSamples, match=r"of 3000 samples are missing"):
+    with pytest.warns(ep.warnings.MissingSamples, match=r"of 3000 samples are missing"):
         found = ep.discover(table)
     terms = {state: sorted(found.model.terms(state)) for state in "xyz"}
     assert terms == {"x": ["x", "y"], "y": ["x", "x*z", "y"], "z": ["x*y", "z"]}

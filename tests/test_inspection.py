@@ -11,6 +11,7 @@ import xarray as xr
 from scipy.io import savemat
 
 import ep2sindy as ep
+from ep2sindy.app.inspection import experiments
 from ep2sindy.data.conversion import conversion
 from ep2sindy.data.quantities import meant_by
 from ep2sindy.data.readers.registry import open_source
@@ -80,7 +81,7 @@ def test_units_that_are_only_likely_are_asked_and_inspect_takes_them(tmp_path: P
     odd_hdf5(tmp_path / "a.h5", units=False)
     with pytest.raises(ValueError, match=r"n_i .*in cm\^-3, and it names no unit: give it; n_n"):
         ep.open_field(tmp_path / "a.h5", dt_s=1.5e-6)
-    found = ep.inspect(tmp_path / "a.h5")
+    found = ep.inspect_file(tmp_path / "a.h5")
     units = {name: variable.unit for name, variable in found.variables.items()}
     assert units == {"n_i": "cm^-3", "n_n": "cm^-3", "u_iz": "m/s", "T_e_eV": "K"}
     field = ep.open_field(
@@ -91,14 +92,18 @@ def test_units_that_are_only_likely_are_asked_and_inspect_takes_them(tmp_path: P
 
 def test_an_inspection_says_what_is_there_and_what_lacks(tmp_path: Path) -> None:
     odd_hdf5(tmp_path / "a.h5", units=False)
-    text = repr(ep.inspect(tmp_path / "a.h5"))
+    found = ep.inspect_file(tmp_path / "a.h5")
+    text = repr(found)
     for part in (
         "out/ionDens", "(5, 7, 40)", "n_i in cm^-3", "no time: give the step", "data.dt_s=STEP",
-        "R_ion is made by ep2sindy.ionization_rate from T_e_eV", "z in cm, 0.5 apart",
-        "no length of the channel", "all there for +exp=breathing",
+        "R_ion is made by ep2sindy.thruster.ionization_rate from T_e_eV", "z in cm, 0.5 apart",
+        "no length of the channel",
     ):  # fmt: skip
         assert part in text, part
-    assert "<table>" in ep.inspect(tmp_path / "a.h5")._repr_html_()
+    assert found.lacking(["n_i", "R_ion", "V_d"]) == ("V_d",)  # R_ion can be made
+    (ready,) = experiments(found)
+    assert "all there for +exp=breathing" in ready
+    assert "<table>" in ep.inspect_file(tmp_path / "a.h5")._repr_html_()
 
 
 def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:
@@ -142,7 +147,7 @@ def test_a_scalar_may_say_the_step(tmp_path: Path, name: str, value: float) -> N
 @pytest.mark.parametrize(("factor", "unit"), [(1.0, "s"), (1e3, "ms"), (1e6, "us"), (7.0, "s")])
 def test_a_rate_beside_a_time_says_its_unit(tmp_path: Path, factor: float, unit: str) -> None:
     savemat(tmp_path / "a.mat", {"signal": WAVE[:, 0, 0], "t": factor * T, "fs": 1 / 1.5e-6})
-    assert ep.inspect(tmp_path / "a.mat").time == ep.Variable("t", unit)
+    assert ep.inspect_file(tmp_path / "a.mat").time == ep.Variable("t", unit)
 
 
 def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
@@ -234,7 +239,7 @@ def test_numbers_that_look_like_another_unit_are_told(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         ep.open_field(tmp_path / "a.npz", **given)
-    texts = [str(w.message) for w in caught if w.category is ep.DoubtfulUnit]
+    texts = [str(w.message) for w in caught if w.category is ep.warnings.DoubtfulUnit]
     assert len(texts) == (unit is not None)
     assert all(f"as if the file counted in {unit}" in text for text in texts)
 
@@ -262,7 +267,7 @@ def test_the_steps_of_a_plasmas_record_show_the_unit_of_time(
     tmp_path: Path, factor: float, unit: str
 ) -> None:
     np.savez(tmp_path / "a.npz", t=factor * T, ni=N_I[:, 0, 0], x=WAVE[:, 0, 0])
-    found = ep.inspect(tmp_path / "a.npz")
+    found = ep.inspect_file(tmp_path / "a.npz")
     assert found.time == ep.Variable("t", unit)
     assert ("time" in found.found.guesses) is (unit != "s")
     with warnings.catch_warnings(record=True) as caught:
@@ -282,6 +287,6 @@ def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> N
         t=T, z=Z, B=RNG.uniform(size=NZ), n_i=N_I[:, :, 0], I_d=WAVE[:, 0, 0],
         V_d=np.full(NT, 300.0),
     )  # fmt: skip
-    found = ep.inspect(tmp_path / "a.npz")
+    found = ep.inspect_file(tmp_path / "a.npz")
     signals = [name for name, variable in found.variables.items() if found.is_trace(variable)]
     assert signals == ["I_d"]

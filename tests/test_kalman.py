@@ -5,7 +5,7 @@ from scipy.linalg import cho_factor, cho_solve, null_space
 from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratio
 from ep2sindy.signals.kernels import likelihood, smoothed
 from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.synthetic.systems import (
+from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
     lorenz,

@@ -17,7 +17,7 @@ def written(tmp_path, header, z, B):
 
 
 def test_magnetic_field_peaks_at_the_exit():
-    field = ep.MagneticField().at(np.array([-0.011, 0.0, 0.018]))
+    field = ep.thruster.MagneticField().at(np.array([-0.011, 0.0, 0.018]))
     np.testing.assert_allclose(field, 15e-3 * np.exp([-0.5, 0.0, -0.5]))
 
 
@@ -35,12 +35,12 @@ def test_magnetic_field_peaks_at_the_exit():
 )
 def test_a_file_is_read_in_its_units(tmp_path, header, z_scale, B_scale, given):
     path = written(tmp_path, header, z_scale * Z, B_scale * PEAK)
-    field = ep.read_magnetic_field(path, exit_m=0.025, **given)
+    field = ep.thruster.read_magnetic_field(path, exit_m=0.025, **given)
     np.testing.assert_allclose(field.at(Z - 0.025), PEAK, rtol=1e-7)  # nine digits in the file
 
 
 def test_the_curve_between_points_never_overshoots():
-    table = ep.MagneticFieldTable([-2.0, -1.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.02, 0.02, 0.0])
+    table = ep.thruster.MagneticFieldTable([-2.0, -1.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.02, 0.02, 0.0])
     between = table.at(np.linspace(-2.0, 2.0, 401))
     assert between.min() >= 0.0
     assert between.max() == pytest.approx(0.02, abs=1e-15)
@@ -54,25 +54,27 @@ def test_the_curve_converges_to_the_field():
         B = 20e-3 * np.exp(-(((z - 0.025) / 0.012) ** 2))
         fine = np.linspace(0.005, 0.02, 500)
         exact = 20e-3 * np.exp(-(((fine - 0.025) / 0.012) ** 2))
-        errors.append(np.abs(ep.MagneticFieldTable(z, B).at(fine) - exact).max())
+        errors.append(np.abs(ep.thruster.MagneticFieldTable(z, B).at(fine) - exact).max())
     assert errors[0] / errors[1] > 4.0
     assert errors[1] / errors[2] > 4.0
 
 
 def test_sign_and_scale_of_a_file(tmp_path):
-    field = ep.read_magnetic_field(written(tmp_path, "z_m,B_T", Z, -PEAK), exit_m=0.025, scale=2.0)
+    field = ep.thruster.read_magnetic_field(
+        written(tmp_path, "z_m,B_T", Z, -PEAK), exit_m=0.025, scale=2.0
+    )
     np.testing.assert_allclose(field.at(Z - 0.025), 2.0 * PEAK, rtol=1e-7)
 
 
 def test_a_field_that_ends_short_of_the_domain_is_refused(tmp_path):
     inside = Z <= 0.04
     path = written(tmp_path, "z_m,B_T", Z[inside], PEAK[inside])
-    field = ep.read_magnetic_field(path, exit_m=0.025)
+    field = ep.thruster.read_magnetic_field(path, exit_m=0.025)
     with pytest.raises(
         ValueError, match=r"must cover the domain, -0\.025 to 0\.025 m .* to 0\.015"
     ):
-        ep.Thruster(magnetic_field=field)
-    assert ep.Thruster(magnetic_field=field, domain_length=0.04).domain_length == 0.04
+        ep.thruster.Thruster(magnetic_field=field)
+    assert ep.thruster.Thruster(magnetic_field=field, domain_length=0.04).domain_length == 0.04
 
 
 @pytest.mark.parametrize(
@@ -95,9 +97,9 @@ def test_a_file_that_cannot_be_taken_says_why(tmp_path, text, given, message):
     path = tmp_path / "B.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
-        ep.read_magnetic_field(path, exit_m=0.025, **given)
+        ep.thruster.read_magnetic_field(path, exit_m=0.025, **given)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"no such file of a magnetic field: .*none\.csv"):
-        ep.read_magnetic_field(tmp_path / "none.csv", exit_m=0.025)
+        ep.thruster.read_magnetic_field(tmp_path / "none.csv", exit_m=0.025)

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from ep2sindy.discovery.regimes import Regimes, find_regimes
 from ep2sindy.figures.maps import (
     ABSENT,
-    COUNTS,
+    COUNT_COLOURS,
     GAP,
     HALF,
-    SHARES,
+    SHARE_COLOURS,
     SINK,
     coefficient_maps,
     quality_maps,
@@ -285,10 +285,10 @@ def test_the_status_of_the_points_has_its_scale(cut: dict[str, int]) -> None:
 
 
 def test_no_value_is_drawn_in_a_shade_near_white(regime: Figure) -> None:
-    for scale in (SHARES, COUNTS):
+    for scale in (SHARE_COLOURS, COUNT_COLOURS):
         assert scale(np.linspace(0.0, 1.0, 50))[:, :3].min(axis=1).max() < 0.8
     (ax, _) = maps(regime)[1]
-    assert ax.collections[0].get_cmap() == SHARES
+    assert ax.collections[0].get_cmap() == SHARE_COLOURS
 
 
 def test_the_figure_says_that_coefficients_are_medians(regime: Figure) -> None:

@@ -8,7 +8,7 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 VARIABLES = ["n_i", "n_n", "R_ion"]
 UNITS = {"n_i": "m^-3", "n_n": "m^-3", "R_ion": "m^3/s"}

@@ -9,8 +9,8 @@ from torchdiffeq import odeint
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.ode import ODE, Drive, HermiteSimpson, RungeKutta, augmented
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.refinement.ode import ODE, Drive, HermiteSimpson, RungeKutta, augment
+from ep2sindy.systems.systems import lotka_volterra
 
 SCALE = np.array([2.0, 3.0])
 
@@ -59,7 +59,7 @@ def test_tangents_agree_with_autograd() -> None:
     ode = ODE(driven_model(), scale=np.array([2.0, 3.0, 5.0]), step_s=0.1)
     x = torch.randn((3, 2), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     ode.drive = constant_drive(0.7, 3)
-    system = augmented([ode])
+    system = augment([ode])
     scaling = torch.tensor([[1.1, 0.8, -0.5, 2.0]], dtype=torch.float64)
     _, inputs = ode.drive.at(0.0)
     out = system.fields(system.weights(scaling), x.T[None], inputs)[0].permute(2, 0, 1)
@@ -84,7 +84,7 @@ def test_steps_are_of_order_four(step: RungeKutta | HermiteSimpson) -> None:
         ode = ODE(model, scale=np.ones(1), step_s=h)
         drive = Drive(torch.ones((1, 1, 1), dtype=torch.float64), torch.zeros((1, 4, 1, 0, 1)))
         nodes = np.array([1.0, np.exp(-h)]).reshape(1, 1, 2, 1)
-        maps = step.maps(augmented([ode]), drive, np.ones((1, 1)), nodes)
+        maps = step.maps(augment([ode]), drive, np.ones((1, 1)), nodes)
         errors.append(abs(maps[0, 0, 0, 0, 0] - np.exp(-h)))
         np.testing.assert_allclose(maps[0, 0, 1:, 0, 0], [np.exp(-h), -h * np.exp(-h)], rtol=2e-4)
     # One step's error falls with the fifth power.
@@ -122,7 +122,7 @@ def test_correction_adds_to_the_rate_and_has_no_tangents() -> None:
     t = torch.tensor(0.0)
     torch.testing.assert_close(extended(t, x), plain(t, x) + 1.0)
     with pytest.raises(ValueError, match="learned correction has no tangents"):
-        augmented([extended])
+        augment([extended])
 
 
 def test_bad_models_are_refused() -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +12,13 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.operating.fit import LeftOut, OperatingFit, Windows, left_out, operating_fit
+from ep2sindy.operating.fit import LeaveOneOut, OperatingFit, Windows, leave_one_out, operating_fit
 from ep2sindy.operating.law import OperatingLaw, in_hull
 from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
     check_records,
-    measured_left_out,
+    interpolation_errors,
 )
 
 STATES = ("x", "y")
@@ -114,6 +115,19 @@ def test_every_number_survives_a_file(tmp_path: object) -> None:
         OperatingLaw.from_json("{}")
 
 
+def test_a_law_that_an_earlier_version_saved_is_read() -> None:
+    """The file is that of the predict study at toy size, before laws of all kinds became one."""
+    path = Path(__file__).parent / "data" / "operating_law.json"
+    saved = OperatingLaw.load(path)
+    assert saved.to_json() == path.read_text("utf-8")
+    assert (saved.parameters, saved.states) == (("V_D_V", "mdot_mg_s"), ("n_i", "n_n"))
+    model = saved.model_at({"V_D_V": 300.0, "mdot_mg_s": 5.0})
+    numbers = saved.numbers["n_n"]["1"]
+    expected = numbers["1"] + 300.0 * numbers["V_D_V"] + 5.0 * numbers["mdot_mg_s"]
+    assert model.terms("n_n")["1"] == pytest.approx(expected, rel=1e-12)
+    assert model.covariance is not None
+
+
 def test_intervals_follow_the_covariance() -> None:
     bounds = law().intervals()["x", "x"]
     assert list(bounds) == ["1", "a", "b"]
@@ -131,7 +145,7 @@ def test_the_text_names_every_coefficient() -> None:
 
 def test_points_left_out_live_by_the_law_of_the_others() -> None:
     functions = fit().functions(1)
-    for found in (left_out(fit(), functions), left_out(fit(), functions, start=law())):
+    for found in (leave_one_out(fit(), functions), leave_one_out(fit(), functions, start=law())):
         assert len(found) == 9
         assert [each.run.verdict for each in found] == [Verdict.LIVES] * 9
         # A frequency read off the five periods of half a record.
@@ -142,14 +156,14 @@ def test_points_left_out_live_by_the_law_of_the_others() -> None:
 
 
 def test_a_run_that_diverges_counts_as_ten_bounds() -> None:
-    found = left_out(fit(), fit().functions(1))[0]
+    found = leave_one_out(fit(), fit().functions(1))[0]
     gone = replace(found.run, verdict=Verdict.DIVERGES, f_error=float("nan"))
-    assert LeftOut(found.record, gone, inside=True).error == 10.0
+    assert LeaveOneOut(found.record, gone, inside=True).error == 10.0
 
 
 def test_a_smooth_family_interpolates_its_own_frequency() -> None:
     quadratic = polynomial(["a", "b"], degree=2)
-    f, amplitude = measured_left_out(records(), fit().basis(quadratic))
+    f, amplitude = interpolation_errors(records(), fit().basis(quadratic))
     assert f.shape == amplitude.shape == (9,)
     assert np.median(f) < 0.01
 
@@ -166,7 +180,7 @@ def test_a_point_that_the_law_needs_cannot_be_left_out() -> None:
         fit(), records=[records()[k] for k in corner], fits=[fit().fits[k] for k in corner]
     )
     with pytest.raises(ValueError, match="a=0.5, b=0 cannot be left out: a law of 3 terms needs"):
-        left_out(three, three.functions(1))
+        leave_one_out(three, three.functions(1))
 
 
 def test_parameters_must_vary_and_be_the_same_everywhere() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.operating.choice import Tried, candidate_structures, chosen, tried
+from ep2sindy.operating.choice import StructureTrial, candidate_structures, choose, try_structures
 from ep2sindy.operating.fit import Windows
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate, eigenvalues, fixed_point, law_map
@@ -25,11 +25,13 @@ ONES = np.ones(2)
 
 
 @cache
-def tries() -> list[Tried]:
+def tries() -> list[StructureTrial]:
     """Three structures, the true one first, along one parameter of the known family."""
     line = [replace(recorded(a, 0.0), parameters={"a": a}) for a in (0.5, 0.75, 1.0, 1.25, 1.5)]
     structures = [STRUCTURE, {**STRUCTURE, "y": ["x", "y"]}, {**STRUCTURE, "x": ["x", "y"]}]
-    return tried(line, LIBRARY, structures, [1, 2], windows=Windows(n_windows=3, periods=1.0))
+    return try_structures(
+        line, LIBRARY, structures, [1, 2], windows=Windows(n_windows=3, periods=1.0)
+    )
 
 
 def hopf() -> OperatingLaw:
@@ -98,7 +100,7 @@ def test_fixed_points_and_their_eigenvalues_are_exact() -> None:
 def test_the_structure_and_degree_of_a_known_family_are_chosen() -> None:
     # Five points bear three functions; every structure has both degrees.
     assert [each.degree for each in tries()] == [1, 2] * 3
-    best = chosen(tries())
+    best = choose(tries())
     assert best.fit.structure == STRUCTURE
     assert (best.degree, best.n_numbers) == (1, 8)
     assert best.errors.max() < 1.0
@@ -114,9 +116,9 @@ def test_candidates_are_the_best_supports_of_every_size() -> None:
 def test_too_few_points_for_every_degree_are_refused() -> None:
     few = [records()[k] for k in (0, 1, 4)]
     with pytest.raises(ValueError, match="3 operating points suffice for no law of degree 1"):
-        tried(few, LIBRARY, [STRUCTURE], [1, 2], windows=Windows(3, 1.0))
+        try_structures(few, LIBRARY, [STRUCTURE], [1, 2], windows=Windows(3, 1.0))
 
 
 def test_of_equals_the_one_of_fewest_numbers_is_chosen() -> None:
     first, second = tries()[:2]
-    assert chosen([Tried(second.fit, 2, first.found), first]).degree == 1
+    assert choose([StructureTrial(second.fit, 2, first.found), first]).degree == 1

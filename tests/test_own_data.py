@@ -11,8 +11,8 @@ import yaml
 
 import ep2sindy as ep
 from ep2sindy.app import main as program
+from ep2sindy.app.inspection import NEEDS
 from ep2sindy.app.runner import run_config
-from ep2sindy.data.inspection import NEEDS
 from tests.programs import EXPERIMENTS, composed, computed
 
 
@@ -160,7 +160,7 @@ GRID = xr.Dataset(
 def test_downstream_is_the_last_part_of_a_channel_that_is_known() -> None:
     zone = ep.Zone(z="downstream")
     known = GRID.assign_attrs(channel_m=0.025)
-    average = ep.ZoneAverage(["n_i"], zone)
+    average = ep.data.ZoneAverage(["n_i"], zone)
     run = average.trajectory(known, inputs=[], label="")
     by_hand = ep.zone_average(GRID, ep.Zone(z=(0.015, 0.025)), states=["n_i"])
     np.testing.assert_array_equal(run.states, by_hand.states)
@@ -170,7 +170,7 @@ def test_downstream_is_the_last_part_of_a_channel_that_is_known() -> None:
     )
     simulated = GRID.assign_attrs(parameters=json.dumps({"thruster": {"channel_length": 0.025}}))
     assert average.place(simulated) == words
-    assert ep.GridPoint(["n_i"], z=0.018).place(GRID) == "the grid point at z = 17.5 mm"
+    assert ep.data.GridPoint(["n_i"], z=0.018).place(GRID) == "the grid point at z = 17.5 mm"
 
 
 def test_a_channel_that_is_not_known_is_asked_for() -> None:
@@ -184,7 +184,9 @@ def test_a_channel_that_is_not_known_is_asked_for() -> None:
 
 def test_a_variable_that_can_be_made_says_how() -> None:
     field = GRID.assign(T_e_eV=GRID["n_i"])
-    with pytest.raises(ValueError, match=r"'prepare=\[\{_target_:ep2sindy.ionization_rate\}\]'"):
+    with pytest.raises(
+        ValueError, match=r"'prepare=\[\{_target_:ep2sindy.thruster.ionization_rate\}\]'"
+    ):
         ep.zone_average(field, None, states=["n_i"], inputs=["R_ion"])
 
 

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from ep2sindy.constraints.fit import constrained_fit
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.point_fits import (
@@ -73,7 +73,7 @@ def study(*, weak: bool = True) -> PointStudy:
         bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
         refining=Refining(n_windows=10, periods=0.5, max_iter=50),
         searched=SEARCHED,
-        recipe=Recipe(
+        recipe=Regression(
             Weak(split=every) if weak else Differential(NoSmoothing(), split=every),
             BestSubset(max_terms=3),
             selection=Knee(n_norm="max_terms"),
@@ -173,8 +173,8 @@ def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
         assert fitted.r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-6)
     # g = 2 + V / 100 lies on the law; eps does not.
     assert joint.tied is not None
-    assert joint.tied.law.names == ("1", "V")
-    assert all(set(e.r2_tied) == set(e.r2_free) for e in joint.tied.equations.values())
+    assert joint.tied.law.functions.names == ("1", "V")
+    assert all(set(e.r2_tied) == set(e.r2_free) for e in joint.tied.tests.values())
 
 
 def test_a_joint_search_says_why_it_ties_nothing(

@@ -9,7 +9,7 @@ from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.search.bootstraps import Bootstraps, Supports, pooled_supports
 from ep2sindy.search.front import front_order, pareto_front
 from ep2sindy.search.searches import STLSQ, AdaptiveLasso, BestSubset, Search
-from ep2sindy.synthetic.systems import (
+from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
     lorenz,

@@ -7,11 +7,11 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
+from benchmarks.landmark import landmark_thruster
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.fields import check_field
 from ep2sindy.studies import pointwise
 from ep2sindy.thruster.axial.settings import to_json
-from ep2sindy.thruster.landmark import landmark_thruster
 from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.plane import electron_kernels as electrons
 from ep2sindy.thruster.plane import heavy_kernels as heavy
@@ -255,15 +255,15 @@ def test_the_config_names_the_set_that_the_package_takes_by_default(tmp_path):
 
 
 def test_second_call_reads_identical_values(tmp_path):
-    first = ep.simulate_2d_cached(cache=tmp_path, **BRIEF)
+    first = ep.thruster.simulate_2d(cache=tmp_path, **BRIEF)
     (path,) = tmp_path.iterdir()
     assert path.name.startswith("plane_300V_5mgs_")
     written = path.stat().st_mtime_ns
-    second = ep.simulate_2d_cached(cache=tmp_path, **BRIEF)
+    second = ep.thruster.simulate_2d(cache=tmp_path, **BRIEF)
     assert path.stat().st_mtime_ns == written
     xr.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
     assert all(first[name].dtype == second[name].dtype for name in first.variables)
-    ep.simulate_2d_cached(cache=tmp_path, **(BRIEF | {"averaged": False}))
+    ep.thruster.simulate_2d(cache=tmp_path, **(BRIEF | {"averaged": False}))
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -278,7 +278,7 @@ def test_second_call_reads_identical_values(tmp_path):
         (
             {
                 "thruster": landmark_thruster(
-                    1, ep.TabulatedRates((1.0, 2.0), (0.0, 1.0), (0.0, 1.0))
+                    1, ep.thruster.TabulatedRates((1.0, 2.0), (0.0, 1.0), (0.0, 1.0))
                 )
             },
             r"wall must be a SheathWall, got ExponentialWall",

@@ -12,7 +12,6 @@ import xarray as xr
 from ep2sindy.data.zones import point_samples
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.library.library import named_terms
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
@@ -59,8 +58,8 @@ def searching(**changes: object) -> PointSearch:
         "selection": EBIC(),
     } | changes
     names = ("formulation", "search", "bootstraps", "selection")
-    recipe = Recipe(**{name: settings.pop(name) for name in names})
-    return PointSearch(recipe=recipe, **settings)
+    recipe = Regression(**{name: settings.pop(name) for name in names})
+    return PointSearch(method=recipe, **settings)
 
 
 def bytes_of(result: xr.Dataset) -> dict[str, bytes]:

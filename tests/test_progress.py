@@ -79,12 +79,12 @@ def prey() -> ep.Trajectory:
     return ep.lotka_volterra().trajectory(noise=0.01, rng=0)
 
 
-def regression(selection: object = None, **settings: object) -> ep.Recipe:
-    return ep.Recipe(
+def regression(selection: object = None, **settings: object) -> ep.Regression:
+    return ep.Regression(
         ep.Differential(),
         ep.BestSubset(max_terms=2),
-        ep.Bootstraps(**({"n": 4} | settings)),
         selection or ep.EBIC(),
+        ep.Bootstraps(**({"n": 4} | settings)),
     )
 
 
@@ -101,7 +101,7 @@ def test_a_regression_tells_its_stages_in_order(prey: ep.Trajectory) -> None:
 
 def test_a_search_of_trajectories_tells_its_steps() -> None:
     watch = Recorder()
-    run = ep.damped_oscillator().trajectory(noise=0.01, rng=0)
+    run = ep.systems.damped_oscillator().trajectory(noise=0.01, rng=0)
     ep.discover(run, ep.polynomial(["x", "v"], degree=1), progress=watch)
     assert watch.labels[:2] == ["states and coefficients", "rivals"]
     assert [each.total for each in watch.stages[:2]] == [None, 2]
@@ -142,18 +142,22 @@ def test_a_result_does_not_depend_on_who_watches(prey: ep.Trajectory) -> None:
 def test_refinements_tell_their_iterations_and_windows(prey: ep.Trajectory) -> None:
     watch = Recorder()
     model = ep.lotka_volterra().model
-    found = ep.loss_against_window(model, [prey], [20, 40], n_windows=2, rng=0, progress=watch)
+    lengths = [20, 40]
+    found = [
+        ep.refine(model, [prey], window=length, n_windows=2, rng=0, progress=watch)
+        for length in counted(watch, lengths, "window length")
+    ]
     outer, *inner = watch.stages
     assert (outer.unit, outer.total, outer.depth) == ("window length", 2, 0)
     assert [each.depth for each in inner] == [1, 1]
-    assert [each.done for each in inner] == [len(fit.history) for fit in found.values()]
+    assert [each.done for each in inner] == [len(fit.history) for fit in found]
     watch.check()
 
 
 def test_a_search_of_all_points_tells_points_and_equations(prey: ep.Trajectory) -> None:
     watch = Recorder()
     points = {"a": [prey], "b": [ep.lotka_volterra().trajectory(noise=0.01, rng=1)]}
-    recipe = ep.Recipe(ep.Differential(), ep.BestSubset(max_terms=2))
+    recipe = ep.Regression(ep.Differential(), ep.BestSubset(max_terms=2))
     ep.discover_jointly(points, LIBRARY, recipe, progress=watch)
     assert [(each.unit, each.total) for each in watch.stages] == [("point", 2), ("equation", 2)]
     watch.check()
@@ -163,12 +167,14 @@ def test_a_search_of_all_points_tells_points_and_equations(prey: ep.Trajectory) 
 def test_a_simulator_tells_warm_up_and_record(simulator: str) -> None:
     watch = Recorder()
     if simulator == "simulate":
-        point = ep.OperatingPoint(300.0, 5.0)
-        field = ep.simulate(ep.Thruster(), point, **BRIEF, n_cells=30, progress=watch)
+        point = ep.thruster.OperatingPoint(300.0, 5.0)
+        field = ep.thruster.simulate(
+            ep.thruster.Thruster(), point, **BRIEF, n_cells=30, progress=watch
+        )
         label = point.label
     else:
-        field = ep.simulate_2d(**BRIEF, n_z=24, n_r=10, progress=watch)
-        label = ep.OPERATING_POINT_2D.label
+        field = ep.thruster.simulate_2d(**BRIEF, n_z=24, n_r=10, progress=watch)
+        label = ep.thruster.OPERATING_POINT_2D.label
     (stage,) = watch.stages
     assert (stage.label, stage.unit) == (label, "sample")
     assert stage.total == 2 + field.sizes["time"]
@@ -177,12 +183,12 @@ def test_a_simulator_tells_warm_up_and_record(simulator: str) -> None:
 
 def test_points_are_told_whoever_computes_them() -> None:
     field = grid_field()
-    search = ep.PointSearch(
+    search = ep.discovery.PointSearch(
         ["x"], ep.named_terms(["x"], ["x", "1"]), regression(n=2, n_culled=0), seed=0
     )
     watch, numbers = Recorder(), []
     for progress in (watch, numbers.append):
-        ep.pointwise(field, search, workers=ep.Serial(), block_points=2, progress=progress)
+        ep.pointwise(field, search, workers=ep.parallel.Serial(), block_points=2, progress=progress)
     (stage,) = watch.of("point")
     assert stage.total == sum(numbers) == 3
     watch.check()
@@ -218,7 +224,7 @@ def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.Captu
     }
     simulators = {name for name, default in asking.items() if default is True}
     assert simulators == {
-        "simulate", "simulate_cached", "simulate_2d", "simulate_2d_cached",
+        "simulate", "simulate_2d",
         "simulate_hallthruster_input",
     }  # fmt: skip
     assert {asking[name] for name in set(asking) - simulators} == {False}

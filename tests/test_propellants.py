@@ -51,7 +51,7 @@ def published_rows():
 
 @pytest.mark.parametrize(("gas", "name", "mean_energy_eV", "expected"), published_rows())
 def test_tables_are_those_of_hallthruster(gas, name, mean_energy_eV, expected):
-    rate = getattr(ep.propellant(gas), name)(np.array(mean_energy_eV / 1.5))
+    rate = getattr(ep.thruster.propellant(gas), name)(np.array(mean_energy_eV / 1.5))
     assert rate == pytest.approx(expected, rel=2e-3)  # rows left out
 
 
@@ -60,7 +60,7 @@ def test_xenon_meets_the_stored_tutorial_of_hallthruster():
 
     nu_iz/n_n and nu_ex/n_n of test/regression/output/ref_spt100_tutorial.json, v0.22.
     """
-    xenon = ep.propellant("xenon")
+    xenon = ep.thruster.propellant("xenon")
     hot = np.array((1.5 * 24.656 + 6.70) / 1.5)
     assert xenon.ionization(hot) == pytest.approx(15990.0857 / 1.0631715e17, rel=3e-3)
     assert xenon.excitation(hot) == pytest.approx(8457.4096 / 1.0631715e17, rel=3e-3)
@@ -76,17 +76,19 @@ def test_argon_is_the_average_of_its_cross_section():
     T_e = 20.0
     weight = speed**2 * np.exp(-energy / T_e)
     expected = np.sum(Q * speed * weight) / np.sum(weight)
-    assert ep.propellant("argon").ionization(np.array(T_e)) == pytest.approx(expected, rel=1e-4)
+    assert ep.thruster.propellant("argon").ionization(np.array(T_e)) == pytest.approx(
+        expected, rel=1e-4
+    )
 
 
 def test_argon_meets_the_ionization_of_hallthruster():
-    rate = ep.propellant("argon").ionization(np.array([10.0, 20.0, 40.0]))
+    rate = ep.thruster.propellant("argon").ionization(np.array([10.0, 20.0, 40.0]))
     np.testing.assert_allclose(rate, [1.540e-14, 4.882e-14, 9.284e-14], rtol=0.05)  # other data
 
 
 @pytest.mark.parametrize("gas", ["xenon", "krypton", "argon"])
 def test_rates_rise_from_their_threshold_and_stay_below_the_fluxes(gas):
-    made = ep.propellant(gas)
+    made = ep.thruster.propellant(gas)
     assert np.all(np.diff(made.ionization(T)) >= 0.0)
     assert np.all(made.ionization(T) < 1e-19 * thermal_speed(T))  # atoms are below 10 A^2
     assert np.all(made.drift_events(T) <= made.events(T))
@@ -99,7 +101,7 @@ def test_rates_rise_from_their_threshold_and_stay_below_the_fluxes(gas):
 
 def test_two_descriptions_of_xenon_are_alike():
     """Formulas against tables, at the temperatures of a discharge; excitation by other data."""
-    table, fits = ep.propellant("xenon"), XenonFits()
+    table, fits = ep.thruster.propellant("xenon"), XenonFits()
     hot = np.array([10.0, 20.0, 40.0])
     np.testing.assert_allclose(table.ionization(hot), fits.ionization(hot), rtol=0.03)
     np.testing.assert_allclose(table.energy_loss(hot), fits.energy_loss(hot), rtol=0.25)
@@ -107,24 +109,26 @@ def test_two_descriptions_of_xenon_are_alike():
 
 
 def test_charge_states_follow_the_columns():
-    states = [ep.propellant(gas).charge_states for gas in ("xenon", "krypton", "argon")]
+    states = [ep.thruster.propellant(gas).charge_states for gas in ("xenon", "krypton", "argon")]
     assert states == [2, 2, 1]
     assert (
         XenonFits().charge_states
         == TabulatedRates((1.0, 2.0), (0.0,) * 2, (0.0,) * 2).charge_states
     )
-    assert np.all(ep.propellant("argon").second_ionization(T) == 0.0)
+    assert np.all(ep.thruster.propellant("argon").second_ionization(T) == 0.0)
 
 
 def test_coulomb_collisions_can_be_left_out():
-    assert np.all(ep.propellant("xenon", coulomb_weight=0.0).coulomb(T) == 0.0)
-    np.testing.assert_array_equal(ep.propellant("xenon").coulomb(T), XenonFits().coulomb(T))
+    assert np.all(ep.thruster.propellant("xenon", coulomb_weight=0.0).coulomb(T) == 0.0)
+    np.testing.assert_array_equal(
+        ep.thruster.propellant("xenon").coulomb(T), XenonFits().coulomb(T)
+    )
 
 
 def test_a_table_of_ones_own_is_read(tmp_path):
     path = tmp_path / "iodine.csv"
     path.write_text("# mine\n" + HEADER + ROWS)
-    made = ep.read_propellant(path, **OWN)
+    made = ep.thruster.read_propellant(path, **OWN)
     assert (made.name, made.range_eV) == ("iodine", (1.0, 10.0))
     assert made.mass == pytest.approx(131.3 * ATOMIC_MASS)
     np.testing.assert_allclose(made.ionization(np.array([1.0, 5.5, 10.0])), [0.0, 2e-14, 4e-14])
@@ -135,7 +139,9 @@ def test_a_table_over_the_mean_energy_is_the_same_gas(tmp_path):
     (tmp_path / "b.csv").write_text(
         "mean_energy_eV,ionization,excitation,momentum\n1.5,0,0,1e-13\n15,4e-14,4e-14,6e-13\n"
     )
-    one, other = (ep.read_propellant(tmp_path / name, **OWN) for name in ("a.csv", "b.csv"))
+    one, other = (
+        ep.thruster.read_propellant(tmp_path / name, **OWN) for name in ("a.csv", "b.csv")
+    )
     np.testing.assert_allclose(one.momentum(T), other.momentum(T))
 
 
@@ -162,14 +168,14 @@ def test_a_table_that_cannot_be_taken_says_why(tmp_path, text, change, message):
     path = tmp_path / "own.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
-        ep.read_propellant(path, **(OWN | change))
+        ep.thruster.read_propellant(path, **(OWN | change))
 
 
 def test_a_gas_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"there are the propellants \['argon', 'krypton', 'xenon"):
-        ep.propellant("iodine")
+        ep.thruster.propellant("iodine")
     with pytest.raises(ValueError, match=r"no such table of a propellant: .*none\.csv"):
-        ep.read_propellant(tmp_path / "none.csv", **OWN)
+        ep.thruster.read_propellant(tmp_path / "none.csv", **OWN)
 
 
 def test_rates_must_cover_the_ends_of_the_discharge():
@@ -177,30 +183,36 @@ def test_rates_must_cover_the_ends_of_the_discharge():
         "own", 2e-25, 12.0, 8.0, (4.0, 60.0), (0.0, 1e-13), (0.0,) * 2, (0.0,) * 2
     )
     with pytest.raises(ValueError, match=r"rates of own cover T_e from 4 to 60 eV, and it is 3 eV"):
-        ep.Thruster(propellant=short)
+        ep.thruster.Thruster(propellant=short)
 
 
 def test_a_run_beyond_the_table_says_how_far_it_got():
-    assert uncovered(ep.propellant("krypton"), 99.0) is None
+    assert uncovered(ep.thruster.propellant("krypton"), 99.0) is None
     assert uncovered(XenonFits(), 199.0) is None
     message = (
         "the rates of krypton cover T_e up to 100 eV, the run reached 120 eV; extend the table"
     )
-    assert uncovered(ep.propellant("krypton"), 120.0) == message
+    assert uncovered(ep.thruster.propellant("krypton"), 120.0) == message
 
 
 def test_a_second_charge_needs_its_rates():
     with pytest.raises(ValueError, match=r"charge_states 2 needs rates .* XenonFits has not"):
-        ep.Thruster(charge_states=2)
+        ep.thruster.Thruster(charge_states=2)
     with pytest.raises(ValueError, match=r"charge_states must be 1 or 2, got 3"):
-        ep.Thruster(charge_states=3, propellant=ep.propellant("xenon"))
-    assert ep.Thruster(charge_states=2, propellant=ep.propellant("xenon")).charge_states == 2
+        ep.thruster.Thruster(charge_states=3, propellant=ep.thruster.propellant("xenon"))
+    assert (
+        ep.thruster.Thruster(
+            charge_states=2, propellant=ep.thruster.propellant("xenon")
+        ).charge_states
+        == 2
+    )
 
 
 def test_another_gas_is_simulated():
     """Krypton of the same flow: lighter ions, faster beam; what enters leaves or stays."""
-    field = ep.simulate(
-        ep.Thruster(propellant=ep.propellant("krypton")), ep.OperatingPoint(300.0, 5.0),
+    field = ep.thruster.simulate(
+        ep.thruster.Thruster(propellant=ep.thruster.propellant("krypton")),
+        ep.thruster.OperatingPoint(300.0, 5.0),
         duration_s=1e-4, warm_up_s=0.0, n_cells=30, progress=False,
     )  # fmt: skip
     assert field.attrs["status"] != "diverged"

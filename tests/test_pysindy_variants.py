@@ -15,7 +15,7 @@ from ep2sindy.studies.pysindy_variants import (
     best_of_each_size,
     pysindy_library,
 )
-from ep2sindy.synthetic.systems import lotka_volterra, van_der_pol
+from ep2sindy.systems.systems import lotka_volterra, van_der_pol
 
 METHODS = [
     PySINDyStlsq(),

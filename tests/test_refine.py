@@ -14,12 +14,12 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.methods.nelder_mead import NelderMead
-from ep2sindy.refinement.methods.single_shooting import SingleShooting
 from ep2sindy.refinement.ode import HermiteSimpson, RungeKutta
-from ep2sindy.refinement.problem import Iteration, Method
-from ep2sindy.refinement.refine import Refinement, loss_against_window, refine, refine_many
+from ep2sindy.refinement.problem import Iteration, Method, RefinementSettings
+from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.refinement.windows import cut_windows, dominant_window
-from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra
+from ep2sindy.systems.systems import System, lorenz, lotka_volterra
+from tests.single_shooting import SingleShooting
 
 PREY, LORENZ = lotka_volterra(), lorenz()
 LONG = replace(PREY, duration_s=300.0)  # 30 windows of 100 samples, none twice
@@ -212,12 +212,61 @@ def test_window_is_one_and_a_half_periods_of_the_sharpest_peak() -> None:
     assert dominant_window([data], ["a", "b"]) == pytest.approx(75, abs=2)
 
 
-def test_loss_against_window_gives_one_refinement_each() -> None:
+def test_a_right_model_follows_windows_of_any_length() -> None:
     rng = np.random.default_rng(0)
     data = noisy(PREY, 0.05, rng)
-    found = loss_against_window(PREY.model, [data], [20, 80], n_windows=6, rng=rng)
-    assert list(found) == [20, 80]
-    assert all(each.loss < 0.05**2 * 1.2 for each in found.values())
+    for window in (20, 80):
+        found = refine(PREY.model, [data], window=window, n_windows=6, rng=rng)
+        assert found.trajectories.shape[1] == window
+        assert found.loss < 0.05**2 * 1.2
+
+
+def test_keywords_stand_for_what_settings_say() -> None:
+    data = noisy(PREY, 0.05, np.random.default_rng(0))
+    settings = RefinementSettings(n_windows=3, window=30, n_reweights=0)
+    by_settings = refine(PREY.model, [data], settings, rng=1)
+    by_keywords = refine(PREY.model, [data], n_windows=3, window=30, n_reweights=0, rng=1)
+    np.testing.assert_array_equal(by_settings.model.coef, by_keywords.model.coef)
+    longer = refine(PREY.model, [data], settings, window=40, rng=1)
+    assert longer.trajectories.shape == (3, 40, 2)
+    by_periods = RefinementSettings(periods=2.0).override({"window": 40, "n_windows": None})
+    assert (by_periods.window, by_periods.periods, by_periods.n_windows) == (40, None, 30)
+    assert refine([], [], rng=1) == []
+    (first, second) = refine([PREY.model] * 2, [[data]] * 2, settings, rng=1)
+    np.testing.assert_array_equal(first.model.coef, by_settings.model.coef)
+    assert second.batch.start.tolist() != first.batch.start.tolist()  # windows of its own
+
+
+def test_windows_are_as_many_periods_as_are_asked_for() -> None:
+    t = np.arange(0.0, 10.0, 0.02)
+    run = Trajectory(t, np.sin(2.0 * np.pi * t)[:, None], ["x"])  # 50 samples a period
+    model = SparseModel(named_terms(["x"], ["x"]), ["x"], np.array([[0.1]]))
+    rng = np.random.default_rng(0)
+    for periods, window in ((None, 75), (2.0, 100), (0.5, 25)):
+        (batch,) = RefinementSettings(periods=periods).cut([model], [[run]], rng)
+        assert batch.data.shape[1] == pytest.approx(window, abs=2)
+    short = run.window(0, 120)
+    batches = RefinementSettings(periods=2.0).cut([model] * 2, [[run], [short]], rng)
+    assert [batch.data.shape[1] for batch in batches] == [60, 60]  # half of the shorter record
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"window": 4}, "at least one window of 5 samples is needed: n_windows=30, window=4"),
+        ({"n_windows": 0}, "at least one window of 5 samples is needed: n_windows=0"),
+        ({"window": 20, "periods": 1.0}, "by its samples or by its periods: window=20 and periods"),
+        ({"periods": 0.0}, "periods must be positive: 0.0 came"),
+        ({"n_reweights": -1}, "n_reweights must be zero or more: -1 came"),
+    ],
+)
+def test_settings_that_say_nothing_or_two_things_are_refused(
+    settings: dict[str, float], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        RefinementSettings(**settings)
+    with pytest.raises(ValueError, match=message):
+        refine(PREY.model, [clean(PREY)], rng=0, **settings)
 
 
 def test_history_reports_every_iteration_as_it_comes() -> None:
@@ -268,10 +317,9 @@ def test_points_refined_together_are_those_refined_alone() -> None:
     model = PREY.model
     data = [[noisy(PREY, noise, rng)] for noise in (0.01, 0.1, 0.05)]
     starts = [spread(model, share, rng) for share in (0.1, 0.9, 0.3)]
-    together = refine_many(starts, data, window=200, n_windows=5, rng=np.random.default_rng(1))
-    alone = refine_many(
-        starts, data, window=200, n_windows=5, points_per_batch=1, rng=np.random.default_rng(1)
-    )
+    settings = RefinementSettings(window=200, n_windows=5)
+    together = refine(starts, data, settings, rng=np.random.default_rng(1))
+    alone = refine(starts, data, settings, points_per_batch=1, rng=np.random.default_rng(1))
     for one, other in zip(together, alone, strict=True):
         assert one.status == other.status == "converged"
         assert len(one.history) == len(other.history)
@@ -286,9 +334,9 @@ def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Me
     wider = [terms[0] | {"x^2": 0.01}, terms[1] | {"1": 0.01, "y^2": -0.01}]
     models = [SparseModel(library, ["x", "y"], coef_matrix(library, t)) for t in (wider, terms)]
     data = [[noisy(PREY, 0.05, rng)]] * 2
-    settings = {"window": 40, "n_windows": 6, "method": method}
-    together = refine_many(models, data, rng=np.random.default_rng(1), **settings)
-    alone = refine_many(models, data, points_per_batch=1, rng=np.random.default_rng(1), **settings)
+    settings = RefinementSettings(window=40, n_windows=6, method=method)
+    together = refine(models, data, settings, rng=np.random.default_rng(1))
+    alone = refine(models, data, settings, points_per_batch=1, rng=np.random.default_rng(1))
     for one, other in zip(together, alone, strict=True):
         assert one.status == other.status
         np.testing.assert_allclose(one.model.coef, other.model.coef, rtol=1e-6)
@@ -308,7 +356,7 @@ def test_models_of_different_states_are_refused_in_one_batch() -> None:
         for a, b in (("x", "y"), ("y", "x"))
     ]
     with pytest.raises(ValueError, match="must share their states and inputs"):
-        refine_many(models, data, window=50, rng=np.random.default_rng(0))
+        refine(models, data, RefinementSettings(window=50), rng=np.random.default_rng(0))
 
 
 def test_bad_input_is_refused() -> None:
@@ -323,6 +371,8 @@ def test_bad_input_is_refused() -> None:
         refine(SparseModel(library, ["x"], np.ones((2, 1))), [data], window=50, rng=rng)
     with pytest.raises(ValueError, match="at least one trajectory"):
         refine(model, [], window=50, rng=rng)
+    with pytest.raises(ValueError, match="a list of trajectories of its own: 2 models and 1 lists"):
+        refine([model] * 2, [[data]], RefinementSettings(window=50), rng=rng)
     with pytest.raises(ValueError, match="NelderMead cannot fit initial states"):
         refine(model, [data], window=50, method=NelderMead(), rng=rng)
 

@@ -9,15 +9,15 @@ from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
-from ep2sindy.refinement.refine import Together, follow_together, refine_together
+from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.refined import RefinedScore, _refined
-from ep2sindy.selection.rule import FLOOR, MAX_ERROR, Selection, selected
-from ep2sindy.synthetic.draws import realization
-from ep2sindy.synthetic.systems import System, damped_oscillator, lorenz, lotka_volterra
+from ep2sindy.selection.rule import FLOOR, MAX_ERROR, selected
+from ep2sindy.systems.draws import realization
+from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra
 
 PREY = lotka_volterra()
 Terms = dict[str, float]
@@ -57,8 +57,13 @@ def fronts_of(
     return fronts
 
 
-def picked(rule: Selection, fronts: list[ParetoFront]) -> list[set[str]]:
-    scores = rule.scores(fronts)
+def scores_by(rule: RefinedScore, fronts: list[ParetoFront]) -> list[np.ndarray]:
+    rows = fronts[0].rows
+    return rule.scores(fronts, rows.library, rows.trajectories)
+
+
+def picked(rule: RefinedScore, fronts: list[ParetoFront]) -> list[set[str]]:
+    scores = scores_by(rule, fronts)
     return [set(selected(f, s).terms) for f, s in zip(fronts, scores, strict=True)]
 
 
@@ -92,7 +97,7 @@ WRONG = {
 def test_the_truth_is_selected_from_exact_samples(system: System, n_samples: int) -> None:
     run = system.trajectory().window(0, n_samples)
     fronts = fronts_of([run], system.model.library, next_to_truth(system, WRONG[system.name]))
-    found = RefinedScore().scores(fronts)
+    found = scores_by(RefinedScore(), fronts)
     chosen = [selected(f, scores) for f, scores in zip(fronts, found, strict=True)]
     assert [set(c.terms) for c in chosen] == supports(system)
     assert max(scores.min() for scores in found) <= EXACT
@@ -120,7 +125,7 @@ def test_equations_without_terms_take_part_and_can_win() -> None:
     fronts = fronts_of([run], polynomial(["x", "y"], degree=1), choices)
     assert picked(RefinedScore(), fronts) == [set(), {"y"}]
     nothing = fronts_of([run], polynomial(["x", "y"], degree=1), {"x": [], "y": []})
-    x, y = RefinedScore(window_s=1.0).scores(nothing)
+    x, y = scores_by(RefinedScore(window_s=1.0), nothing)
     assert x == y
     assert 0.0 < float(x[0]) < MAX_ERROR
 
@@ -143,8 +148,8 @@ def test_units_do_not_matter_to_the_refined_score() -> None:
         s: [{n: c * 1e6 * 1e18 ** (1.0 - degree[n]) for n, c in terms.items()} for terms in given]
         for s, given in choices.items()
     }
-    plain = RefinedScore().scores(fronts_of([run], library, choices))
-    scaled = RefinedScore().scores(fronts_of([dense], library, converted))
+    plain = scores_by(RefinedScore(), fronts_of([run], library, choices))
+    scaled = scores_by(RefinedScore(), fronts_of([dense], library, converted))
     for a, b in zip(plain, scaled, strict=True):
         assert b == pytest.approx(a, rel=1e-4)
 
@@ -154,7 +159,7 @@ def test_a_combination_that_diverges_gets_the_largest_error() -> None:
     library = polynomial(["x", "v"], degree=3)
     choices = {"x": [{"v": 1.0}, {"1": 1e200, "x^3": 1e200}], "v": [{"x": -9.0, "v": -0.6}]}
     run = system.trajectory().window(0, 600)
-    scores = RefinedScore(window_s=0.5).scores(fronts_of([run], library, choices))
+    scores = scores_by(RefinedScore(window_s=0.5), fronts_of([run], library, choices))
     assert scores[0][2] == MAX_ERROR
     assert scores[0][1] <= EXACT
 
@@ -215,18 +220,18 @@ def test_models_of_different_terms_refined_together_are_those_refined_alone() ->
     )
     models = models_of_different_terms()
     method = MultipleShooting()
-    found = refine_together(models, batch, method=method)
+    found = refine_batch(models, batch, method=method)
     together = found.models
-    alone = refine_together(models, batch, method=method, points_per_batch=1).models
+    alone = refine_batch(models, batch, method=method, points_per_batch=1).models
     assert found.finished[0]
     assert found.loss[0] == pytest.approx(0.05**2 * 2.0, rel=0.5)
     for one, other, before in zip(together, alone, models, strict=True):
         np.testing.assert_allclose(one.coef, other.coef, rtol=1e-6)
         assert ((one.coef != 0.0) == (before.coef != 0.0)).all()
     assert not np.allclose(together[1].coef, models[1].coef, rtol=1e-3)
-    paths = follow_together(together, batch, method=method)
+    paths = smooth_batch(together, batch, method=method)
     for k, model in enumerate(together):
-        (path,) = follow_together([model], batch, method=method)
+        (path,) = smooth_batch([model], batch, method=method)
         np.testing.assert_allclose(paths[k], path, rtol=1e-8, equal_nan=True)
     # A fit of the starts alone is one of the noise alone, where the model is right.
     assert np.square(paths[0] - batch.data).mean() == pytest.approx(0.05**2 * 2.0, rel=0.5)
@@ -241,14 +246,14 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
         [PREY.trajectory()], states=("x", "y"), inputs=(), n_windows=3, window=50,
         rng=np.random.default_rng(0),
     )  # fmt: skip
-    found = refine_together([wild, sound], batch, method=MultipleShooting())
+    found = refine_batch([wild, sound], batch, method=MultipleShooting())
     kept, good = found.models
     assert found.finished.tolist() == [False, True]
     assert found.loss[0] == np.inf
     assert found.loss[1] < 1e-8
     np.testing.assert_array_equal(kept.coef, wild.coef)
     np.testing.assert_allclose(good.coef, sound.coef, rtol=1e-5, atol=1e-12)
-    paths = follow_together([wild, sound], batch, method=MultipleShooting())
+    paths = smooth_batch([wild, sound], batch, method=MultipleShooting())
     assert np.isnan(paths[0]).all()
     assert np.square(paths[1] - batch.data).mean() < 1e-8
 
@@ -258,11 +263,11 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
 ) -> None:
     off = replace(PREY.model, coef=1.2 * PREY.model.coef)
 
-    def unfinished(models: list[SparseModel], *_: object, **__: object) -> Together:
+    def unfinished(models: list[SparseModel], *_: object, **__: object) -> BatchRefinement:
         better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
-        return Together([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
+        return BatchRefinement([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
 
-    monkeypatch.setattr("ep2sindy.selection.refined.refine_together", unfinished)
+    monkeypatch.setattr("ep2sindy.selection.refined.refine_batch", unfinished)
     run = PREY.trajectory()
     batch = cut_windows(
         [run], states=("x", "y"), inputs=(), n_windows=3, window=50, rng=np.random.default_rng(0)
@@ -278,17 +283,17 @@ def test_what_cannot_be_judged_is_refused() -> None:
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of([run], PREY.model.library, choices)
     with pytest.raises(ValueError, match=r"at most 3 combinations .* make 4; lower depth"):
-        RefinedScore(max_combinations=3).scores(fronts)
+        scores_by(RefinedScore(max_combinations=3), fronts)
     with pytest.raises(ValueError, match=r"every state needs one front: \['x'\] came"):
-        RefinedScore().scores(fronts[:1])
+        scores_by(RefinedScore(), fronts[:1])
     alone = [replace(f, problem=replace(f.problem, trajectories=())) for f in fronts]
-    with pytest.raises(ValueError, match="the rows must know their trajectories"):
-        RefinedScore().scores(alone)
+    with pytest.raises(ValueError, match="to integrate, trajectories are needed: none came"):
+        scores_by(RefinedScore(), alone)
     with pytest.raises(ValueError, match="2 x 502 were asked of at most 1000; change window_s"):
-        RefinedScore(window_s=50.1).scores(fronts)
+        scores_by(RefinedScore(window_s=50.1), fronts)
     short = fronts_of([run.window(0, 9)], PREY.model.library, choices)
     with pytest.raises(ValueError, match="2 x 4 were asked of at most 9; .* longer records"):
-        RefinedScore().scores(short)
+        scores_by(RefinedScore(), short)
     with pytest.raises(ValueError, match="window_s must be positive: 0"):
         RefinedScore(window_s=0.0)
     with pytest.raises(ValueError, match="n_windows must be at least 2: 1 came"):

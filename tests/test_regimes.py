@@ -5,15 +5,15 @@ import pytest
 import xarray as xr
 from sklearn.metrics import adjusted_rand_score
 
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
-from ep2sindy.discovery.recipe import Recipe
 from ep2sindy.discovery.regimes import Regimes, find_regimes, group_points
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Serial
 from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.regions import REGIONS, STATES, RegionField, three_regions
+from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
 SIZES = {"fast": (8, 7, 600), "full": (20, 15, 1500)}
 ONE_EQUATION = dict.fromkeys(REGIONS, REGIONS["exit"])
@@ -34,11 +34,11 @@ def studied(size: str, noise: float, *, seed: int = 0, one_equation: bool = Fals
     search = PointSearch(
         states=STATES,
         library=truth.library,
-        recipe=Recipe(
+        method=Regression(
             formulation=Differential(),
             search=BestSubset(max_terms=5),
-            bootstraps=Bootstraps(n=8, n_culled=0),
             selection=EBIC(),
+            bootstraps=Bootstraps(n=8, n_culled=0),
         ),
         seed=seed,
     )

@@ -6,7 +6,7 @@ import xarray as xr
 
 from ep2sindy.data.fields import check_field
 from ep2sindy.model.model import coef_matrix
-from ep2sindy.synthetic.regions import INPUTS, REGIONS, STATES, RegionField, three_regions
+from ep2sindy.systems.regions import INPUTS, REGIONS, STATES, RegionField, three_regions
 from ep2sindy.thruster.parameters import Thruster
 
 DT_S = 1.5e-6

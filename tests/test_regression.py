@@ -12,7 +12,7 @@ from ep2sindy.regression.splits import BlockSplit, RandomSplit
 from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 
 def problem_of(theta: np.ndarray, target: np.ndarray, names: list[str]) -> RegressionRows:

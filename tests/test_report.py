@@ -182,7 +182,7 @@ def test_settings_read_in_words() -> None:
     settings = {
         "search": {"_target_": "ep2sindy.BestSubset", "max_terms": 4, "n_best": None},
         "data": {"path": "a.csv", "variables": variables},
-        "trajectory": {"_target_": "ep2sindy.ZoneAverage", "zone": zone, "states": ["x"]},
+        "trajectory": {"_target_": "ep2sindy.data.ZoneAverage", "zone": zone, "states": ["x"]},
         "rollout_s": 4.0e-3,
         "thesis": {"x": 1.0},
         "depth": None,

@@ -3,7 +3,7 @@ import pytest
 
 from ep2sindy.regression.differential import Differential
 from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
-from ep2sindy.synthetic.systems import lorenz
+from ep2sindy.systems.systems import lorenz
 
 
 def test_a_draw_has_the_size_asked_for() -> None:

@@ -172,8 +172,8 @@ RECORD = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
 
 def found(run: ep.Trajectory, rule: Any, search: Any) -> ep.Discovery:
     library = ep.polynomial(list(run.state_names), degree=2)
-    smoother = ep.SavitzkyGolay()
-    recipe = ep.Recipe(ep.Differential(smoother=smoother), search, ep.Bootstraps(n=0), rule)
+    smoother = ep.signals.SavitzkyGolay()
+    recipe = ep.Regression(ep.Differential(smoother=smoother), search, rule, ep.Bootstraps(n=0))
     return ep.discover(run, library, recipe)
 
 

@@ -5,14 +5,14 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.sampling import even_grid, is_even, one_about_each, stretches
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.synthetic.systems import System, lorenz, lotka_volterra, van_der_pol
+from ep2sindy.systems.systems import System, lorenz, lotka_volterra, van_der_pol
 
 EVERY_ROW = Weak(split=RandomSplit(0.0))
 RANDOM = np.cumsum(np.random.default_rng(3).exponential(size=400))
@@ -99,7 +99,7 @@ def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:
 def test_known_systems_are_found_with_30_percent_of_the_samples_missing(system: System) -> None:
     rng = np.random.default_rng(1)
     run = thinned(system.trajectory(noise=0.05, rng=rng), rng)
-    found = discover(run, system.model.library, Recipe(WeightedWeak()))
+    found = discover(run, system.model.library, Regression(WeightedWeak()))
     for state in system.model.states:
         truth = system.model.terms(state)
         assert found.model.terms(state) == pytest.approx(truth, rel=0.2)

@@ -10,7 +10,7 @@ from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection, selected
-from ep2sindy.synthetic.systems import lorenz
+from ep2sindy.systems.systems import lorenz
 
 BIC, LOG_KNEE = EBIC(gamma=0.0, coarsening=None), Knee(scale="log")
 RULES = [Knee(), LOG_KNEE, AICc(), BIC, EBIC(), EBIC(coarsening=None)]

@@ -12,10 +12,10 @@ import ep2sindy as ep
 from benchmarks.spoilt import spoilt
 from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.sensor import bounds_of
-from ep2sindy.estimation.lateness import delayed_gram, moved
-from ep2sindy.estimation.likelihood import Fit, Level, between, gram, seen
-from ep2sindy.estimation.problem import Problem, scaled_problem
-from ep2sindy.synthetic.systems import System
+from ep2sindy.estimation.lateness import delayed_gram, move_channels
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, between, gram, observe
+from ep2sindy.estimation.problem import EstimationProblem, scaled_problem
+from ep2sindy.systems.systems import System
 
 LIMITS = [(-np.inf, 0.3), (0.3, np.inf), (-1.0, 0.5), (2.0, 2.5), (-9.0, -8.0), (30.0, np.inf)]
 
@@ -49,7 +49,7 @@ def test_far_beyond_a_limit_it_is_as_good_as_a_value() -> None:
     assert squares[0] == pytest.approx(4e8, rel=1e-6)
 
 
-def clipped_problem() -> tuple[Problem, System]:
+def clipped_problem() -> tuple[EstimationProblem, System]:
     system, run = spoilt("lorenz", "clip 80", 0, 0.02)
     return scaled_problem([run], system.model.library), system
 
@@ -60,8 +60,8 @@ def test_residuals_beside_limits_are_the_slope_of_what_is_least() -> None:
     rng = np.random.default_rng(0)
     path = record.samples + 0.4 * rng.standard_normal(record.samples.shape)
     variance, small = np.full(path.shape, 0.01), 1e-6
-    here = seen(record, path, variance)
-    up, down = (seen(record, path + sign * small, variance).squares for sign in (1.0, -1.0))
+    here = observe(record, path, variance)
+    up, down = (observe(record, path + sign * small, variance).squares for sign in (1.0, -1.0))
     slope = np.nan_to_num(-2.0 * here.residuals / here.variance)
     told = np.isfinite(here.residuals)
     assert record.limits is not None
@@ -134,15 +134,15 @@ def test_samples_at_their_limits_do_not_lead_astray(kind: str) -> None:
 
 def test_a_regression_says_that_it_takes_limits_for_values() -> None:
     system, run = spoilt("van_der_pol", "clip 80", 0, 0.02)
-    found = ep.discover(run, system.model.library, ep.Recipe(ep.WeightedWeak()))
-    assert "rows take them for values; Recipe(search=Joint())" in found.remarks[0]
+    found = ep.discover(run, system.model.library, ep.Regression(ep.WeightedWeak()))
+    assert "rows take them for values; TrajectorySearch()" in found.remarks[0]
     assert "note: x is clipped" in repr(found)
 
 
 # Delays
 
 
-def late_record(delays: tuple[float, ...]) -> tuple[Problem, System]:
+def late_record(delays: tuple[float, ...]) -> tuple[EstimationProblem, System]:
     """Lorenz without noise, every channel read so many steps late."""
     system = ep.lorenz()
     t = np.arange(300) / 100.0
@@ -155,9 +155,9 @@ def late_record(delays: tuple[float, ...]) -> tuple[Problem, System]:
     return scaled_problem([run], system.model.library), system
 
 
-def fit_of_samples(problem: Problem, system: System) -> Fit:
+def fit_of_samples(problem: EstimationProblem, system: System) -> TrajectoryFit:
     free = system.model.coef[problem.column, problem.equation] / problem.to_SI
-    return Fit(tuple(r.samples for r in problem.records), free, free != 0.0, np.zeros(3))
+    return TrajectoryFit(tuple(r.samples for r in problem.records), free, free != 0.0, np.zeros(3))
 
 
 def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
@@ -188,7 +188,9 @@ def test_without_delays_the_gram_pair_is_the_plain_one() -> None:
 def test_moved_samples_are_those_of_the_time_they_belong_to() -> None:
     late, _ = late_record((0.0, 1.5, -2.25))
     right, _ = late_record((0.0, 0.0, 0.0))
-    (found,) = moved(late, [r.samples for r in late.records], np.array([0.0, 1.5, -2.25])).records
+    (found,) = move_channels(
+        late, [r.samples for r in late.records], np.array([0.0, 1.5, -2.25])
+    ).records
     assert len(found.samples) == 300 - 3 - 2  # 2.25 steps at the start, 1.5 at the end
     expected = right.records[0].samples[3:-2] * right.scale
     np.testing.assert_allclose(found.samples * late.scale, expected, atol=2e-3)
@@ -200,7 +202,7 @@ def test_a_late_channel_is_said_and_brought_forward_on_request(kind: str, delay:
     found = ep.discover(run, system.model.library)
     assert found.misfit.startswith("y comes ")
     assert found.model.covariance is None
-    aligned = ep.discover(run, system.model.library, ep.Recipe(search=ep.Joint(align=True)))
+    aligned = ep.discover(run, system.model.library, ep.TrajectorySearch(align=True))
     np.testing.assert_array_equal(aligned.model.coef != 0.0, system.model.coef != 0.0)
     assert not aligned.misfit
     assert aligned.estimate is not None
@@ -212,7 +214,7 @@ def test_the_first_channel_may_be_the_late_one() -> None:
     system, run = spoilt("lorenz", "none", 1, 0.02)
     states = np.column_stack([run.states[:-2, 0], run.states[2:, 1:]])
     late = ep.Trajectory(run.t[2:], states, run.state_names)
-    found = ep.estimate([late], system.model.library, ep.Joint(align=True))
+    found = ep.estimate([late], system.model.library, align=True)
     np.testing.assert_allclose(found.delays_s / run.dt_s, [2.0, 0.0, 0.0], atol=0.1)
     np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
 

@@ -10,7 +10,7 @@ from ep2sindy.figures.series import (
     spectrum_figure,
     trajectory_figure,
 )
-from ep2sindy.figures.style import OFF_SCALE, STOPS, exits, framing
+from ep2sindy.figures.style import OFF_SCALE, STOPS, find_exits, frame_limits
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel
@@ -88,20 +88,20 @@ def test_right_hand_sides_stand_in_the_order_of_the_data(oscillation: Trajectory
 
 def test_a_model_that_runs_away_does_not_shrink_the_rest() -> None:
     data = np.array([1.0, 3.0])
-    assert framing(data, np.array([1e9, -1e9])) == pytest.approx((-0.2, 4.2))
-    assert framing(data, np.array([2.0])) == pytest.approx((0.9, 3.1))
-    assert framing(data, np.empty(0)) == framing(data, data)
+    assert frame_limits(data, np.array([1e9, -1e9])) == pytest.approx((-0.2, 4.2))
+    assert frame_limits(data, np.array([2.0])) == pytest.approx((0.9, 3.1))
+    assert frame_limits(data, np.empty(0)) == frame_limits(data, data)
 
 
 def test_rare_values_at_the_ends_of_a_derivative_set_no_scale() -> None:
     data = np.sin(np.linspace(0.0, 20.0, 300))
     spiked = np.concatenate([[40.0], data, [-70.0]])
-    assert framing(spiked, data) == pytest.approx((-73.35 - 2.15, 45.5), rel=0.03)
-    low, high = framing(spiked, data, rare=0.01)
+    assert frame_limits(spiked, data) == pytest.approx((-73.35 - 2.15, 45.5), rel=0.03)
+    low, high = frame_limits(spiked, data, rare=0.01)
     assert -2.2 < low < -1.0 < 1.0 < high < 2.2
-    assert framing(data, data, rare=0.01) == framing(data, data)  # what is not rare stays
+    assert frame_limits(data, data, rare=0.01) == frame_limits(data, data)  # what is not rare stays
     step = np.append(np.zeros(200), 1.0)  # all but a rare value alike: nothing else to go by
-    assert framing(step, step, rare=0.01) == pytest.approx((-0.05, 1.05))
+    assert frame_limits(step, step, rare=0.01) == pytest.approx((-0.05, 1.05))
 
 
 def test_an_edge_spike_does_not_flatten_the_derivative(oscillation: Trajectory) -> None:
@@ -121,11 +121,11 @@ def test_an_edge_spike_does_not_flatten_the_derivative(oscillation: Trajectory) 
 
 def test_a_curve_leaves_a_panel_where_it_crosses_the_edge() -> None:
     x, y = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.array([0.0, 4.0, 0.0, -4.0, np.inf])
-    assert exits(x, y, (0.0, 4.0), (-1.0, 2.0)) == [(0.5, 2.0, 6), (2.25, -1.0, 7)]
-    assert exits(y, x, (-1.0, 2.0), (0.0, 4.0)) == [(2.0, 0.5, 5), (-1.0, 2.25, 4)]
-    assert exits(x, x, (0.0, 4.0), (0.0, 4.0)) == []
-    assert exits(x[:0], y[:0], (0.0, 4.0), (-1.0, 2.0)) == []
-    assert exits(np.array([0.0, 1.0]), np.array([9.0, 0.0]), (0.0, 1.0), (0.0, 2.0)) == [
+    assert find_exits(x, y, (0.0, 4.0), (-1.0, 2.0)) == [(0.5, 2.0, 6), (2.25, -1.0, 7)]
+    assert find_exits(y, x, (-1.0, 2.0), (0.0, 4.0)) == [(2.0, 0.5, 5), (-1.0, 2.25, 4)]
+    assert find_exits(x, x, (0.0, 4.0), (0.0, 4.0)) == []
+    assert find_exits(x[:0], y[:0], (0.0, 4.0), (-1.0, 2.0)) == []
+    assert find_exits(np.array([0.0, 1.0]), np.array([9.0, 0.0]), (0.0, 1.0), (0.0, 2.0)) == [
         (0.0, 2.0, 6)  # it begins outside
     ]
 

@@ -37,8 +37,8 @@ def through_scipy(rates: Products) -> Callable[[float, np.ndarray], np.ndarray]:
     return lambda t, y: rates(t, y)
 
 
-@pytest.mark.parametrize("system", [ep.lotka_volterra(), ep.van_der_pol(), ep.lorenz()])
-def test_compiled_steps_are_those_of_scipy(system: ep.System) -> None:
+@pytest.mark.parametrize("system", [ep.lotka_volterra(), ep.systems.van_der_pol(), ep.lorenz()])
+def test_compiled_steps_are_those_of_scipy(system: ep.systems.System) -> None:
     from scipy.integrate import DOP853
 
     rates, y = products(system.model), np.array(system.initial, dtype=np.float64)
@@ -63,8 +63,8 @@ def test_compiled_steps_are_those_of_scipy(system: ep.System) -> None:
             assert found[0] == pytest.approx(solver.t, rel=1e-6)
 
 
-@pytest.mark.parametrize("system", [ep.lotka_volterra(), ep.van_der_pol(), ep.lorenz()])
-def test_a_compiled_run_is_the_one_of_scipy(system: ep.System) -> None:
+@pytest.mark.parametrize("system", [ep.lotka_volterra(), ep.systems.van_der_pol(), ep.lorenz()])
+def test_a_compiled_run_is_the_one_of_scipy(system: ep.systems.System) -> None:
     """To what the tolerance leaves: rounding shifts steps, and a step's error with it."""
     rates, t = products(system.model), np.linspace(0.0, 8.0, 401)
     ours, theirs = (run(r, t, system.initial, rtol=1e-12) for r in (rates, through_scipy(rates)))
@@ -74,7 +74,7 @@ def test_a_compiled_run_is_the_one_of_scipy(system: ep.System) -> None:
 
 def test_the_dense_output_is_of_seventh_order() -> None:
     """Of the circle, between steps: half the step, an error of 2^-8, of which 2^-7 are asked."""
-    rates = products(ep.damped_oscillator(zeta=0.0, omega=1.0).model)
+    rates = products(ep.systems.damped_oscillator(zeta=0.0, omega=1.0).model)
     errors = []
     for step_s in (0.8, 0.4):
         y, at, room, slopes = np.array([1.0, 0.0]), np.empty(2), np.empty(2), np.zeros((16, 2))
@@ -112,7 +112,7 @@ def test_functions_of_ones_own_stay_with_scipy() -> None:
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_run_ends_after_its_time(compiled: bool) -> None:
     """A clock that goes on by a second each time that it is read."""
-    fast = products(ep.damped_oscillator(zeta=0.0, omega=1e6).model)
+    fast = products(ep.systems.damped_oscillator(zeta=0.0, omega=1e6).model)
     ticks = count()
     found = run(
         fast if compiled else through_scipy(fast),
@@ -127,7 +127,7 @@ def test_a_run_ends_after_its_time(compiled: bool) -> None:
 
 
 def test_the_limit_of_a_model_reaches_the_clock() -> None:
-    model = ep.damped_oscillator(zeta=0.0, omega=1e6).model
+    model = ep.systems.damped_oscillator(zeta=0.0, omega=1e6).model
     found = model.simulate(np.linspace(0.0, 10.0, 101), [1.0, 0.0], limit_s=0.0)
     assert found.diverged
     assert "s of work" in found.message
@@ -159,7 +159,7 @@ def test_what_falls_back_below_its_bound_ends_there_too(compiled: bool) -> None:
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_evaluations_are_counted_alike(compiled: bool) -> None:
-    fast = products(ep.damped_oscillator(zeta=0.0, omega=1e6).model)
+    fast = products(ep.systems.damped_oscillator(zeta=0.0, omega=1e6).model)
     rates, y = (fast if compiled else through_scipy(fast)), np.array([1.0, 0.0])
     message = run(rates, np.linspace(0.0, 10.0, 101), y).message
     calls = int(message.split(" evaluations")[0].split()[-1])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ep2sindy.synthetic.systems import (
+from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
     lorenz,

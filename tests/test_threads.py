@@ -13,12 +13,12 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from ep2sindy.app import main as program
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.threads import NUMBERS, one_thread
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.synthetic.systems import lotka_volterra
+from ep2sindy.systems.systems import lotka_volterra
 
 PREY = lotka_volterra()
 
@@ -67,14 +67,14 @@ def test_an_error_gives_the_threads_back() -> None:
 
 def test_a_refinement_runs_on_one_thread() -> None:
     from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-    from ep2sindy.refinement.problem import Fit, Problem
+    from ep2sindy.refinement.problem import RefinementFit, RefinementProblem
     from ep2sindy.refinement.refine import refine
 
     @dataclass(frozen=True)
     class WatchedFit(MultipleShooting):
         seen: list[tuple[int, int]] = field(default_factory=list)
 
-        def fit(self, problem: Problem) -> Fit:
+        def fit(self, problem: RefinementProblem) -> RefinementFit:
             self.seen.append(threads())
             return super().fit(problem)
 
@@ -88,7 +88,7 @@ def test_a_refinement_runs_on_one_thread() -> None:
 
 def test_a_discovery_runs_on_one_thread() -> None:
     rule = WatchedChoice()
-    discover(PREY.trajectory(), recipe=Recipe(WeightedWeak(), selection=rule))
+    discover(PREY.trajectory(), method=Regression(WeightedWeak(), selection=rule))
     assert rule.seen == [(1, 1)]
     assert threads() == (2, 2)
 

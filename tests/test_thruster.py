@@ -5,15 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from ep2sindy.thruster.axial.grid import cell_faces
+from benchmarks.landmark import landmark_thruster, read_landmark_rates
 from ep2sindy.thruster.axial.heavy_kernels import heavy_step
-from ep2sindy.thruster.axial.model import build_model, lengths_and_centres
+from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.axial.starts import GuessedStart
 from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, SERIES_SUMS, Sums
 from ep2sindy.thruster.closures import IONIZATION, TABLE_STEP_EV, closure_table
-from ep2sindy.thruster.landmark import landmark_thruster, read_landmark_rates
 from ep2sindy.thruster.magnetic_field import MagneticField
 from ep2sindy.thruster.parameters import OPERATING_POINTS, OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import TabulatedRates, XenonFits

@@ -6,8 +6,9 @@ import xarray as xr
 
 from ep2sindy.runtime import files
 from ep2sindy.thruster import cache
+from ep2sindy.thruster.axial import simulate as axial
+from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.axial.starts import ColdStart, SoftStart
-from ep2sindy.thruster.cache import simulate_cached
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 
 POINT = OperatingPoint(300.0, 5.0)
@@ -30,14 +31,14 @@ def small_runs(monkeypatch):
         attributes = {"parameters": "{}", "status": "steady"}
         return xr.Dataset(variables, {"time": np.arange(4.0)}, attributes)
 
-    monkeypatch.setattr(cache, "simulate_as", simulate_as)
+    monkeypatch.setattr(axial, "simulate_as", simulate_as)
     return done
 
 
 def test_second_call_reads_identical_values(tmp_path, monkeypatch):
-    first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated twice"))
-    second = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    first = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    monkeypatch.setattr(axial, "simulate_as", lambda *_, **__: pytest.fail("simulated twice"))
+    second = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
     xr.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
     assert all(first[name].dtype == second[name].dtype for name in first.variables)
     for name, value in first.attrs.items():
@@ -46,10 +47,10 @@ def test_second_call_reads_identical_values(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("size", [0, 1000])
 def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, small_runs, size):
-    first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    first = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
     (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:size])
-    again = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    again = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
     xr.testing.assert_identical(first.drop_attrs(), again.drop_attrs())
     assert len(small_runs) == 2
     printed = capsys.readouterr()
@@ -68,8 +69,8 @@ def test_truncated_file_is_reported_and_recomputed(tmp_path, capsys, small_runs,
     ],
 )
 def test_other_parameters_have_another_file(tmp_path, small_runs, thruster, point, change):
-    simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    simulate_cached(thruster, point, cache=tmp_path, **(BRIEF | change))
+    simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    simulate(thruster, point, cache=tmp_path, **(BRIEF | change))
     assert len(kept(tmp_path)) == len(small_runs) == 2
 
 
@@ -82,17 +83,17 @@ def test_other_parameters_have_another_file(tmp_path, small_runs, thruster, poin
 )
 def test_other_starts_have_another_file(tmp_path, small_runs, one, other):
     for initial in (one, other, one):
-        simulate_cached(Thruster(), POINT, cache=tmp_path, initial=initial, **BRIEF)
+        simulate(Thruster(), POINT, cache=tmp_path, initial=initial, **BRIEF)
     assert len(kept(tmp_path)) == 2
     assert small_runs == [(POINT, one), (POINT, other)]
 
 
 @pytest.mark.usefixtures("small_runs")
 def test_changed_source_has_another_file(tmp_path, monkeypatch):
-    simulate_cached(Thruster(), POINT, cache=tmp_path / "kept", **BRIEF)
+    simulate(Thruster(), POINT, cache=tmp_path / "kept", **BRIEF)
     (tmp_path / "closures.py").write_text("changed = True\n")
     monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
-    simulate_cached(Thruster(), POINT, cache=tmp_path / "kept", **BRIEF)
+    simulate(Thruster(), POINT, cache=tmp_path / "kept", **BRIEF)
     assert len(kept(tmp_path / "kept")) == 2
 
 
@@ -103,15 +104,15 @@ def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr(files.os, "replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+        simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
     assert kept(tmp_path) == []
 
 
 def test_a_cache_that_cannot_be_written_costs_no_simulation(tmp_path, monkeypatch):
     (tmp_path / "taken").write_text("a file")
-    monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
+    monkeypatch.setattr(axial, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
     with pytest.raises(OSError, match="taken could not be written .*make room there"):
-        simulate_cached(Thruster(), POINT, cache=tmp_path / "taken", **BRIEF)
+        simulate(Thruster(), POINT, cache=tmp_path / "taken", **BRIEF)
 
 
 def changed_value(field: xr.Dataset) -> xr.Dataset:
@@ -131,10 +132,10 @@ def changed_value(field: xr.Dataset) -> xr.Dataset:
 def test_a_kept_run_that_is_another_is_simulated_again(
     tmp_path, capsys, small_runs, change, reason
 ):
-    first = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    first = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
     (path,) = tmp_path.iterdir()
     cache.write(change(cache.read(path)), path)
-    again = simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    again = simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
     xr.testing.assert_identical(first.drop_attrs(), again.drop_attrs())
     assert len(small_runs) == 2
     printed = capsys.readouterr()
@@ -143,12 +144,12 @@ def test_a_kept_run_that_is_another_is_simulated_again(
 
 def test_a_run_under_the_name_of_another_is_not_taken_for_it(tmp_path, small_runs):
     hot = OperatingPoint(300.0, 5.0, neutral_speed=281.0)
-    simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+    simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
     (path,) = tmp_path.iterdir()
-    expected = simulate_cached(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
+    expected = simulate(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
     (other,) = (tmp_path / "other").iterdir()
     other.write_bytes(path.read_bytes())
-    found = simulate_cached(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
+    found = simulate(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
     assert [point for point, _ in small_runs] == [POINT, hot, hot]
     xr.testing.assert_identical(found.drop_attrs(), expected.drop_attrs())
 
@@ -160,6 +161,6 @@ def test_a_cache_that_takes_no_file_costs_no_simulation(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(cache, "TemporaryFile", refuse)
-    monkeypatch.setattr(cache, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
+    monkeypatch.setattr(axial, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
     with pytest.raises(OSError, match="No space left on device.*make room there"):
-        simulate_cached(Thruster(), POINT, cache=tmp_path, **BRIEF)
+        simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)

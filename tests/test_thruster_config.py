@@ -16,35 +16,35 @@ from tests.programs import ROOT, composed
 THRUSTERS = sorted(path.stem for path in (ROOT / "conf" / "thruster").glob("*.yaml"))
 
 
-def built(*overrides: str) -> ep.Thruster:
+def built(*overrides: str) -> ep.thruster.Thruster:
     node = composed("+exp=breathing", *overrides).data.thruster
     return bind(node, "data.thruster")()
 
 
 @pytest.mark.parametrize("name", THRUSTERS)
 def test_every_thruster_of_the_group_is_built(name: str) -> None:
-    assert isinstance(built(f"thruster={name}"), ep.Thruster)
+    assert isinstance(built(f"thruster={name}"), ep.thruster.Thruster)
 
 
 def test_the_default_is_the_default_of_the_class() -> None:
-    assert built() == ep.Thruster()
+    assert built() == ep.thruster.Thruster()
 
 
 def test_two_cycles_is_the_set_of_the_docs() -> None:
     made = built("thruster=two_cycles")
-    assert made.transport == ep.AnomalousTransport(1 / 300, 1 / 80, 3e-3)
+    assert made.transport == ep.thruster.AnomalousTransport(1 / 300, 1 / 80, 3e-3)
     assert made.series_resistance == 1.0
 
 
 def test_the_spt_100_has_its_published_field() -> None:
     made = built("thruster=spt100")
     assert max(made.magnetic_field.B) == pytest.approx(20.82e-3)  # at the exit
-    assert made.wall == ep.wall_material("BN-SiO2", electron_scale=1.0)
+    assert made.wall == ep.thruster.wall_material("BN-SiO2", electron_scale=1.0)
 
 
 def test_a_value_is_set_from_the_command_line() -> None:
     made = built("thruster=example", "data.thruster.propellant.name=argon")
-    assert made.propellant == ep.propellant("argon")
+    assert made.propellant == ep.thruster.propellant("argon")
 
 
 @pytest.mark.parametrize("experiment", ["parametric", "pointwise", "breathing"])
@@ -83,14 +83,14 @@ def test_a_mistake_is_named_with_its_place(override: str, message: str) -> None:
 
 OWN = """\
 # @package data.thruster
-_target_: ep2sindy.Thruster
+_target_: ep2sindy.thruster.Thruster
 channel_length: 0.02
 magnetic_field:
-  _target_: ep2sindy.read_magnetic_field
+  _target_: ep2sindy.thruster.read_magnetic_field
   path: B.csv
   exit_m: 0.02
 propellant:
-  _target_: ep2sindy.read_propellant
+  _target_: ep2sindy.thruster.read_propellant
   path: rates.csv
   mass_u: 126.9
   ionization_eV: 10.45
@@ -132,7 +132,7 @@ def test_a_file_without_its_first_line_says_so(tmp_path: Path) -> None:
     from ep2sindy.app.schema import study_of
 
     (tmp_path / "thruster").mkdir()
-    (tmp_path / "thruster" / "mine.yaml").write_text("_target_: ep2sindy.Thruster\n")
+    (tmp_path / "thruster" / "mine.yaml").write_text("_target_: ep2sindy.thruster.Thruster\n")
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         config = compose(
             "config",

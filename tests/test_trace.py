@@ -31,8 +31,8 @@ def sine(n_periods=20.0, *, per_period=60, mean=0.0):
 
 def test_the_growth_rate_is_that_of_the_signal():
     run = toda()
-    chosen = ep.embed(ep.trace(recorded(run.t, run.states[:, 0])))
-    assert chosen.embedding == ep.LogRate()
+    chosen = ep.signals.embed(ep.signals.from_one_signal(recorded(run.t, run.states[:, 0])))
+    assert chosen.embedding == ep.signals.LogRate()
     states = chosen.embedded.run
     assert states.state_names == ("x", "g")
     assert states.units == {"x": "A", "g": "s^-1"}
@@ -44,8 +44,8 @@ def test_the_growth_rate_is_that_of_the_signal():
 
 def test_the_toda_oscillator_is_found_with_its_known_equation_exact():
     run = toda()
-    found = ep.embed(ep.trace(recorded(run.t, run.states[:, 0]))).embedded
-    recipe = ep.Recipe(ep.Differential(ep.KalmanSmoother()), ep.BestSubset(max_terms=3))
+    found = ep.signals.embed(ep.signals.from_one_signal(recorded(run.t, run.states[:, 0]))).embedded
+    recipe = ep.Regression(ep.Differential(ep.signals.KalmanSmoother()), ep.BestSubset(max_terms=3))
     library = ep.polynomial(["x", "g"], degree=3)
     model = ep.discover(
         found.run, library, recipe, relations=found.relations, terms=found.terms
@@ -56,13 +56,13 @@ def test_the_toda_oscillator_is_found_with_its_known_equation_exact():
 
 
 def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
-    found = ep.embed(ep.trace(sine()))
-    assert found.embedding == ep.Rate()
+    found = ep.signals.embed(ep.signals.from_one_signal(sine()))
+    assert found.embedding == ep.signals.Rate()
     assert "either sign" in found.reason
     states = found.embedded
     assert states.run.units == {"x": "A", "v": "A s^-1"}
     library = ep.polynomial(["x", "v"], degree=2)
-    recipe = ep.Recipe(ep.Differential(ep.KalmanSmoother()), ep.BestSubset(max_terms=2))
+    recipe = ep.Regression(ep.Differential(ep.signals.KalmanSmoother()), ep.BestSubset(max_terms=2))
     model = ep.discover(
         states.run, library, recipe, relations=states.relations, terms=states.terms
     ).model
@@ -71,7 +71,7 @@ def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
 
 
 def test_delays_are_the_signal_a_part_of_a_period_before():
-    embedded = ep.Delays().embed(ep.trace(sine()))
+    embedded = ep.signals.Delays().embed(ep.signals.from_one_signal(sine()))
     x, before = embedded.run.states[40:-40].T
     phase = 2e3 * np.pi * embedded.run.t[40:-40]
     np.testing.assert_allclose(x, np.sin(phase), atol=0.01)
@@ -83,8 +83,10 @@ def test_delays_are_the_signal_a_part_of_a_period_before():
 def test_noise_that_drowns_the_derivative_asks_for_delays():
     clean = sine(60.0)
     noise = 1.5 * DROWNED * np.random.default_rng(0).standard_normal(clean.n_samples)
-    chosen = ep.embed(ep.trace(recorded(clean.t, clean.states[:, 0] + noise)))
-    assert chosen.embedding == ep.Delays()
+    chosen = ep.signals.embed(
+        ep.signals.from_one_signal(recorded(clean.t, clean.states[:, 0] + noise))
+    )
+    assert chosen.embedding == ep.signals.Delays()
     assert "noise" in chosen.reason
 
 
@@ -94,7 +96,7 @@ def test_a_trough_below_the_noise_keeps_its_logarithm():
     sigma = 0.02 * x.mean()
     noisy = x + sigma * np.random.default_rng(1).standard_normal(len(x))
     assert noisy.min() < 0.0  # its own logarithm does not exist
-    found = ep.LogSmoother().estimate(run.t, noisy)
+    found = ep.signals.LogSmoother().estimate(run.t, noisy)
     assert found.noise_std == pytest.approx(sigma, rel=0.05)  # 4800 samples: 1 %, and Laplace's
     high = x > 0.5
     assert np.abs(found.log - np.log(x))[high].max() < 0.1
@@ -104,7 +106,7 @@ def test_a_trough_below_the_noise_keeps_its_logarithm():
 
 def test_an_exponential_passes_the_log_smoother_unchanged():
     t = np.cumsum(np.random.default_rng(0).uniform(0.5, 1.5, 200)) / 200.0
-    found = ep.LogSmoother().estimate(t, 3.0 * np.exp(2.0 * t - t**2))
+    found = ep.signals.LogSmoother().estimate(t, 3.0 * np.exp(2.0 * t - t**2))
     # A parabola in the logarithm has no third derivative, on whatever steps.
     np.testing.assert_allclose(found.log, np.log(3.0) + 2.0 * t - t**2, atol=1e-5)
 
@@ -112,7 +114,7 @@ def test_an_exponential_passes_the_log_smoother_unchanged():
 def test_units_scale_the_log_smoother():
     run = toda()
     x = run.states[:, 0] * (1 + 0.01 * np.random.default_rng(0).standard_normal(len(run.t)))
-    one, other = (ep.LogSmoother().estimate(run.t, k * x) for k in (1.0, 1e-3))
+    one, other = (ep.signals.LogSmoother().estimate(run.t, k * x) for k in (1.0, 1e-3))
     np.testing.assert_allclose(one.rate, other.rate, rtol=1e-6, atol=1e-6)
     assert other.noise_std == pytest.approx(1e-3 * one.noise_std)
 
@@ -122,17 +124,17 @@ def test_what_is_faster_than_asked_counts_as_noise():
     assert ratio_bound(10.0, 1.0) == pytest.approx(-6.0)
     clean = sine(40.0, mean=3.0)
     x = clean.states[:, 0] + 0.1 * np.sin(25 * 2e3 * np.pi * clean.t)
-    fine = ep.LogRate(harmonics=7.0).embed(ep.trace(recorded(clean.t, x)))
+    fine = ep.signals.LogRate(harmonics=7.0).embed(ep.signals.from_one_signal(recorded(clean.t, x)))
     assert fine.noise_std > 0.05  # 0.1 / sqrt(2) of it
     assert np.abs(fine.run.states[20:-20, 0] - clean.states[20:-20, 0]).max() < 0.03
 
 
 def test_fine_samples_are_averaged_where_asked_and_offered_where_not():
     fine = sine(10.0, per_period=1000)
-    kept = ep.trace(fine)
+    kept = ep.signals.from_one_signal(fine)
     assert len(kept.x) == fine.n_samples
     assert "decimate=10" in kept.advice[0]
-    few = ep.trace(fine, decimate="auto")
+    few = ep.signals.from_one_signal(fine, decimate="auto")
     assert few.advice == ()
     assert len(few.x) == 1000
     assert "100 to a period" in few.done[0]
@@ -144,8 +146,8 @@ def test_fine_samples_are_averaged_where_asked_and_offered_where_not():
 def test_a_drift_is_offered_to_be_taken_out(mean):
     run = sine(20.0, mean=mean)
     drifting = recorded(run.t, run.states[:, 0] + 1.5 * run.t / run.t[-1])
-    assert "detrend=true" in ep.trace(drifting).advice[0]
-    straight = ep.trace(drifting, detrend=True)
+    assert "detrend=true" in ep.signals.from_one_signal(drifting).advice[0]
+    straight = ep.signals.from_one_signal(drifting, detrend=True)
     assert straight.advice == ()
     assert straight.x.mean() == pytest.approx(drifting.states.mean())
     line = np.polynomial.Polynomial.fit(run.t, straight.x, 1)(run.t)
@@ -154,7 +156,10 @@ def test_a_drift_is_offered_to_be_taken_out(mean):
 
 def test_a_signal_named_as_the_rate_keeps_its_name():
     run = recorded(*(lambda s: (s.t, s.states[:, 0]))(sine(mean=3.0)), name="g")
-    assert ep.embed(ep.trace(run)).embedded.run.state_names == ("g", "g_rate")
+    assert ep.signals.embed(ep.signals.from_one_signal(run)).embedded.run.state_names == (
+        "g",
+        "g_rate",
+    )
 
 
 @pytest.mark.parametrize(
@@ -170,33 +175,39 @@ def test_a_signal_named_as_the_rate_keeps_its_name():
 )
 def test_what_does_not_oscillate_is_refused(run, message):
     with pytest.raises(ValueError, match=message):
-        ep.trace(run)
+        ep.signals.from_one_signal(run)
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.9])
 def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
-    signal = ep.trace(sine(mean=mean))
+    signal = ep.signals.from_one_signal(sine(mean=mean))
     with pytest.raises(
         ValueError, match=r"needs a positive signal: x falls to .* \(embedding=rate"
     ):
-        ep.LogRate().embed(signal)
-    assert ep.embed(signal).embedding == ep.Rate()
+        ep.signals.LogRate().embed(signal)
+    assert ep.signals.embed(signal).embedding == ep.signals.Rate()
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ep.LogRate(0.5), "harmonics must be one or more: 0.5 came"),
-        (lambda: ep.Delays(share=1.0), "share of the period must lie between 0 and 1"),
-        (lambda: ep.LogSmoother(0.0), "finest_s must be a positive time"),
-        (lambda: ep.trace(sine(), decimate=0), "decimate must be auto, null or a whole number"),
-        (lambda: ep.trace(sine(), "y"), "unknown variable 'y'"),
-        (lambda: ep.trace(ep.lotka_volterra().trajectory()), "one signal must be named"),
+        (lambda: ep.signals.LogRate(0.5), "harmonics must be one or more: 0.5 came"),
+        (lambda: ep.signals.Delays(share=1.0), "share of the period must lie between 0 and 1"),
+        (lambda: ep.signals.LogSmoother(0.0), "finest_s must be a positive time"),
         (
-            lambda: ep.LogSmoother().estimate(np.arange(9.0), -np.ones(9)),
+            lambda: ep.signals.from_one_signal(sine(), decimate=0),
+            "decimate must be auto, null or a whole number",
+        ),
+        (lambda: ep.signals.from_one_signal(sine(), "y"), "unknown variable 'y'"),
+        (
+            lambda: ep.signals.from_one_signal(ep.lotka_volterra().trajectory()),
+            "one signal must be named",
+        ),
+        (
+            lambda: ep.signals.LogSmoother().estimate(np.arange(9.0), -np.ones(9)),
             "a signal must be positive for its logarithm",
         ),
-        (lambda: ep.LogSmoother().estimate(np.arange(5.0), np.ones(5)), "needs 8 samples"),
+        (lambda: ep.signals.LogSmoother().estimate(np.arange(5.0), np.ones(5)), "needs 8 samples"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(make, message):

@@ -7,19 +7,19 @@ import ep2sindy as ep
 
 
 def test_anomalous_coefficient_is_linear_across_the_exit():
-    c = ep.AnomalousTransport().at(np.array([-2e-3, -1.5e-3, 0.0, 1.5e-3, 2e-3]))
+    c = ep.thruster.AnomalousTransport().at(np.array([-2e-3, -1.5e-3, 0.0, 1.5e-3, 2e-3]))
     middle = 0.5 * (1 / 300 + 1 / 145)
     np.testing.assert_allclose(c, [1 / 300, 1 / 300, middle, 1 / 145, 1 / 145])
 
 
 def test_the_trough_keeps_its_share_and_no_more():
-    trough = ep.GaussianTransport(c_far=0.06, trough=0.1, center=1e-3, width=2e-3)
+    trough = ep.thruster.GaussianTransport(c_far=0.06, trough=0.1, center=1e-3, width=2e-3)
     c = trough.at(np.array([1e-3, 3e-3, -1.0]))
     np.testing.assert_allclose(c, [0.006, 0.06 * (1.0 - 0.9 * np.exp(-0.5)), 0.06])
 
 
 def test_points_are_met_and_the_way_between_is_a_power():
-    model = ep.MultiLogTransport(distance=[-0.02, 0.0, 0.01], c=[1e-2, 1e-3, 1e-1])
+    model = ep.thruster.MultiLogTransport(distance=[-0.02, 0.0, 0.01], c=[1e-2, 1e-3, 1e-1])
     np.testing.assert_allclose(model.at(np.array([-0.02, 0.0, 0.01])), [1e-2, 1e-3, 1e-1])
     np.testing.assert_allclose(model.at(np.array([-0.01, 0.005])), [10**-2.5, 1e-2])
     np.testing.assert_allclose(model.at(np.array([-1.0, 1.0])), [1e-2, 1e-1])
@@ -27,21 +27,42 @@ def test_points_are_met_and_the_way_between_is_a_power():
 
 def test_equal_points_are_the_two_zone_model_without_zones():
     distance = np.linspace(-0.025, 0.025, 11)
-    flat = ep.MultiLogTransport([-0.01, 0.01], [0.0125, 0.0125]).at(distance)
-    np.testing.assert_allclose(flat, ep.AnomalousTransport(0.0125, 0.0125).at(distance))
+    flat = ep.thruster.MultiLogTransport([-0.01, 0.01], [0.0125, 0.0125]).at(distance)
+    np.testing.assert_allclose(flat, ep.thruster.AnomalousTransport(0.0125, 0.0125).at(distance))
 
 
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: ep.GaussianTransport(trough=1.5), r"GaussianTransport\.trough must be at most 1"),
-        (lambda: ep.GaussianTransport(width=0.0), r"GaussianTransport\.width must be finite and"),
-        (lambda: ep.GaussianTransport(center=np.nan), r"center must be finite, got nan"),
-        (lambda: ep.MultiLogTransport([0.0], [0.1]), r"distance must hold two numbers or more"),
-        (lambda: ep.MultiLogTransport([0.0, 0.0], [0.1, 0.1]), r"must increase: 0 follows 0 at"),
-        (lambda: ep.MultiLogTransport([0.0, 1.0], [0.1]), r"c must have one number for each of"),
-        (lambda: ep.MultiLogTransport([0.0, 1.0], [0.1, np.nan]), r"c must be finite, got nan"),
-        (lambda: ep.MultiLogTransport([0.0, 1.0], [0.1, 0.0]), r"c must be positive at every"),
+        (
+            lambda: ep.thruster.GaussianTransport(trough=1.5),
+            r"GaussianTransport\.trough must be at most 1",
+        ),
+        (
+            lambda: ep.thruster.GaussianTransport(width=0.0),
+            r"GaussianTransport\.width must be finite and",
+        ),
+        (lambda: ep.thruster.GaussianTransport(center=np.nan), r"center must be finite, got nan"),
+        (
+            lambda: ep.thruster.MultiLogTransport([0.0], [0.1]),
+            r"distance must hold two numbers or more",
+        ),
+        (
+            lambda: ep.thruster.MultiLogTransport([0.0, 0.0], [0.1, 0.1]),
+            r"must increase: 0 follows 0 at",
+        ),
+        (
+            lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1]),
+            r"c must have one number for each of",
+        ),
+        (
+            lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1, np.nan]),
+            r"c must be finite, got nan",
+        ),
+        (
+            lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1, 0.0]),
+            r"c must be positive at every",
+        ),
     ],
 )
 def test_bad_transport_says_what_must_hold(build, message):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.types import RunMode
@@ -34,7 +35,7 @@ REFUSED = [
     "ep2sindy.studies.libraries._registered", "ep2sindy.EBIC.scores", "ep2sindy.EBIC.__init__",
     "ep2sindy._stubs.dotted_names", "ep2sindy.warnings", "ep2sindy.thruster.zone_balance",
     "ep2sindy.thruster.parameters.Thruster", "ep2sindy.prepare.import_module", "crop",
-    "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.r2", "prepare.crop",
+    "ep2sindy.ep2sindy.crop", "ep2sindy.thruster.crop", "ep2sindy.model.r2", "prepare.crop",
     "ep2sindy", "EBIC", "", "..EBIC", "../EBIC", "ep2sindy..EBIC", None, 1,
 ]  # fmt: skip
 
@@ -134,10 +135,14 @@ ELSEWHERE = [
     ({"hydra": {"overrides": {"task": ["output=/x"]}}}, "must not set hydra.overrides.task"),
     ({"scan": {"cache": ["/elsewhere"]}}, "scan.cache to a folder below"),
     ({"output": "a\0b"}, "output to a folder below"),
+    ({"output": {"a": "../elsewhere"}}, "output must be a folder's name"),  # its text has a ..
     ({"output": "../elsewhere"}, "output to a folder below the one that you start in"),
     ({"output": "${oc.env:PATH}"}, "output to a folder below"),
     ({"data": {"cache": "/elsewhere"}}, "data.cache to a folder below"),
-    ({"parallel": {"_target_": "ep2sindy.Dask", "address": "tcp://a:1"}}, "parallel.address, for"),
+    (
+        {"parallel": {"_target_": "ep2sindy.parallel.Dask", "address": "tcp://a:1"}},
+        "parallel.address, for",
+    ),
 ]
 
 
@@ -153,7 +158,7 @@ def test_a_file_cannot_say_what_must_be_typed(
     modes = (RunMode.RUN, RunMode.MULTIRUN) if "hydra" in said else (RunMode.RUN,)
     for mode in modes:
         with pytest.raises(ValueError, match=message):
-            loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], mode)
+            looked_at(tmp_path, ["+exp=theirs"], mode)
 
 
 def test_a_file_may_say_what_need_not_be_typed(tmp_path: Path) -> None:
@@ -162,6 +167,32 @@ def test_a_file_may_say_what_need_not_be_typed(tmp_path: Path) -> None:
     (tmp_path / "exp" / "theirs.yaml").write_text(text)
     found = loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
     assert found.seed == 3
+
+
+def looked_at(folder: Path, overrides: list[str], mode: RunMode) -> None:
+    """As Hydra's loader does, and then a job before all else."""
+    found = loader_of(folder).load_configuration("config", overrides, mode)
+    check_places(resolved(found), overrides)
+
+
+def test_what_is_typed_is_composed_once_for_all_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    composed: list[list[str]] = []
+    whole = ConfigLoaderImpl.load_configuration
+
+    def counted(loader: ConfigLoaderImpl, name: str, overrides: list[str], *how: Any, **more: Any):
+        composed.append(overrides)
+        return whole(loader, name, overrides, *how, **more)
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
+    loader = loader_of(tmp_path)
+    for seed in range(3):
+        loader.load_configuration("config", [f"seed={seed}", "hydra.mode=RUN"], RunMode.RUN)
+    mode = loader.load_configuration("config", ["seed=4"], RunMode.MULTIRUN, True, False)
+    assert mode.hydra.mode is None
+    assert len(composed) == 4
+    assert composed.count(["hydra.mode=RUN"]) == 1
 
 
 def loader_of(folder: Path) -> CheckedLoader:
@@ -231,7 +262,7 @@ def test_a_long_list_is_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_text_that_becomes_a_group_is_looked_at_as_one(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    said = {"data": "${oc.create:'{_target_: ep2sindy.simulate_cached, cache: ../elsewhere}'}"}
+    said = {"data": "${oc.create:'{_target_: ep2sindy.thruster.simulate, cache: ../elsewhere}'}"}
     with pytest.raises(ValueError, match=r"data\.cache to a folder below"):
         check_places(resolved(OmegaConf.create(said)), [])
     check_places(resolved(OmegaConf.create(said)), ["data.cache=../elsewhere"])

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from ep2sindy.report import provenance
+from ep2sindy.report.folder import commit
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.trust.user_code import leave_folder, load_user_module, own_packages
 
@@ -167,4 +167,4 @@ def test_a_folder_that_is_gone_is_told(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_commit_is_not_that_of_a_folder_around(tmp_path: Path) -> None:
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     (tmp_path / "inside").mkdir()
-    assert provenance.commit(tmp_path / "inside") == "unknown: not a git checkout"
+    assert commit(tmp_path / "inside") == "unknown: not a git checkout"

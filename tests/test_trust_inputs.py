@@ -28,13 +28,13 @@ def test_samples_of_a_simulation_are_counted_first(
 
 
 READERS: dict[str, Callable[[Path], object]] = {
-    "field.csv": lambda path: ep.read_magnetic_field(path, exit_m=0.025),
-    "gas.csv": lambda path: ep.read_propellant(
+    "field.csv": lambda path: ep.thruster.read_magnetic_field(path, exit_m=0.025),
+    "gas.csv": lambda path: ep.thruster.read_propellant(
         path, mass_u=131.3, ionization_eV=12.1, excitation_eV=8.3
     ),
-    "restart.nc": lambda path: ep.Restart(path),
-    "input.json": lambda path: ep.read_hallthruster_input(path),
-    "law.json": lambda path: ep.OperatingLaw.load(path),
+    "restart.nc": lambda path: ep.thruster.Restart(path),
+    "input.json": lambda path: ep.thruster.read_hallthruster_input(path),
+    "law.json": lambda path: ep.operating.OperatingLaw.load(path),
     "model.json": lambda path: ep.SparseModel.load(path),
 }
 DAMAGED = {
@@ -58,7 +58,7 @@ def test_a_law_that_cannot_be_is_refused(change: dict, tmp_path: Path) -> None:
     path = tmp_path / "law.json"
     path.write_text(json.dumps(LAW | change))
     with pytest.raises(ValueError, match="law.json: a law file must hold"):
-        ep.OperatingLaw.load(path)
+        ep.operating.OperatingLaw.load(path)
 
 
 RUN = {"summary.json": '{"experiment": "weak", "seed": 1}', "provenance.json": "{}",

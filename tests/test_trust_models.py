@@ -88,7 +88,7 @@ def test_gram_matrices_are_counted_before_they_are_made(monkeypatch: pytest.Monk
     """1771 terms in 32 bootstraps: 4 GB, where 2 GB are free."""
     monkeypatch.setattr(memory, "free_bytes", lambda: 2_000_000_000)
     run = ep.lorenz().trajectory(noise=0.05, rng=0)
-    recipe = ep.Recipe(ep.Differential(), ep.STLSQ(), ep.Bootstraps(n=32), ep.Knee())
+    recipe = ep.Regression(ep.Differential(), ep.STLSQ(), ep.Knee(), ep.Bootstraps(n=32))
     library = ep.polynomial(["x", "y", "z"], degree=20)
     assert len(library) == 1771
     with pytest.raises(ValueError, match=r"Gram matrices of 1771 terms in 32 boot.* GB are free"):

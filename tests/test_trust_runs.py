@@ -66,4 +66,4 @@ def test_what_is_fast_but_does_not_decay_is_given_up_after_its_evaluations() -> 
 
 def test_a_system_that_cannot_be_integrated_says_so() -> None:
     with pytest.raises(ValueError, match="must run for duration_s=20: the .*milder parameters"):
-        ep.van_der_pol(mu=-1e8).trajectory()
+        ep.systems.van_der_pol(mu=-1e8).trajectory()

@@ -10,7 +10,7 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.studies.simulated import DivergedError, amiss, is_simulation
-from ep2sindy.studies.source import FieldSource, Step
+from ep2sindy.studies.source import Step, open_prepared
 
 
 def simulation(status: str, n_samples: int = 2000) -> xr.Dataset:
@@ -41,11 +41,11 @@ class Data:
 STEPS: list[Step] = [
     lambda field: field / 2,
     lambda field: field.drop_attrs(),
-    lambda field: ep.crop(field, stop_s=4e-5),
-    lambda field: ep.decimate(field, factor=2),
-    lambda field: ep.low_pass(field, cutoff_Hz=1e5),
-    lambda field: ep.derive(field, name="twice", expression="2*n_i", units="m^-3"),
-    lambda field: ep.keep_where(field, condition="z > 0.015"),
+    lambda field: ep.prepare.crop(field, stop_s=4e-5),
+    lambda field: ep.prepare.decimate(field, factor=2),
+    lambda field: ep.prepare.low_pass(field, cutoff_Hz=1e5),
+    lambda field: ep.prepare.derive(field, name="twice", expression="2*n_i", units="m^-3"),
+    lambda field: ep.prepare.keep_where(field, condition="z > 0.015"),
     lambda field: xr.Dataset({"n_i": field["n_i"]}),
 ]
 
@@ -53,14 +53,14 @@ STEPS: list[Step] = [
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying", "transit"])
 @pytest.mark.parametrize("k", range(len(STEPS)))
 def test_no_step_makes_a_simulation_silent(status: str, k: int) -> None:
-    field = FieldSource(Data(simulation(status)), [STEPS[k]]).field()
+    field = open_prepared(Data(simulation(status)), [STEPS[k]])
     assert is_simulation(field.attrs)
     assert amiss(field.attrs)
 
 
 def test_a_run_that_broke_at_once_is_no_data() -> None:
     with pytest.raises(DivergedError, match="it diverged after 3; try shorter steps"):
-        FieldSource(Data(simulation("diverged", 3))).field()
+        open_prepared(Data(simulation("diverged", 3)), ())
 
 
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying"])

@@ -94,7 +94,7 @@ def test_what_may_be_read_in_two_ways_is_refused(case: str, tmp_path: Path) -> N
     text, message = AMBIGUOUS[case]
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(ValueError, match=f"(?s)a.csv cannot be read: .*{message}"):
-        ep.inspect(tmp_path / "a.csv")
+        ep.inspect_file(tmp_path / "a.csv")
 
 
 ROWS = "".join(f"{k},{2 * k}\n" for k in range(9))
@@ -127,7 +127,7 @@ def test_units_and_missing_samples_below_a_header_cost_no_name_and_no_row(
 
 def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,x,x\n" + "".join(f"{k},{k**2},7\n" for k in range(9)))
-    found = ep.inspect(tmp_path / "a.csv")
+    found = ep.inspect_file(tmp_path / "a.csv")
     assert [each.name for each in found.found.held] == ["t", "x.0", "x.1"]
     with pytest.raises(ValueError, match=r"no variable 'x' .*it holds t \(9\), x\.0 \(9\), x\.1"):
         ep.open_field(tmp_path / "a.csv", variables={"x": ep.Variable("x", "1")}, dt_s=1.0)
@@ -153,7 +153,7 @@ def test_arrays_of_one_name_are_refused(tmp_path: Path) -> None:
         with pytest.warns(UserWarning, match="Duplicate name"):
             archive.writestr("x.npy", content.getvalue())
     with pytest.raises(ValueError, match="a.npz .*names of their own: 'x' comes 2 times"):
-        ep.inspect(tmp_path / "a.npz")
+        ep.inspect_file(tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"a name must mean one value: 'a\.b' means two"):
         leaves({"a.b": 1, "a": {"b": 2}})
 
@@ -201,7 +201,7 @@ def test_packing_that_leaves_no_numbers_is_refused_with_its_attribute(
     path = written(tmp_path / f"a{kind}", **{key: value})
     with pytest.raises(ValueError, match=f"a{kind} cannot be read: {key} of 'x' must be a finite"):
         ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
-    assert ep.inspect(path).time is not None  # the other array is read
+    assert ep.inspect_file(path).time is not None  # the other array is read
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -217,7 +217,7 @@ def test_days_are_no_seconds(kind: str, time: str, tmp_path: Path) -> None:
     path = written(tmp_path / f"a{kind}", time=time)
     with pytest.raises(ValueError, match=f"the mapping says 's', the file '{time}'"):
         ep.open_field(path, variables=PLAIN, time=ep.Variable("time", "s"))
-    for given in (ep.Variable("time", "days"), ep.inspect(path).time):
+    for given in (ep.Variable("time", "days"), ep.inspect_file(path).time):
         field = ep.open_field(path, variables=PLAIN, time=given)
         assert field["time"].values[:2].tolist() == [0.0, 86400.0]
 
@@ -228,7 +228,7 @@ def test_null_spaces_of_hdf5_are_named(tmp_path: Path) -> None:
         file["y"] = np.arange(5.0) ** 2
         file["x"].attrs["units"] = h5py.Empty("S1")
         file["y"].attrs["_FillValue"] = h5py.Empty("f8")
-    held = {each.name: each for each in ep.inspect(tmp_path / "a.h5").found.held}
+    held = {each.name: each for each in ep.inspect_file(tmp_path / "a.h5").found.held}
     assert "'/n' is empty: its dataspace is null" in held["n"].problem
     assert "_FillValue of 'y' must be a number: the attribute is empty" in held["y"].problem
     assert (held["x"].unit, held["x"].problem) == ("", "")
@@ -247,7 +247,7 @@ def test_a_line_and_a_number_of_columns_are_counted_first(
     for text in texts.values():
         path.write_text(text)
         with pytest.raises(ValueError, match="a table may have up to 10000 columns, in lines of"):
-            ep.inspect(path)
+            ep.inspect_file(path)
 
 
 def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:
@@ -291,10 +291,10 @@ def test_it_is_refused_in_models_runs_inputs_records_and_stores(tmp_path: Path) 
         read_run(tmp_path, 0)
     record = tmp_path / "a.json"
     record.write_text(twice(json.dumps({"config": {}, "t": [0, 1], "x": [1, 2]}), "t"))
-    for read in (ep.inspect, ep.read_hallthruster_input):
+    for read in (ep.inspect_file, ep.thruster.read_hallthruster_input):
         with pytest.raises(ValueError, match="a.json .*each key once: 't' comes 2 times"):
             read(record)
     array = written(tmp_path / "a.zarr") / "x" / ".zarray"
     array.write_text(twice(array.read_text(), "dtype"))
     with pytest.raises(ValueError, match="a.zarr cannot be read: .*each key once: 'dtype'"):
-        ep.inspect(tmp_path / "a.zarr")
+        ep.inspect_file(tmp_path / "a.zarr")

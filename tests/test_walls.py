@@ -11,12 +11,12 @@ DISTANCE = np.array([-2e-3, -1e-3, 0.0, 1e-3, 2e-3])
 
 
 def test_wall_emission_stops_at_the_space_charge_limit():
-    emission = ep.SheathWall().emission(np.array([1.0, 10.0, 100.0]), M_XENON)
+    emission = ep.thruster.SheathWall().emission(np.array([1.0, 10.0, 100.0]), M_XENON)
     assert emission[0] < emission[1] < emission[2] == pytest.approx(0.983, abs=1e-3)
 
 
 def test_emission_without_limit_reaches_one_at_the_crossover():
-    wall = ep.SheathWall(yield_0=0.5, crossover_eV=30.0)
+    wall = ep.thruster.SheathWall(yield_0=0.5, crossover_eV=30.0)
     heavy = 1e6 * M_XENON  # moves the limit to one
     assert wall.emission(np.array(20.0), heavy) == pytest.approx(1.0, abs=1e-4)
 
@@ -27,17 +27,17 @@ def test_emission_without_limit_reaches_one_at_the_crossover():
      ("SiC", (43.0, 0.69)), ("SiO2", (18.0, 0.5))],
 )  # fmt: skip
 def test_materials_have_their_published_yields(name, published):
-    wall = ep.wall_material(name)
+    wall = ep.thruster.wall_material(name)
     assert (wall.crossover_eV, wall.yield_0) == published
 
 
 def test_the_default_wall_is_a_named_one():
-    assert ep.wall_material("BN-SiO2") == ep.SheathWall()
+    assert ep.thruster.wall_material("BN-SiO2") == ep.thruster.SheathWall()
 
 
 def test_losses_go_with_the_bohm_speed():
     """At the same emission, krypton's ions are faster by the root of the masses."""
-    wall = ep.SheathWall(yield_0=0.0, crossover_eV=1e9)
+    wall = ep.thruster.SheathWall(yield_0=0.0, crossover_eV=1e9)
     ratio = np.sqrt(M_XENON / M_KRYPTON)
     for loss in (wall.ion_loss, wall.collision):
         np.testing.assert_allclose(loss(T, 0.015, M_KRYPTON) / loss(T, 0.015, M_XENON), ratio)
@@ -45,22 +45,22 @@ def test_losses_go_with_the_bohm_speed():
 
 def test_power_is_what_electrons_carry_through_the_sheath():
     """Without emission: nu (2 T + phi), phi = T ln sqrt(m / (2 pi m_e))."""
-    wall = ep.SheathWall(yield_0=0.0, crossover_eV=1e12, electron_scale=1.0)
+    wall = ep.thruster.SheathWall(yield_0=0.0, crossover_eV=1e12, electron_scale=1.0)
     nu = 0.4965 * np.sqrt(E_CHARGE * T / M_XENON) / 0.015
     phi = T * np.log(np.sqrt(M_XENON / (2.0 * np.pi * M_ELECTRON)))
     np.testing.assert_allclose(wall.power(T, 0.015, M_XENON), nu * (2.0 * T + phi))
 
 
 def test_shares_change_at_the_exit_or_across_a_layer():
-    sharp = ep.SheathWall(plume_collisions=0.0, plume_power=0.5)
+    sharp = ep.thruster.SheathWall(plume_collisions=0.0, plume_power=0.5)
     np.testing.assert_array_equal(sharp.ion_weight(DISTANCE), [1, 1, 0, 0, 0])
     np.testing.assert_array_equal(sharp.power_weight(DISTANCE), [1, 1, 0.5, 0.5, 0.5])
-    soft = ep.SheathWall(plume_collisions=0.0, transition=4e-3)
+    soft = ep.thruster.SheathWall(plume_collisions=0.0, transition=4e-3)
     np.testing.assert_allclose(soft.collision_weight(DISTANCE), [1.0, 0.75, 0.5, 0.25, 0.0])
 
 
 def test_landmark_wall_is_the_benchmarks_formula():
-    wall = ep.ExponentialWall(power_weights=[0.5, 1.0])
+    wall = ep.thruster.ExponentialWall(power_weights=[0.5, 1.0])
     np.testing.assert_allclose(wall.power(T, 0.0, M_XENON), 1.5e7 * T * np.exp(-20.0 / (1.5 * T)))
     np.testing.assert_array_equal(wall.power_weight(DISTANCE), [0.5, 0.5, 1.0, 1.0, 1.0])
     np.testing.assert_array_equal(wall.collision_weight(DISTANCE), [1.0, 1.0, 0.0, 0.0, 0.0])
@@ -69,11 +69,20 @@ def test_landmark_wall_is_the_benchmarks_formula():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: ep.wall_material("glass"), r"there are walls of \['BN-SiO2', .* 'glass' came"),
-        (lambda: ep.SheathWall(crossover_eV=0.0), r"SheathWall\.crossover_eV must be finite and"),
-        (lambda: ep.SheathWall(yield_0=1.0), r"SheathWall\.yield_0 must be below 1"),
-        (lambda: ep.SheathWall(electron_scale=-1.0), r"electron_scale must be .* zero or more"),
-        (lambda: ep.ExponentialWall((1.0,)), r"power_weights must be two numbers"),
+        (
+            lambda: ep.thruster.wall_material("glass"),
+            r"there are walls of \['BN-SiO2', .* 'glass' came",
+        ),
+        (
+            lambda: ep.thruster.SheathWall(crossover_eV=0.0),
+            r"SheathWall\.crossover_eV must be finite and",
+        ),
+        (lambda: ep.thruster.SheathWall(yield_0=1.0), r"SheathWall\.yield_0 must be below 1"),
+        (
+            lambda: ep.thruster.SheathWall(electron_scale=-1.0),
+            r"electron_scale must be .* zero or more",
+        ),
+        (lambda: ep.thruster.ExponentialWall((1.0,)), r"power_weights must be two numbers"),
     ],
 )
 def test_bad_walls_say_what_must_hold(build, message):

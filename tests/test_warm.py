@@ -45,6 +45,14 @@ def test_kernels_are_compiled_again_where_a_source_has_changed(
     assert len(compilations) == 1
 
 
+def test_what_kernels_import_compiles_them_again_too() -> None:
+    """Columns of a table and constants stand in other files, and are compiled in."""
+    folder = compilation.PACKAGE / "thruster" / "axial"
+    watched = {name for name, *_ in compilation._stamp(folder)}
+    assert {"collision_kernels.py", "closures.py", "constants.py", "compilation.py"} <= watched
+    assert {"closures.py", "constants.py"} <= {path.name for path in compilation.sources()}
+
+
 def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None:
     compilations.insert(0, False)
     warm.warm()

@@ -5,7 +5,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.regression.rows import RegressionRows
@@ -16,7 +16,7 @@ from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.signals.smoothers import NoSmoothing
-from ep2sindy.synthetic.systems import (
+from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
     lorenz,
@@ -46,7 +46,9 @@ def found_in(run: Trajectory, library: Library, form: Weak = EVERY_ROW) -> Disco
     return discover(
         [run],
         library,
-        Recipe(formulation=form, search=BestSubset(), bootstraps=Bootstraps(n=0), selection=EBIC()),
+        Regression(
+            formulation=form, search=BestSubset(), selection=EBIC(), bootstraps=Bootstraps(n=0)
+        ),
         seed=np.random.default_rng(1),
     )
 

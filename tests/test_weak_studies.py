@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from ep2sindy.app.build import Configured
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.identified import frontier_figure
 from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.regression.differential import Differential
@@ -27,7 +27,7 @@ from ep2sindy.studies.weak_windows import (
     true_library,
     window_cells,
 )
-from ep2sindy.synthetic.systems import System, lotka_volterra
+from ep2sindy.systems.systems import System, lotka_volterra
 
 EVERY_ROW = RandomSplit(test_fraction=0.0)
 BOXES = Weak(
@@ -199,11 +199,11 @@ def test_errors_of_nothing_are_refused(settings: dict) -> None:
         coefficient_errors(sampled(), **(defaults | settings))
 
 
-VARIANT = Recipe(
+VARIANT = Regression(
     formulation=Differential(smooth_library=False),
     search=BestSubset(max_terms=3),
-    bootstraps=Bootstraps(n=0),
     selection=Knee(),
+    bootstraps=Bootstraps(n=0),
 )
 RESAMPLED = replace(VARIANT, bootstraps=Bootstraps(n=4))
 

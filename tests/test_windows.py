@@ -6,7 +6,7 @@ from ep2sindy.regression.test_functions import (
     Boxes,
     Bumps,
     WindowFunctions,
-    Windows,
+    WindowRows,
     bump_power,
     spectral_half_width,
 )
@@ -20,12 +20,12 @@ def uneven_times(n: int = 200) -> np.ndarray:
 
 def windows_of(
     functions: WindowFunctions, t: np.ndarray = T, x: np.ndarray | None = None
-) -> Windows:
+) -> WindowRows:
     x = np.sin(9.0 * t) if x is None else x
     return functions.windows(t, x, rng=np.random.default_rng(1))
 
 
-def half_widths(windows: Windows) -> np.ndarray:
+def half_widths(windows: WindowRows) -> np.ndarray:
     return (windows.last - windows.first) // 2
 
 

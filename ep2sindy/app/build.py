@@ -170,7 +170,7 @@ def bind_step(node: Any, place: str) -> Step:
     """A step of `prepare`; an argument that it does not know is refused here."""
     if not isinstance(node, DictConfig) or "_target_" not in node:
         raise ValueError(
-            f"{place} must be like {{_target_: ep2sindy.crop, start_s: 0}}: {node!r} came"
+            f"{place} must be like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: {node!r} came"
         )
     return bind(node, place, None)
 

@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> None:
     runs = [read_run(Path(path), k) for k, path in enumerate(given.run)]
     page = Path(given.page)
     template = Path(given.template) if given.template else TEMPLATES / "page.html"
-    sections = compared(runs, beside=page.parent)
+    sections = compare_runs(runs, beside=page.parent)
     html = page_html("Runs compared", sections, figures_of(runs), template=template)
     Screen().show(sections)
     write_text(page, html)
@@ -161,7 +161,7 @@ def link_to(run: ReadRun, beside: Path) -> str:
     return os.path.relpath(run.folder / "report.html", beside)
 
 
-def compared(runs: Sequence[ReadRun], *, beside: Path) -> list[Section]:
+def compare_runs(runs: Sequence[ReadRun], *, beside: Path) -> list[Section]:
     """Runs, settings that differ, headline figures, equations, figures. beside: of the page."""
     return [
         Section("Runs", [_runs(runs, beside), *_versions(runs)]),

@@ -22,11 +22,24 @@ ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks li
 and what is missing for which experiment. Several files, or a pattern in quotes, are several
 records of one kind."""
 
+# Variables that experiments on files need beside time; those that take any need none of ours.
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "breathing": ("n_i", "n_n", "R_ion", "u_iz"),
+    "weak": ("n_i", "n_n"),
+    "constrained": ("n_i", "n_n", "R_ion", "u_iz"),
+    "ils": ("n_i", "n_n"),
+    "parametric": ("n_i", "n_n", "R_ion", "u_iz"),
+    "predict": ("n_i", "n_n"),
+    "pointwise": ("n_i", "n_n", "R_ion", "u_iz"),
+    "trace": (),
+    "discover": (),
+}
+
 
 def main(arguments: Sequence[str], conf: Path) -> None:
     """conf: the package's configs.
 
-    Raises ValueError as `ep2sindy.inspect` does, and for a config that is there already.
+    Raises ValueError as `ep2sindy.inspect_file` does, and for a config that is there already.
     """
     parser = argparse.ArgumentParser("ep2sindy inspect", description=ABOUT)
     parser.add_argument("path", nargs="+", help="file, folder.zarr or pattern")
@@ -41,7 +54,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     paths = files_of(given.path)
     found = [inspect_file(path) for path in paths]
     for each in found:
-        say("\n".join(each.lines()) + "\n")
+        say("\n".join(each.lines(experiments(each))) + "\n")
     name = re.sub(r"\W+", "_", given.write or Path(paths[0]).stem).strip("_")
     if given.write is None:
         say(f"--write makes conf/data/{name}.yaml of it, for data={name}")
@@ -51,6 +64,17 @@ def main(arguments: Sequence[str], conf: Path) -> None:
     write_text(path, config_text(found, paths))
     say(f"written: {path}; next, for example:")
     say("\n".join(f"  {command}" for command in commands(found[0], name)))
+
+
+def experiments(found: Inspection) -> list[str]:
+    """A line for those that can be run, and one for those that lack the same variables."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for name, needed in NEEDS.items():
+        groups.setdefault(found.lacking(needed), []).append(f"+exp={name}")
+    return [
+        f"{'missing ' + ', '.join(lacking) if lacking else 'all there'} for {', '.join(names)}"
+        for lacking, names in groups.items()
+    ]
 
 
 def own_config(name: str, conf: Path) -> Path:
@@ -118,12 +142,11 @@ def _word(found: Inspection, name: str) -> str:
 
 def commands(found: Inspection, name: str) -> list[str]:
     """What can be run with it, with a word in capitals for what only the user knows."""
-    lacking = found.missing()
     data = [f"data={name}"]
     if found.time is None and found.dt_s is None:
         data.append("data.dt_s=STEP")
     lines = []
-    if not lacking["breathing"]:
+    if not found.lacking(NEEDS["breathing"]):
         steps = ",".join(f"{{_target_:{step}}}" for step in found.prepare.values())
         prepare = [f"prepare=[{steps}]"] if steps else []
         zone = [] if found.z is None or found.channel_m else ["data.channel_m=LENGTH"]

@@ -17,6 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
+from ep2sindy.app.safety import check_output
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
@@ -46,6 +47,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     overrides: what was set on the command line; one that the study does not use is an error.
     """
     check_common(config)
+    formats = formats_of(config)
     with Bars().stage(3, "step", "loading") as advance:
         check_targets(config)
         advance(1)
@@ -57,7 +59,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     warm()
     with started_run(config) as run:
         outcome = study.compute(run)
-        headline = write(run, outcome, study, formats_of(config))
+        headline = write(run, outcome, study, formats)
     return Finished(run.folder.path, headline)
 
 
@@ -105,10 +107,7 @@ def check_common(config: DictConfig) -> None:
         raise ValueError(
             f"experiment names a folder: letters, digits and _, not {config.experiment!r}"
         )
-    output = config.get("output")
-    if not isinstance(output, str) or not output:
-        raise ValueError(f"output must be a folder's name: {output!r} came")
-    formats_of(config)
+    check_output(config)
 
 
 def formats_of(config: DictConfig) -> list[str]:

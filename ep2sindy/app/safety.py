@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +43,16 @@ WORD = re.compile(r"[^\s.,:$'\"(){}\[\]]+")
 
 
 class CheckedLoader(ConfigLoaderImpl):
-    """Hydra's loader of configs, which looks at each before anything of it is obeyed."""
+    """Hydra's loader of configs, which looks at each before anything of it is obeyed.
+
+    What is typed is told from what files say by composing once more without the folders: a file
+    reaches `hydra:` by keys, packages, defaults and names of groups, and the result knows them all.
+    """
 
     def __init__(self, config_search_path: ConfigSearchPath) -> None:
         super().__init__(config_search_path)
         self.repository = CheckedFiles(config_search_path)
+        self._without_files: dict[tuple[Any, ...], DictConfig] = {}  # jobs of a sweep share it
 
     def load_configuration(
         self,
@@ -56,19 +62,30 @@ class CheckedLoader(ConfigLoaderImpl):
         from_shell: bool = True,
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
-        how = (run_mode, from_shell, validate_sweep_overrides)
         hydras = [text for text in overrides if re.match(r"[+~]*hydra[./=]", text)]
-        without = _without_folders(self, hydras).load_configuration(config_name, hydras, *how)
+        typed = partial(self._typed, config_name, hydras, run_mode, from_shell)
         if not validate_sweep_overrides:  # Hydra asks for its mode alone, before it composes
-            return without
-        found = super().load_configuration(config_name, overrides, *how)
-        typed = _settings(without)
-        typed["overrides.task"] = [text for text in overrides if text not in hydras]
-        check_hydra(_settings(found), typed)
-        written = _written(found)
-        check_references(written)
-        check_places(_places(found, written), overrides)
+            return typed() if hydras else OmegaConf.create({"hydra": {"mode": None}})
+        found = super().load_configuration(config_name, overrides, run_mode, from_shell)
+        tasks = [text for text in overrides if text not in hydras]
+        check_hydra(_settings(found), _settings(typed()) | {"overrides.task": tasks})
+        check_references(_written(found))
+        if "output" in found:  # Hydra makes a sweep's folder in it; all others a job looks at, for
+            check_output(found)  # not before it begins can all that a config says be resolved
+            check_places([("output", found.output)], overrides)
         return found
+
+    def _typed(
+        self, config_name: str | None, hydras: list[str], run_mode: RunMode, from_shell: bool
+    ) -> DictConfig:
+        """What the command line and the package say without files from elsewhere."""
+        key = (run_mode, *hydras)
+        if key not in self._without_files:
+            loader = _without_folders(self, hydras)
+            self._without_files[key] = loader.load_configuration(
+                config_name, hydras, run_mode, from_shell, validate_sweep_overrides=False
+            )
+        return self._without_files[key]
 
 
 def _without_folders(loader: ConfigLoaderImpl, hydras: Sequence[str]) -> ConfigLoaderImpl:
@@ -115,6 +132,13 @@ def check_hydra(found: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
             )
 
 
+def check_output(config: DictConfig) -> None:
+    """Raise ValueError for an output that is no text: of a group, its text would be a folder."""
+    output = config.get("output")
+    if not isinstance(output, str) or not output:
+        raise ValueError(f"output must be a folder's name: {output!r} came")
+
+
 def check_places(settings: Iterable[tuple[str, Any]], overrides: Sequence[str]) -> None:
     """Raise ValueError for a folder elsewhere, or a server, that nobody has typed.
 
@@ -154,13 +178,6 @@ def _written(config: DictConfig) -> dict[str, Any]:
     """All that a config says but Hydra's own, as it is written."""
     written: Any = OmegaConf.to_container(config, resolve=False)
     return {key: value for key, value in written.items() if key != "hydra"}
-
-
-def _places(config: DictConfig, written: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """The same before all of it can be resolved: Hydra makes a folder first."""
-    for place, value in _leaves(written, ""):
-        known = place.rpartition(".")[2] in FOLDERS + SERVERS and "${" in str(value)
-        yield place, OmegaConf.select(config, place) if known else value
 
 
 def _is_typed(place: str, overrides: Sequence[str]) -> bool:

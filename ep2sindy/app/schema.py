@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy.app.build import child, hints_of, is_required, value_of
-from ep2sindy.discovery.recipe import Recipe
-from ep2sindy.studies.source import FieldSource, Source
+from ep2sindy.app.build import (
+    child,
+    hints_of,
+    is_required,
+    value_of,
+)
+from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.discovery.recipe import Recipe, method_of
+from ep2sindy.studies.source import Source
 
 # Keys of conf/config.yaml that every run has.
 COMMON = ("experiment", "study", "seed", "output", "figures")
-# Fields of these types take their own fields from the top level: a recipe is five groups.
-GATHERED = (Recipe, Source, FieldSource)
+# Fields of these types are made of groups at the top level, by what stands beside them: a method is
+# five groups. Recipe is the old way to write AnyMethod, for one version more.
+GATHERED: Mapping[Any, Callable[..., Any]] = {
+    AnyMethod: method_of, Recipe: method_of, Source: Source,
+}  # fmt: skip
 # Groups of conf/config.yaml that a study may leave aside.
 GROUPS = (
     "data", "prepare", "trajectory", "formulation", "search", "bootstraps", "selection", "depth",
@@ -23,9 +33,9 @@ GROUPS = (
 
 def keys_of(study: type) -> set[str]:
     """The top-level keys of the config that a study takes."""
-    found = set()
+    found: set[str] = set()
     for name, kind in hints_of(study).items():
-        found |= keys_of(kind) if kind in GATHERED else {name}
+        found |= set(_groups(kind)) if kind in GATHERED else {name}
     return found
 
 
@@ -70,11 +80,20 @@ def _filled(study: type, config: DictConfig) -> Any:
     return study(**arguments)
 
 
-def _gathered(kind: type, config: DictConfig) -> Any:
-    """A recipe or source from its groups: one left out (`~search`) must not turn into a default."""
-    if lacking := [name for name in hints_of(kind) if name not in config]:
+def _gathered(kind: Any, config: DictConfig) -> Any:
+    """A method or source from its groups: one left out (`~search`) must not turn into a default."""
+    groups = _groups(kind)
+    if lacking := [name for name in groups if name not in config]:
         raise ValueError(
             f"the config of this experiment must have {lacking[0]!r}: choose one with "
             f"{lacking[0]}=NAME, see --help"
         )
-    return _filled(kind, config)
+    return GATHERED[kind](
+        **{name: value_of(each, child(config, name, name), name) for name, each in groups.items()}
+    )
+
+
+def _groups(kind: Any) -> dict[str, Any]:
+    """The groups that make a value of this kind, each with the kind that it must be."""
+    hints = get_type_hints(GATHERED[kind], include_extras=True)
+    return {name: hint for name, hint in hints.items() if name != "return"}

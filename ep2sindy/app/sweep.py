@@ -77,7 +77,7 @@ def _index(records: Records) -> str:
 
 def write_sweep_page(sweep: Path, records: Records) -> None:
     """`index.html` beside `index.csv`; links go to the pages of the jobs, and are relative."""
-    varied, shared = parted(records)
+    varied, shared = split_varied(records)
     jobs = [Table(_jobs(sweep, records, varied), note=f"In all jobs: {' '.join(shared) or '-'}.")]
     figures = _figures(records, varied)
     errors: list[Block] = [
@@ -91,7 +91,7 @@ def write_sweep_page(sweep: Path, records: Records) -> None:
     write_text(sweep / "index.html", page_html(f"Sweep of {len(records)} jobs", sections, figures))
 
 
-def parted(records: Records) -> tuple[dict[str, list[str]], list[str]]:
+def split_varied(records: Records) -> tuple[dict[str, list[str]], list[str]]:
     """What differs between jobs, as values by key, one per job; and what all have in common."""
     everywhere = set.intersection(*(set(record["overrides"]) for record in records))
     keys = dict.fromkeys(

@@ -80,19 +80,23 @@ def _search() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     found = ep.discover(run)
     for method in (ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset()):
-        ep.discover(run, recipe=ep.Recipe(ep.Differential(), method, ep.Bootstraps(n=2), ep.Knee()))
+        ep.discover(
+            run, method=ep.Regression(ep.Differential(), method, ep.Knee(), ep.Bootstraps(n=2))
+        )
     found.model.simulate(run.t, run.states[0])
 
 
 def _refinement() -> None:
     """Refinement, trial runs, and the simulator along the axis."""
-    point, step_s = ep.OperatingPoint(300.0, 5.0), 1e-7
+    point, step_s = ep.thruster.OperatingPoint(300.0, 5.0), 1e-7
     for n_samples in (20, 60):  # in one piece, and in several, which are slices
-        brief = partial(ep.simulate, duration_s=n_samples * step_s, warm_up_s=0.0, sample_s=step_s)
-        brief(ep.Thruster(), point, n_cells=20, progress=False)
+        brief = partial(
+            ep.thruster.simulate, duration_s=n_samples * step_s, warm_up_s=0.0, sample_s=step_s
+        )
+        brief(ep.thruster.Thruster(), point, n_cells=20, progress=False)
     system = ep.lotka_volterra()
-    for step in (ep.RungeKutta(), ep.HermiteSimpson()):
-        method = ep.MultipleShooting(step=step)
+    for step in (ep.refinement.RungeKutta(), ep.refinement.HermiteSimpson()):
+        method = ep.refinement.MultipleShooting(step=step)
         ep.refine(system.model, [system.trajectory()], window=20, n_windows=2, method=method, rng=0)
     model = system.model
     windows = DrivenWindows.free(np.ones((2, 1)), step_s=0.1, n_samples=3)
@@ -104,7 +108,7 @@ def _refinement() -> None:
 def _plane() -> None:
     """The (z, r) simulator."""
     step_s = 1e-6
-    brief = partial(ep.simulate_2d, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
+    brief = partial(ep.thruster.simulate_2d, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
     brief(n_z=12, n_r=12, progress=False)
 
 

@@ -52,7 +52,7 @@ def constrained_fit(
         for (state, term), sign in (signs or {}).items()
     ]
     equations = weighted_equations(problems, constraint)
-    coef, covariance = _solved(equations, constraint, _bounds(constraint, signed))
+    coef, covariance = _solve(equations, constraint, _bounds(constraint, signed))
     for k, sign in signed:
         if sign * coef[k] <= ROUNDING * abs(constraint.d[k]):
             coef[k] = 0.0  # at its bound, but for rounding
@@ -124,13 +124,13 @@ class WeightedEquation:
         """Terms and target, whose residuals have variance 1 if these are the coefficients."""
         scale = self.problem.coef_scale(self.number)[self.terms]
         if self.problem.noisy is not None:
-            white = _whitened(self.problem, self.terms, coef / scale, n_steps=0)
+            white = _whiten(self.problem, self.terms, coef / scale, n_steps=0)
             return white.theta[:, self.terms] / scale, white.target
         theta = self.problem.train_theta[:, self.terms] / self.std
         return theta / scale, self.problem.train_target(self.number) / self.std
 
 
-def _whitened(
+def _whiten(
     problem: RegressionRows, terms: np.ndarray, coef: np.ndarray, *, n_steps: int
 ) -> WhitenedRows:
     mask, full = np.zeros(len(problem.library), dtype=np.bool_), np.zeros(len(problem.library))
@@ -164,7 +164,7 @@ def _fitted_alone(
     variance = np.square(target - theta @ start).sum() / max(len(target) - len(terms), 1)
     least = LEAST_RESIDUAL**2 * np.square(target).mean()
     if problem.noisy is not None:
-        white = _whitened(problem, terms, start, n_steps=8)
+        white = _whiten(problem, terms, start, n_steps=8)
         problem = replace(problem, noisy=replace(problem.noisy, smoothed=white.corrected))
         start = np.linalg.lstsq(white.theta[:, terms], white.target, rcond=None)[0]
     return WeightedEquation(
@@ -177,7 +177,7 @@ def _fitted_alone(
     )
 
 
-def _solved(
+def _solve(
     equations: Sequence[WeightedEquation],
     constraint: Constraint,
     bounds: Float[np.ndarray, "2 free"],

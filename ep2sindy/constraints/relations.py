@@ -1,6 +1,6 @@
 """Linear relations between coefficients, solved once and for all: coef = C free + d.
 
-Some of the coefficients may be absent: then `binding` and `completed` say what relations ask of a
+Some of the coefficients may be absent: then `binding` and `complete` say what relations ask of a
 support.
 """
 
@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import NUMBER, PRODUCT, VARIABLE
+from ep2sindy.runtime.arrays import read_only
 
 ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
 
@@ -182,8 +182,8 @@ def constraint(
             named[k] = None
             row[k] += factor
             size[k] += abs(factor)
-        factors = _rounded(row @ C, size @ np.abs(C))
-        value = _rounded(relation.value - row @ d, abs(relation.value) + size @ np.abs(d))
+        factors = _round(row @ C, size @ np.abs(C))
+        value = _round(relation.value - row @ d, abs(relation.value) + size @ np.abs(d))
         if not factors.any():
             why = "contradicts" if value else "is redundant: it is implied by"
             others = f"the earlier ones, {earlier}" if earlier else "arithmetic alone"
@@ -192,8 +192,8 @@ def constraint(
         last = [k for k in named if abs(factors[k]) >= largest][-1]
         change = np.outer(C[:, last], -factors / factors[last])
         shift = C[:, last] * (value / factors[last])
-        C = _rounded(C + change, np.abs(C) + np.abs(change))
-        d = _rounded(d + shift, np.abs(d) + np.abs(shift))
+        C = _round(C + change, np.abs(C) + np.abs(change))
+        d = _round(d + shift, np.abs(d) + np.abs(shift))
         C[:, last], free[last] = 0.0, False
         earlier.append(relation.text)
     return Constraint(tuple(support), coefficients, C[:, free], d, np.flatnonzero(free))
@@ -219,7 +219,7 @@ def place_of(
     )
 
 
-def _rounded(sums: np.ndarray | float, sizes: np.ndarray | float) -> np.ndarray:
+def _round(sums: np.ndarray | float, sizes: np.ndarray | float) -> np.ndarray:
     """Sums of numbers with these sizes in all; zero where they cancel but for rounding."""
     return np.where(np.abs(sums) <= ROUNDING * sizes, 0.0, sums)
 
@@ -247,7 +247,7 @@ def binding(
     return tuple(found)
 
 
-def completed(
+def complete(
     masks: Bool[np.ndarray, "supports terms"],
     library: Library,
     equation: str,

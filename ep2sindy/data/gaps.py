@@ -33,7 +33,8 @@ def present_rows(columns: Mapping[str, Float[np.ndarray, " _"]]) -> Bool[np.ndar
         counts = ", ".join(f"{name} lacks {int(a.sum())}" for name, a in lacking.items() if a.any())
         raise ValueError(
             f"two samples or more must hold all of {list(columns)}: of {len(present)} samples "
-            f"{counts}, and {int(present.sum())} are left; fill them first (ep2sindy.interpolate)"
+            f"{counts}, and {int(present.sum())} are left; fill them first "
+            "(ep2sindy.prepare.interpolate)"
         )
     return present
 
@@ -56,5 +57,5 @@ def gap_words(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
     return (
         f"{n_samples - len(t)} of {n_samples} samples are missing (NaN) and left out; the longest "
         f"gap is {longest:.4g} s, {longest / usual:.0f} steps: crop the record if that is long "
-        "beside its period, or fill it with ep2sindy.interpolate"
+        "beside its period, or fill it with ep2sindy.prepare.interpolate"
     )

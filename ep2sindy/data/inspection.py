@@ -1,10 +1,10 @@
-"""What a file holds, what it was taken for, and what is missing for what."""
+"""What a file holds, what it was taken for, and what is lacking."""
 
 from __future__ import annotations
 
 import html
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,19 +15,6 @@ from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.recognition import Recognised, recognised
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
-
-# What the experiments need beside time; those that take any variables are not here.
-NEEDS: Mapping[str, tuple[str, ...]] = {
-    "breathing": ("n_i", "n_n", "R_ion", "u_iz"),
-    "weak": ("n_i", "n_n"),
-    "constrained": ("n_i", "n_n", "R_ion", "u_iz"),
-    "ils": ("n_i", "n_n"),
-    "parametric": ("n_i", "n_n", "R_ion", "u_iz"),
-    "predict": ("n_i", "n_n"),
-    "pointwise": ("n_i", "n_n", "R_ion", "u_iz"),
-    "trace": (),
-    "discover": (),
-}
 
 HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
 
@@ -77,10 +64,10 @@ class Inspection:
             if source in have and name not in have
         }
 
-    def missing(self) -> dict[str, tuple[str, ...]]:
-        """Experiment -> variables that it needs, and that the file neither holds nor yields."""
+    def lacking(self, needed: Iterable[str]) -> tuple[str, ...]:
+        """Those of some variables that the file neither holds nor yields by a step of `prepare`."""
         have = {*self.found.variables, *self.prepare}
-        return {name: tuple(v for v in needs if v not in have) for name, needs in NEEDS.items()}
+        return tuple(name for name in needed if name not in have)
 
     def is_trace(self, variable: Variable) -> bool:
         """Whether a variable has only time, varies, and does not rise all along."""
@@ -109,20 +96,10 @@ class Inspection:
             )
         return texts
 
-    def experiments(self) -> list[str]:
-        """A line for those that can be run, and one for those that lack the same variables."""
-        groups: dict[tuple[str, ...], list[str]] = {}
-        for name, lacking in self.missing().items():
-            groups.setdefault(lacking, []).append(f"+exp={name}")
-        return [
-            f"{'missing ' + ', '.join(lacking) if lacking else 'all there'} for {', '.join(names)}"
-            for lacking, names in groups.items()
-        ]
-
-    def lines(self) -> list[str]:
+    def lines(self, more_notes: Sequence[str] = ()) -> list[str]:
         """The file, its arrays, and what is to be known of them, in lines of a screen's width."""
         words = f"; {self.words}" if self.words else ""
-        texts = map(in_line, (*self.notes(), *self.experiments()))
+        texts = map(in_line, (*self.notes(), *more_notes))
         notes = [
             line
             for text in texts
@@ -137,7 +114,7 @@ class Inspection:
 
     def _repr_html_(self) -> str:
         rows = [list(map(html.escape, row)) for row in self._rows()]
-        items = "".join(f"<li>{html.escape(t)}</li>" for t in (*self.notes(), *self.experiments()))
+        items = "".join(f"<li>{html.escape(text)}</li>" for text in self.notes())
         head = html.escape(f"{self.path}: {self.kind}")
         return f"<div>{head}</div>{html_table(HEADER, rows)}<ul>{items}</ul>"
 
@@ -170,12 +147,12 @@ class Inspection:
 def inspect_file(path: str | Path) -> Inspection:
     """Look into a file: what it holds, and what that is by names, units, shapes and sizes.
 
-    Reads every array once. The result prints as a table and says what is missing for which
-    experiment; `ep2sindy.open_field(path, variables=found.variables, time=found.time, z=found.z,
+    Reads every array once. The result prints as a table, with what is only likely and what is
+    lacking; `ep2sindy.open_field(path, variables=found.variables, time=found.time, z=found.z,
     r=found.r, dt_s=found.dt_s)` opens what it found.
     Raises ValueError for a file that is missing, empty, damaged or of no known kind.
 
-    >>> found = ep.inspect("run.nc")
+    >>> found = ep.inspect_file("run.nc")
     >>> found.variables["n_i"].unit
     'm^-3'
     """

@@ -43,7 +43,7 @@ def open_field(
     is a table or HallThruster.jl's JSON by its ending.
     variables: our name -> where it is in the file, as a `Variable` or the same keys from a
         config; those with name None are left out. None: all that the file's names, units and
-        shapes say without doubt, see `ep2sindy.inspect`; so are then time, z and r.
+        shapes say without doubt, see `ep2sindy.inspect_file`; so are then time, z and r.
     time, z, r: the coordinates; None, or name None, where the file has none.
     dt_s: time step, for a file without time; taken instead of `time` where given.
     mask: nonzero where there is plasma; elsewhere values become NaN.

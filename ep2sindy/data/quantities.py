@@ -86,7 +86,7 @@ AXES: dict[str, Quantity] = {
 }  # fmt: skip
 
 # How a variable is had that a file lacks: from another one, by a step of `prepare`.
-MADE_FROM = {"R_ion": ("T_e_eV", "ep2sindy.ionization_rate")}
+MADE_FROM = {"R_ion": ("T_e_eV", "ep2sindy.thruster.ionization_rate")}
 
 PLASMA = frozenset({"n_i", "n_n", "u_iz", "u_ir", "T_e_eV", "R_ion"})
 LONGEST_STEP_S = 1e-3  # of their records: ten periods of breathing

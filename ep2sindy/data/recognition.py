@@ -52,7 +52,7 @@ class Recognised:
         if problems:
             text = "; ".join([*problems, *self.questions])
             raise ValueError(
-                f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect "
+                f"{source.path} cannot be opened without a mapping: {text}; ep2sindy.inspect_file "
                 "shows what it holds"
             )
 
@@ -86,7 +86,8 @@ def recognised(
             axes[axis] = with_unit(axis, one, AXES[axis], guesses)
     lengths = _lengths(axes, held, source, rest, dt_s, questions)
     variables = _variables(source, rest, axes, held, lengths, questions, guesses)
-    if "time" not in named and (one := _of(held, getattr(axes.get("time"), "name", None))):
+    time = axes.get("time")
+    if "time" not in named and time is not None and (one := _of(held, time.name)):
         said_s = _said_step_s(usable)
         axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
     return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 
 
@@ -25,13 +26,6 @@ def fixed(values: dict) -> MappingProxyType:
 
 # Pickle does not know the kind, and trajectories and models go to other processes.
 copyreg.pickle(MappingProxyType, lambda kept: (fixed, (dict(kept),)))
-
-
-def read_only(values: np.ndarray) -> np.ndarray:
-    """Copy to float64 and lock, so that a value cannot change behind its owner."""
-    copy = np.array(values, dtype=np.float64, order="C")
-    copy.flags.writeable = False
-    return copy
 
 
 class ConstantStateError(ValueError):

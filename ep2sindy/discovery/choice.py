@@ -7,7 +7,7 @@ one model.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,19 +37,73 @@ from ep2sindy.selection.rule import (
 MOST_COMBINATIONS = 1_000_000  # that relations between equations may have to be checked on
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """What a rule makes of fronts.
+# Of a right equation chi-squared per row is 1, give or take a standard error, and a little more:
+# the noise is estimated from the samples that it judges. Measured: 0.7 to 1.3 with 70 rows.
+MOST_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
 
-    scores: per front, one per candidate. chosen: per front the selected candidate, with the
-    coefficients and the covariance that it has in the model. note: of a rule that refines, or that
-    the model leaves more than noise.
+SMALLEST = np.finfo(np.float64).tiny  # an exact fit leaves nothing
+
+
+@dataclass(frozen=True)
+class LeftOver:
+    """What the terms of one equation leave of its rows, whitened by the noise that reaches them.
+
+    chi_squared: per row, 1 where the noise is all that is left; then autocorrelation, of a row's
+    residual with the next, is 0, and leaves_noise is true.
     """
 
-    scores: Sequence[Float[np.ndarray, " _candidates"]]
+    chi_squared: float
+    autocorrelation: float
+    leaves_noise: bool
+
+
+@dataclass(frozen=True, eq=False)
+class EquationFit:
+    """The terms of one equation as they go into a model.
+
+    coef: (terms,), in SI. covariance: (terms, terms) of coef, in SI, where noise has been followed
+    to it and is all that is left. left: of the rows; None where their noise is not known.
+    """
+
+    equation: str
+    terms: tuple[str, ...]
+    coef: Float[np.ndarray, " terms"]
+    covariance: Float[np.ndarray, "terms terms"] | None = None
+    left: LeftOver | None = None
+
+    @property
+    def coef_by_term(self) -> dict[str, float]:
+        return dict(zip(self.terms, self.coef.tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseTest:
+    """Whether a model explains the data as far as their noise.
+
+    left: by state, what its equation leaves of rows; empty where no rows were asked: of a search
+    of trajectories, which tests whole trajectories, and of rules that judge free runs. misfit: why
+    the model does not explain the data; empty where it does, or where nothing was tested.
+    """
+
+    left: Mapping[str, LeftOver] = field(default_factory=dict)
+    misfit: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Result of applying a selection rule to the Pareto fronts.
+
+    fronts: with the scores of the rule. chosen: per front the selected candidate. model: of the
+    chosen terms; its coefficients may be others than the candidates': weighted, constrained or
+    refined. note: how the rule came to it; else empty. left: by state, what the last fit leaves of
+    rows whose noise it knows; None where the model was judged by other means than rows.
+    """
+
+    fronts: Sequence[ParetoFront]
     chosen: Sequence[Candidate]
     model: SparseModel
     note: str = ""
+    left: Mapping[str, LeftOver] | None = None
 
 
 def choose(
@@ -59,159 +113,152 @@ def choose(
     *,
     units: Mapping[str, str],
     provenance: Mapping[str, str],
-    estimate: Estimate | None = None,
     progress: Progress = SILENT,
 ) -> Choice:
-    """Score the candidates, select, and fit: refined, constrained, weighted or as they are.
+    """Score the candidates of a regression, select, and fit: constrained, weighted or as they are.
 
-    A rule that judges whole systems refines the winner. Under relations the combination of least
-    summed score wins that has the terms, and all equations are fitted at once. estimate: of whose
-    candidates the fronts are; where its own evidence selects, its model stands as it is.
+    Under relations the combination of least summed score wins that has the terms, and all
+    equations are fitted at once.
     Raises ValueError for relations that no combination has the terms for.
     """
-    library = fronts[0].problem.library
-    if isinstance(rule, SystemSelection):
-        decision = rule.decide(fronts, relations, progress=progress)
-        best = [selected(*pair) for pair in zip(fronts, decision.scores, strict=True)]
-        model = replace(decision.model, units=units, provenance=provenance)
-        chosen = [_as_in(model, candidate) for candidate in best]
-        return Choice(decision.scores, chosen, model, decision.note)
+    library = fronts[0].rows.library
+    scored = score_by_rule(fronts, rule, progress)
+    if relations:
+        place = _least_sum(scored, relations)
+        support = support_of(scored, place)
+        held = constraint(library, support, binding(relations, support) or ())
+        problems = list(dict.fromkeys(front.rows for front in scored))
+        model = constrained_fit(problems, held, units=units, provenance=provenance)
+        won = [f.with_scores(_won(f.scores, int(k))) for f, k in zip(scored, place, strict=True)]
+        best = [front.candidates[k] for front, k in zip(won, place, strict=True)]
+        return Choice(won, best, model, left={})
+    best = [selected(front, front.scores) for front in scored]
+    fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
+    model = assemble_model(library, fits, units=units, provenance=provenance)
+    left = {fit.equation: fit.left for fit in fits if fit.left is not None}
+    return Choice(scored, best, model, left=left)
+
+
+def choose_by_runs(
+    fronts: Sequence[ParetoFront],
+    rule: SystemSelection,
+    relations: Sequence[Relation] = (),
+    *,
+    library: Library,
+    runs: Sequence[Trajectory],
+    provenance: Mapping[str, str],
+    progress: Progress = SILENT,
+) -> Choice:
+    """Have whole systems of candidates judged by a rule that runs them, and refines the winner.
+
+    Raises ValueError for relations that no combination has the terms for.
+    """
+    decision = rule.decide(fronts, library, runs, relations, progress=progress)
+    scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
+    model = replace(decision.model, units=runs[0].units, provenance=provenance)
+    best = [selected(front, front.scores) for front in scored]
+    return Choice(scored, best, model, decision.note)
+
+
+def score_by_rule(
+    fronts: Sequence[ParetoFront], rule: Selection, progress: Progress
+) -> list[ParetoFront]:
+    """Fronts with the scores of a rule that judges candidates one by one."""
     with progress.stage(None, "", f"candidates by {rule.label}"):
         scores = rule.scores(fronts)
-    if estimate is not None:
-        best = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
-        chosen = [_as_in(estimate.model, candidate) for candidate in best]
-        return Choice(scores, chosen, estimate.model, estimate.note)
-    if relations:
-        place = _least_sum(fronts, scores, relations)
-        support = support_of(fronts, place)
-        held = constraint(library, support, binding(relations, support) or ())
-        problems = list(dict.fromkeys(front.problem for front in fronts))
-        model = constrained_fit(problems, held, units=units, provenance=provenance)
-        scores = [_won(s, int(k)) for s, k in zip(scores, place, strict=True)]
-        best = [front.candidates[k] for front, k in zip(fronts, place, strict=True)]
-        return Choice(scores, [_as_in(model, candidate) for candidate in best], model)
-    best = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
-    chosen = [last_fit(*pair) for pair in zip(fronts, best, strict=True)]
-    model = assemble_model(library, chosen, units=units, provenance=provenance)
-    return Choice(scores, chosen, model)
+    return [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
 
 
-def _least_sum(
-    fronts: Sequence[ParetoFront],
-    scores: Sequence[Float[np.ndarray, " _candidates"]],
-    relations: Sequence[Relation],
-) -> Int[np.ndarray, " fronts"]:
-    """The combination of candidates of least summed score that has the relations' terms."""
-    places = admissible(fronts, combinations(fronts, MOST_COMBINATIONS), relations)
-    sums = np.sum([s[column] for s, column in zip(scores, places.T, strict=True)], axis=0)
-    return places[int(np.argmin(sums))]
+def noise_test(
+    model: SparseModel,
+    runs: Sequence[Trajectory],
+    *,
+    left: Mapping[str, LeftOver] | None,
+    estimate: Estimate | None = None,
+) -> NoiseTest:
+    """Say what a model leaves of the noise, whatever it was found by.
 
-
-def _won(scores: Float[np.ndarray, " candidates"], winner: int) -> Float[np.ndarray, " candidates"]:
-    """Scores with the winner's the least: what relations chose counts as selected."""
-    won = scores.copy()
-    won[winner] = min(won[winner], np.nextafter(won.min(), -np.inf))
-    return won
-
-
-def _as_in(model: SparseModel, candidate: Candidate) -> Candidate:
-    """A candidate with its coefficients and their covariance as a model has them."""
-    terms = model.terms(candidate.equation)
-    coef = np.array([terms.get(name, 0.0) for name in candidate.terms])
-    if model.covariance is None:
-        return replace(candidate, coef=coef, covariance=None)
-    equation = model.states.index(candidate.equation)
-    places = np.argwhere(model.coef.T != 0.0)
-    own = {model.library.names[j]: k for k, (i, j) in enumerate(places) if i == equation}
-    covariance = np.zeros((len(coef), len(coef)))
-    known = [k for k, name in enumerate(candidate.terms) if name in own]
-    at = [own[candidate.terms[k]] for k in known]
-    covariance[np.ix_(known, known)] = model.covariance[np.ix_(at, at)]
-    return replace(candidate, coef=coef, covariance=covariance)
-
-
-# Of a right equation chi-squared per row is 1, give or take a standard error, and a little more:
-# the noise is estimated from the samples that it judges. Measured: 0.7 to 1.3 with 70 rows.
-MOST_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
-
-SMALLEST = np.finfo(np.float64).tiny  # an exact fit leaves nothing
-
-
-def last_fit(front: ParetoFront, candidate: Candidate) -> Candidate:
-    """A selected candidate as it goes into the model: weighted, where the noise is known."""
-    return candidate if front.problem.noisy is None else reweighted(front.problem, candidate)
-
-
-def judged(
-    chosen: Sequence[Candidate], runs: Sequence[Trajectory], library: Library
-) -> list[Candidate]:
-    """Candidates with what their terms leave of the noise, also where their rows do not know it.
-
-    Then weak rows of the same runs are asked; coefficients stay as they are. Where there are none,
-    as of a record of a few samples, nothing is said.
+    left: by state, what the last fit of its rows left; of states that it lacks, weak rows of the
+    runs are asked: coefficients stay as they are. Where there are none, as of a record of a few
+    samples, nothing is said. None where a rule has judged the model by running it: then rows say
+    nothing. estimate: of states and coefficients together, which has tested whole trajectories.
     """
-    unknown = [c for c in chosen if c.chi_squared is None]
-    if not unknown or not runs:
-        return list(chosen)
+    if estimate is not None:
+        return NoiseTest(misfit=estimate.misfit)
+    if left is None:
+        return NoiseTest()
+    unknown = [state for state in model.states if state not in left]
+    found = {**left, **(_left_of_weak_rows(model, runs, unknown) if unknown else {})}
+    ordered = {state: found[state] for state in model.states if state in found}
+    return NoiseTest(ordered, _misfit(ordered))
+
+
+def _left_of_weak_rows(
+    model: SparseModel, runs: Sequence[Trajectory], states: Sequence[str]
+) -> dict[str, LeftOver]:
+    """What some equations leave of weak rows; empty where the samples make none."""
     try:
         # The same numbers as with all terms, at a fraction of their cost.
-        used = np.isin(library.names, [name for c in unknown for name in c.terms])
+        used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
         used[0] |= not used.any()  # a library needs a term
         form, rng = Weak(split=RandomSplit(0.0)), np.random.default_rng(0)
-        rows = form.assemble(runs, library.take(used), rng=rng)
+        rows = form.assemble(runs, model.library.take(used), rng=rng)
         found = {problem.equations[0]: problem for problem in rows}
-        fitted = {c.equation: reweighted(found[c.equation], c) for c in unknown}
+        fits = [reweight(found[state], _fit_in(model, state)) for state in states]
     except (ValueError, np.linalg.LinAlgError):
-        return list(chosen)
-    return [_as_judged(c, fitted.get(c.equation, c)) for c in chosen]
+        return {}
+    return {fit.equation: fit.left for fit in fits if fit.left is not None}
 
 
-def _as_judged(candidate: Candidate, fitted: Candidate) -> Candidate:
-    return replace(
-        candidate,
-        covariance=candidate.covariance if fitted.leaves_noise else None,
-        chi_squared=fitted.chi_squared,
-        autocorrelation=fitted.autocorrelation,
-        leaves_noise=fitted.leaves_noise,
-    )
+def _fit_in(model: SparseModel, state: str) -> EquationFit:
+    """One equation of a model."""
+    terms = model.terms(state)
+    return EquationFit(state, tuple(terms), np.array(list(terms.values())))
 
 
-def misfit_of(chosen: Sequence[Candidate]) -> str:
+def _misfit(left: Mapping[str, LeftOver]) -> str:
     """Which equations leave more than noise, in a sentence; empty where none does."""
-    left = {c.equation: c.chi_squared for c in chosen if c.leaves_noise is False}
-    if not left:
+    more = {state: each.chi_squared for state, each in left.items() if not each.leaves_noise}
+    if not more:
         return ""
-    parts = ", ".join(f"{state}' ({value:.3g} times its size)" for state, value in left.items())
+    parts = ", ".join(f"{state}' ({value:.3g} times its size)" for state, value in more.items())
     return (
         f"no equation of this library leaves white noise of {parts}: intervals are not given; "
         "add terms or states, or judge the model by free run"
     )
 
 
+def fit_last(front: ParetoFront, candidate: Candidate) -> EquationFit:
+    """A selected candidate as it goes into the model: weighted, where the noise is known."""
+    if front.rows.noisy is None:
+        return EquationFit(candidate.equation, candidate.terms, candidate.coef)
+    return reweight(front.rows, candidate)
+
+
 def assemble_model(
     library: Library,
-    candidates: Sequence[Candidate],
+    fits: Sequence[EquationFit],
     *,
     units: Mapping[str, str],
     provenance: Mapping[str, str],
 ) -> SparseModel:
-    """Join one candidate per equation into a model, as if errors of equations were independent."""
-    blocks = [c.covariance for c in candidates if c.covariance is not None]
+    """Join one fit per equation into a model, as if errors of equations were independent."""
+    blocks = [fit.covariance for fit in fits if fit.covariance is not None]
     return SparseModel(
         library=library,
-        states=[c.equation for c in candidates],
-        coef=coef_matrix(library, [c.coef_by_term for c in candidates]),
+        states=[fit.equation for fit in fits],
+        coef=coef_matrix(library, [fit.coef_by_term for fit in fits]),
         units=units,
         provenance=provenance,
-        covariance=block_diag(*blocks) if len(blocks) == len(candidates) else None,
+        covariance=block_diag(*blocks) if len(blocks) == len(fits) else None,
     )
 
 
-def reweighted(problem: RegressionRows, candidate: Candidate, *, n_steps: int = 8) -> Candidate:
+def reweight(
+    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int = 8
+) -> EquationFit:
     """Fit a candidate's terms again, with weights and corrected samples, and say how well.
 
-    Returns it with new coefficients, their covariance, in SI, and chi-squared; its scores stay.
     What leaves more than the noise of its rows has no covariance: it would not hold the truth.
     """
     terms = np.isin(problem.term_names, candidate.terms)
@@ -228,11 +275,27 @@ def reweighted(problem: RegressionRows, candidate: Candidate, *, n_steps: int = 
     freedom = max(len(left) - len(order), 1)
     chi_squared = float(left @ left) / freedom
     leaves_noise = chi_squared <= MOST_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
-    return replace(
-        candidate,
+    autocorrelation = float(left[1:] @ left[:-1]) / max(float(left @ left), SMALLEST)
+    return EquationFit(
+        equation=candidate.equation,
+        terms=candidate.terms,
         coef=fitted * scale[order],
         covariance=root @ root.T if leaves_noise else None,
-        chi_squared=chi_squared,
-        autocorrelation=float(left[1:] @ left[:-1]) / max(float(left @ left), SMALLEST),
-        leaves_noise=bool(leaves_noise),
+        left=LeftOver(chi_squared, autocorrelation, bool(leaves_noise)),
     )
+
+
+def _least_sum(
+    fronts: Sequence[ParetoFront], relations: Sequence[Relation]
+) -> Int[np.ndarray, " fronts"]:
+    """The combination of candidates of least summed score that has the relations' terms."""
+    places = admissible(fronts, combinations(fronts, MOST_COMBINATIONS), relations)
+    sums = np.sum([f.scores[column] for f, column in zip(fronts, places.T, strict=True)], axis=0)
+    return places[int(np.argmin(sums))]
+
+
+def _won(scores: Float[np.ndarray, " candidates"], winner: int) -> Float[np.ndarray, " candidates"]:
+    """Scores with the winner's the least: what relations chose counts as selected."""
+    won = scores.copy()
+    won[winner] = min(won[winner], np.nextafter(won.min(), -np.inf))
+    return won

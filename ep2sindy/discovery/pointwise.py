@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import choose
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression, check_kind
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.files import WriteError, replacing, sweep
@@ -43,7 +42,7 @@ class PointSearch:
 
     states: Sequence[str]
     library: Library
-    recipe: Recipe
+    method: Regression
     least_variation: float = 1e-3
     seed: int = 0
 
@@ -53,7 +52,8 @@ class PointSearch:
             raise ValueError(
                 f"least_variation must lie in [0, 1): {self.least_variation} came; it is a share"
             )
-        if not (n := self.recipe.bootstraps.n):
+        check_kind("method", self.method, Regression, "ep.Regression(bootstraps=ep.Bootstraps())")
+        if not (n := self.method.bootstraps.n):
             raise ValueError(f"a pointwise study needs bootstraps for its spread: n={n} came")
 
     @cached_property
@@ -94,7 +94,7 @@ def pointwise(
     result = _empty(part, search)
     n_points = sum(block.n_points for block in blocks)
     with as_progress(progress).stage(n_points, "point") as advance:
-        for block, done in _done(part, search, blocks, workers, kept):
+        for block, done in _search_blocks(part, search, blocks, workers, kept):
             _place(result, block, done)
             advance(block.n_points)
     if not (result["status"] == 0).any():
@@ -102,7 +102,7 @@ def pointwise(
     return result
 
 
-def _done(
+def _search_blocks(
     part: xr.Dataset,
     search: PointSearch,
     blocks: Sequence[Block],
@@ -118,7 +118,7 @@ def _done(
         else:
             yield block, done
     pieces = (part.isel(block.slices) for block in waiting)
-    for number, done in workers.run(partial(_searched, search), pieces):
+    for number, done in workers.run(partial(_search_block, search), pieces):
         if kept:
             kept.write(waiting[number], done)
         yield waiting[number], done
@@ -157,7 +157,7 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
         for state in search.states
     ]
     sizes = {
-        "draw": search.recipe.bootstraps.n,
+        "draw": search.method.bootstraps.n,
         "equation": len(search.states),
         "term": len(search.library),
     }
@@ -199,7 +199,7 @@ def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> 
         target.values[...] = values.reshape(target.shape)
 
 
-def _searched(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
+def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
     """Every point of a block, points along the last axis; why a fit failed, if one did."""
     block = block.load(scheduler="synchronous")  # in chunks, if at all, on this thread
     t = grid_points(block, "time")
@@ -263,7 +263,7 @@ def _trajectory(
 
 
 def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
-    sizes = (search.recipe.bootstraps.n, len(search.states), len(search.library))
+    sizes = (search.method.bootstraps.n, len(search.states), len(search.library))
     first = {"draw": 0, "equation": 1, "term": 2}
     return {name: np.full([sizes[first[d]] for d in dims], np.nan) for name, dims in LAYOUT.items()}
 
@@ -271,15 +271,14 @@ def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
 def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit one trajectory; its spread over the bootstraps."""
     rng = np.random.default_rng(search.seed)
-    equations = search.recipe.searched([run], search.library, rng=rng)
+    equations = search.method.search_equations([run], search.library, rng=rng)
     fronts = [equation.front for equation in equations]
-    chosen_of = choose(fronts, search.recipe.selection, units=run.units, provenance={}).chosen
+    choice = search.method.choose(fronts, [run], search.library)
     point = _nothing(search)
-    for row, (equation, chosen) in enumerate(zip(equations, chosen_of, strict=True)):
-        problem = equation.front.problem
+    for row, (equation, chosen) in enumerate(zip(equations, choice.chosen, strict=True)):
+        problem = equation.front.rows
         mask: Bool[np.ndarray, " terms"] = np.isin(search.library.names, chosen.terms)
-        point["coef"][row] = 0.0
-        point["coef"][row, mask] = chosen.coef
+        point["coef"][row] = choice.model.coef[:, row]
         point["inclusion"][row] = equation.supports.inclusion[chosen.n_terms]
         point["weight"][row] = _shares(point["coef"][row] * problem.theta_scale)
         fits = equation.draws.fits(equation.number, equation.found, mask)

@@ -9,20 +9,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
-from ep2sindy.discovery.choice import assemble_model, last_fit
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.choice import assemble_model, fit_last
+from ep2sindy.discovery.method import Regression, check_kind, old_name
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import Progress, as_progress, counted
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.search.front import ParetoFront, errors_of, fit_supports, front_order
 from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
-from ep2sindy.selection.rule import Selection
+from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,37 +58,39 @@ class JointDiscovery:
 def discover_jointly(
     points: Mapping[str, Sequence[Trajectory]],
     library: Library,
-    recipe: Recipe | None = None,
+    method: Regression | None = None,
     *,
     seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
+    recipe: Regression | None = None,
 ) -> JointDiscovery:
     """Find equations whose terms are the same at every operating point, coefficients free.
 
     Each point is assembled on its own, with its own sampling, noise and scale. The search finds
     the supports whose product of residuals over the points is least: a term is in or out
-    everywhere. The recipe's rule scores the fits at each point and the scores are added: for AICc,
+    everywhere. The method's rule scores the fits at each point and the scores are added: for AICc,
     BIC and EBIC that is the criterion of the joint likelihood, the count of supports paid once. A
     term may vanish at some points, if it shows at others. One point gives what `discover` does.
     points: name -> trajectories. Points are assembled in the order of their names.
-    recipe: None means Recipe(WeightedWeak()). Raises ValueError for a search that cannot serve
-    several points, bootstraps, which a joint search has none of, no point, or points whose states,
-    variables or units differ.
+    method: None means Regression(). recipe: its old name, for one version more.
+    Raises ValueError for a search that cannot serve several points, bootstraps, which a search of
+    several points has none of, no point, or points whose states, variables or units differ.
     Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
     """
-    recipe = recipe or Recipe(WeightedWeak())
-    search = _joint_search(recipe)
+    method = method or old_name(recipe) or Regression()
+    check_kind("method", method, Regression, "ep.Regression(search=ep.BestSubset())")
+    search = _search_of(method)
     _check_points(points, library)
     rng = np.random.default_rng(seed)
     watch = as_progress(progress)
     problems = {
-        p: recipe.formulation.assemble(points[p], library, rng=rng)
+        p: method.formulation.assemble(points[p], library, rng=rng)
         for p in counted(watch, sorted(points), "point", "rows of the regression")
     }
-    fronts = _joint_fronts(problems, search, recipe.depth, watch)
-    scores = _summed_scores(list(fronts.values()), recipe.selection)
+    fronts = _joint_fronts(problems, search, method.depth, watch)
+    scores = _summed_scores(list(fronts.values()), method.selection, library, points)
     best = {state: int(np.argmin(each)) for state, each in zip(fronts, scores, strict=True)}
-    provenance = recipe.provenance | {"joint": ", ".join(points)}
+    provenance = method.provenance | {"joint": ", ".join(points)}
     del provenance["bootstraps"]
     return JointDiscovery(
         fronts=fronts,
@@ -123,17 +124,17 @@ def _joint_fronts(
     }
 
 
-def _joint_search(recipe: Recipe) -> BestSubset:
-    """The search of a recipe that can weigh all points at once."""
-    if not isinstance(recipe.search, BestSubset):
+def _search_of(method: Regression) -> BestSubset:
+    """The search of a method that can weigh all points at once."""
+    if not isinstance(method.search, BestSubset):
         raise ValueError(
-            f"a joint search must weigh all points at once: {recipe.search} cannot; use BestSubset"
+            f"a joint search must weigh all points at once: {method.search} cannot; use BestSubset"
         )
-    if recipe.bootstraps.n:
+    if method.bootstraps.n:
         raise ValueError(
-            f"a joint search has no bootstraps: {recipe.bootstraps} came; use Bootstraps(n=0)"
+            f"a joint search has no bootstraps: {method.bootstraps} came; use Bootstraps(n=0)"
         )
-    return recipe.search
+    return method.search
 
 
 def _models(
@@ -148,7 +149,7 @@ def _models(
         point: assemble_model(
             library,
             [
-                last_fit(front.points[point], front.points[point].candidates[best[state]])
+                fit_last(front.points[point], front.points[point].candidates[best[state]])
                 for state, front in fronts.items()
             ],
             units=runs[0].units,
@@ -190,7 +191,8 @@ def _joint_front(
         np.array([gram.yy[0, k] for gram in grams]),
     )
     fits = {
-        p: fit_supports(each, equation, _determined(each, masks)) for p, each in problems.items()
+        p: fit_supports(each, equation, _keep_determined(each, masks))
+        for p, each in problems.items()
     }
     by_point = [errors_of(fits[p]) for p in problems]
     errors = np.exp(np.log(np.maximum(by_point, ROUNDING)).mean(axis=0))
@@ -207,7 +209,7 @@ def _joint_front(
     )
 
 
-def _determined(
+def _keep_determined(
     problem: RegressionRows, masks: Bool[np.ndarray, "supports terms"]
 ) -> Bool[np.ndarray, "supports terms"]:
     """The terms of each support that the rows of one point determine, earlier terms first."""
@@ -219,9 +221,15 @@ def _determined(
 
 
 def _summed_scores(
-    fronts: Sequence[JointFront], selection: Selection
+    fronts: Sequence[JointFront],
+    selection: Selection | SystemSelection,
+    library: Library,
+    runs: Mapping[str, Sequence[Trajectory]],
 ) -> list[Float[np.ndarray, " supports"]]:
     points = list(fronts[0].points)
     rule = selection.shared_by(len(points)) if isinstance(selection, EBIC) else selection
-    by_point = [rule.scores([front.points[point] for front in fronts]) for point in points]
+    by_point = [
+        score_candidates(rule, [front.points[p] for front in fronts], library, runs[p])
+        for p in points
+    ]
     return [np.sum(scores, axis=0) for scores in zip(*by_point, strict=True)]

@@ -6,7 +6,7 @@ Beside the model: what a reader must know of the samples and of their noise, in 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -17,27 +17,30 @@ from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
-from ep2sindy.estimation.problem import Problem, check_size, scaled_problem
+from ep2sindy.estimation.problem import EstimationProblem, check_size, scaled_problem
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Aligned,
-    Joint,
     Solution,
     enough_samples,
+    max_terms_for,
     solve,
 )
-from ep2sindy.estimation.supports import priced, supports_by_size
+from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress, counted
 
 MOST_RIVALS = 5
 LEAST_ODDS = 1e-3  # of a rival that is worth a word
+HEAVY, STANDARD_ERRORS = 4.0, 5.0  # a kurtosis that is told; by which it must be above 3
+COLLINEAR = 5.0  # standard errors of a variance that is no more than noise
+PART = 0.05  # of the largest share: states with less have no part in a relation
 EVEN = 0.2  # odds of a rival that leave it open which of the two is right
 
 
 @dataclass(frozen=True)
-class Weighed:
+class ScoredSupport:
     """A support of one equation, the others as chosen. coef: SI, of its terms, by name.
 
     deviance: -2 log likelihood of the trajectories plus the prices of all terms, beside the
@@ -68,13 +71,13 @@ class Estimate:
     flow_error: how far from the model the states move from sample to sample, as a share of the
     noise; 0 where nothing but noise is left. misfit: why these equations do not explain the data;
     empty where they do. few: a word where there are too few samples to tell; else empty.
-    weighed: by state, the best supports of every size. rivals: what else may be, most likely
+    supports: by state, the best supports of every size. rivals: what else may be, most likely
     first.
     remarks: what the samples show that is not as assumed, in sentences: limits of sensors, noise
     that lasts, grows or has outliers, states that hang together.
     kurtosis: (d,), of the noise, 3 where it is normal, NaN where no sample is a value. growth:
     (d,), share of its variance that grows with the state. delays_s: (d,), by which channels come
-    late; `Joint(align=True)` brings them together, and leaves out what that takes at the ends.
+    late; `align=True` brings them together, and leaves out what that takes at the ends.
     """
 
     model: SparseModel
@@ -84,7 +87,7 @@ class Estimate:
     flow_error: float
     misfit: str
     few: str
-    weighed: Mapping[str, Sequence[Weighed]] = field(repr=False)
+    supports: Mapping[str, Sequence[ScoredSupport]] = field(repr=False)
     rivals: Sequence[Rival]
     remarks: tuple[str, ...]
     kurtosis: Float[np.ndarray, " d"]
@@ -108,8 +111,9 @@ class Estimate:
 def estimate(
     runs: Sequence[Trajectory],
     library: Library,
-    search: Joint | None = None,
     *,
+    max_terms: int = 7,
+    align: bool = False,
     relations: Sequence[Relation] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
     units: Mapping[str, str] | None = None,
@@ -119,37 +123,45 @@ def estimate(
     """Estimate states at every sample and sparse coefficients together, by their likelihood.
 
     runs: share the coefficients; samples may come at unequal times. Inputs are taken as exact.
-    relations: between coefficients, held in fit and search. terms: by state, all the terms of an
-    equation that is known but for its coefficients. progress: True shows bars; see `Progress`.
-    Raises ValueError for a library that needs
-    more samples than there are, or a variable that no run has.
+    max_terms: of one equation. align: channels that are found to come late are brought forward;
+    else the model is said to be a misfit, with their delays. relations: between coefficients, held
+    in fit and search. terms: by state, all the terms of an equation that is known but for its
+    coefficients.
+    progress: True shows bars; see `Progress`.
+    Raises ValueError for fewer than one term, a library that needs more samples than there are, or
+    a variable that no run has.
     """
-    search = search or Joint()
+    if max_terms < 1:
+        raise ValueError(f"max_terms must be at least 1: {max_terms} came")
     check_runs(runs, library)
     check_size(runs, library, terms or {})
     watch = as_progress(progress)
     with watch.stage(None, "step", "states and coefficients") as advance:
         problem = scaled_problem(runs, library, relations, terms, advance=advance)
-        answer = _answered(problem, search)
+        answer = _answer(problem, max_terms, align=align)
+    model = _model(answer, library, units or runs[0].units, provenance or {})
+    return _report(answer, model, max_terms, watch)
+
+
+def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progress) -> Estimate:
+    """What was found, in SI, beside what else may be."""
     problem, found = answer.problem, answer.found
-    fit, level = found.annealed.fit, found.annealed.level
-    pair = gram(problem, fit, level)
-    weighed = {
-        state: _weighed(problem, pair, found, block, search)
+    fit, few_terms = found.annealed.fit, max_terms_for(problem, max_terms)
+    pair = gram(problem, fit, found.annealed.level)
+    supports = {
+        state: _score_supports(problem, pair, found, block, few_terms)
         for block, state in counted(watch, list(enumerate(problem.states)), "equation", "rivals")
     }
-    model = _model(problem, library, found, units or runs[0].units, provenance or {})
     return Estimate(
-        # The intervals of a model that leaves more than noise would not hold the truth.
-        model=replace(model, covariance=None) if answer.misfit else model,
+        model=model,
         paths=tuple(path * problem.scale for path in fit.paths),
         noise_std=found.noise.std * problem.scale,
         memory=found.noise.memory,
         flow_error=found.flow_error,
         misfit=answer.misfit,
-        few=_few(problem, search.terms_for(problem)),
-        weighed=weighed,
-        rivals=_rivals(problem, found, weighed),
+        few=_few(problem, few_terms),
+        supports=supports,
+        rivals=_rivals(problem, found, supports),
         remarks=(*answer.said, *remarks(problem, found.noise)),
         kurtosis=found.noise.kurtosis,
         growth=found.noise.growth,
@@ -158,29 +170,29 @@ def estimate(
 
 
 @dataclass(frozen=True, eq=False)
-class _Answer:
+class _Reported:
     """What is reported: of the samples as they are, or of those brought together, if asked for.
 
     delays: (d,), in mean steps. said: what was done to the samples.
     """
 
-    problem: Problem
+    problem: EstimationProblem
     found: Solution
     misfit: str
     delays: Float[np.ndarray, " d"]
     said: tuple[str, ...] = ()
 
 
-def _answered(problem: Problem, search: Joint) -> _Answer:
-    found, late = solve(problem, max_terms=search.terms_for(problem))
+def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Reported:
+    found, late = solve(problem, max_terms=max_terms_for(problem, max_terms))
     if late is None:
-        misfit = _misfit(problem, found) or _at_limit(problem, found, search)
-        return _Answer(problem, found, misfit, np.zeros(len(problem.states)))
-    if not search.align:
-        return _Answer(problem, found, late_words(problem, late), late.delays)
+        misfit = _misfit(problem, found) or _at_limit(problem, found, max_terms)
+        return _Reported(problem, found, misfit, np.zeros(len(problem.states)))
+    if not align:
+        return _Reported(problem, found, late_words(problem, late), late.delays)
     said = f"{delay_words(problem, late.delays)}: brought together with the others"
-    misfit = _at_limit(late.problem, late.solution, search)
-    return _Answer(late.problem, late.solution, misfit, late.delays, (said,))
+    misfit = _at_limit(late.problem, late.solution, max_terms)
+    return _Reported(late.problem, late.solution, misfit, late.delays, (said,))
 
 
 def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
@@ -207,11 +219,15 @@ def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
             )
 
 
-def _coef_SI(problem: Problem, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, " _"]:
+def _coef_SI(
+    problem: EstimationProblem, free: Float[np.ndarray, " free"]
+) -> Float[np.ndarray, " _"]:
     return (problem.C @ free + problem.fixed) * problem.to_SI
 
 
-def _named_coef(problem: Problem, free: Float[np.ndarray, " free"], block: int) -> dict[str, float]:
+def _named_coef(
+    problem: EstimationProblem, free: Float[np.ndarray, " free"], block: int
+) -> dict[str, float]:
     """Term -> SI coefficient of one equation, those that are not zero."""
     values = _coef_SI(problem, free)
     own = (problem.equation == block) & (values != 0.0)
@@ -220,12 +236,9 @@ def _named_coef(problem: Problem, free: Float[np.ndarray, " free"], block: int) 
 
 
 def _model(
-    problem: Problem,
-    library: Library,
-    found: Solution,
-    units: Mapping[str, str],
-    provenance: Mapping[str, str],
+    answer: _Reported, library: Library, units: Mapping[str, str], provenance: Mapping[str, str]
 ) -> SparseModel:
+    problem, found = answer.problem, answer.found
     fit = found.annealed.fit
     values = _coef_SI(problem, fit.free)
     coef = np.zeros((len(library), len(problem.states)))
@@ -233,45 +246,47 @@ def _model(
     used = values != 0.0
     order = np.lexsort((problem.column[used], problem.equation[used]))
     rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
-    free_cov = covariance(problem, fit, found.annealed.level) if found.fits else None
+    # The intervals of a model that leaves more than noise would not hold the truth.
+    known = found.fits and not answer.misfit
+    free_cov = covariance(problem, fit, found.annealed.level) if known else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
     return SparseModel(library, problem.states, coef, units, provenance, cov)
 
 
-def _weighed(
-    problem: Problem, pair: Gram, found: Solution, block: int, search: Joint
-) -> list[Weighed]:
+def _score_supports(
+    problem: EstimationProblem, pair: Gram, found: Solution, block: int, max_terms: int
+) -> list[ScoredSupport]:
     """Supports of one equation, by size and then by deviance."""
     fit = found.annealed.fit
     if not pair.finite:
-        return [Weighed(_named_coef(problem, fit.free, block), 0.0)]
-    chosen = priced(pair, fit.support, found.prices).score
-    masks = supports_by_size(problem, pair, fit.support, block, max_terms=search.terms_for(problem))
+        return [ScoredSupport(_named_coef(problem, fit.free, block), 0.0)]
+    chosen = penalise(pair, fit.support, found.prices).score
+    masks = supports_by_size(problem, pair, fit.support, block, max_terms=max_terms)
     masks = [m for m in masks if not np.array_equal(m, fit.support)]
     rows = []
     for mask in [fit.support, *masks]:
-        each = priced(pair, mask, found.prices)
+        each = penalise(pair, mask, found.prices)
         free = fit.free if mask is fit.support else each.free
         coef = _named_coef(problem, free, block)
-        rows.append(Weighed(coef, max(each.score - chosen, 0.0)))
+        rows.append(ScoredSupport(coef, max(each.score - chosen, 0.0)))
     return sorted(rows, key=lambda w: (len(w.coef), w.deviance))
 
 
 def _rivals(
-    problem: Problem, found: Solution, weighed: Mapping[str, Sequence[Weighed]]
+    problem: EstimationProblem, found: Solution, supports: Mapping[str, Sequence[ScoredSupport]]
 ) -> tuple[Rival, ...]:
     fit = found.annealed.fit
     rivals = []
     for block, state in enumerate(problem.states):
         chosen = set(_named_coef(problem, fit.free, block))
-        for each in weighed[state]:
+        for each in supports[state]:
             odds = float(np.exp(-0.5 * each.deviance))
             if set(each.coef) != chosen and odds >= LEAST_ODDS:
                 rivals.append(Rival(state, tuple(each.coef), odds))
     return tuple(sorted(rivals, key=lambda r: -r.odds)[:MOST_RIVALS])
 
 
-def _few(problem: Problem, max_terms: int) -> str:
+def _few(problem: EstimationProblem, max_terms: int) -> str:
     if enough_samples(problem):
         return ""
     n_terms = len(problem.library)
@@ -282,7 +297,7 @@ def _few(problem: Problem, max_terms: int) -> str:
     )
 
 
-def _misfit(problem: Problem, found: Solution) -> str:
+def _misfit(problem: EstimationProblem, found: Solution) -> str:
     if found.fits:
         return ""
     signs = []
@@ -300,31 +315,26 @@ def _misfit(problem: Problem, found: Solution) -> str:
     )
 
 
-def _at_limit(problem: Problem, found: Solution, search: Joint) -> str:
+def _at_limit(problem: EstimationProblem, found: Solution, max_terms: int) -> str:
     """A word where an equation takes all the terms that it may: many that stand in for another."""
-    if search.terms_for(problem) < search.max_terms:
+    if max_terms_for(problem, max_terms) < max_terms:
         return ""  # too few samples: that is told of anyway
     used = _coef_SI(problem, found.annealed.fit.free) != 0.0
     full = [
         f"{state}'"
         for block, state in enumerate(problem.states)
-        if used[own := problem.equation == block].sum() >= search.max_terms < own.sum()
+        if used[own := problem.equation == block].sum() >= max_terms < own.sum()
     ]
     if not full:
         return ""
     return (
-        f"{', '.join(full)} with as many terms as may be (max_terms={search.max_terms}): they may "
+        f"{', '.join(full)} with as many terms as may be (max_terms={max_terms}): they may "
         "stand for one that the library lacks, and intervals are not given; add terms to it, or "
         "raise max_terms"
     )
 
 
-HEAVY, STANDARD_ERRORS = 4.0, 5.0  # a kurtosis that is told; by which it must be above 3
-COLLINEAR = 5.0  # standard errors of a variance that is no more than noise
-PART = 0.05  # of the largest share: states with less have no part in a relation
-
-
-def remarks(problem: Problem, noise: Noise) -> tuple[str, ...]:
+def remarks(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
     """What sensors did, how the noise differs from white and normal, which states hang together."""
     limits = [w for r in problem.records if r.limits is not None for w in r.limits.words]
     return (
@@ -334,7 +344,7 @@ def remarks(problem: Problem, noise: Noise) -> tuple[str, ...]:
     )
 
 
-def delay_words(problem: Problem, delays: Float[np.ndarray, " d"]) -> str:
+def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
     """`z comes 0.00333 s late (0.99 samples)`, of every state that does."""
     parts = [
         f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
@@ -345,16 +355,16 @@ def delay_words(problem: Problem, delays: Float[np.ndarray, " d"]) -> str:
     return " and ".join(parts)
 
 
-def late_words(problem: Problem, late: Aligned) -> str:
+def late_words(problem: EstimationProblem, late: Aligned) -> str:
     """Why samples with a late channel are a misfit, and the way out."""
     return (
         f"{delay_words(problem, late.delays)}: brought together, the samples are better explained "
-        "by other equations; ask for those by ep.Recipe(search=ep.Joint(align=True)), in configs "
+        "by other equations; ask for those by ep.TrajectorySearch(align=True), in configs "
         "search.align=true. These are of the samples as they are"
     )
 
 
-def _of_noise(problem: Problem, noise: Noise) -> list[str]:
+def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
     words = []
     error = np.sqrt(24.0 / problem.n_samples)
     for k, state in enumerate(problem.states):
@@ -372,7 +382,7 @@ def _of_noise(problem: Problem, noise: Noise) -> list[str]:
     return words
 
 
-def _of_collinear_states(problem: Problem, noise: Noise) -> list[str]:
+def _of_collinear_states(problem: EstimationProblem, noise: Noise) -> list[str]:
     """States of which a sum varies no more than their noise."""
     d, n = len(problem.states), problem.n_samples
     if d < 2 or noise.unexplained.any():

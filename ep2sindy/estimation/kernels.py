@@ -55,7 +55,7 @@ def sensitivity_stage(jacobian, terms, equation, column, start, lead, slope, wei
 
 
 @compiled
-def _seen(i, residual, variance, mean, by_coef, cov, gain):
+def _observe(i, residual, variance, mean, by_coef, cov, gain):
     """Learn from one sample of state i; returns its innovation and the innovation's variance."""
     d, p = by_coef.shape
     spread = cov[i, i] + variance
@@ -77,7 +77,7 @@ def _seen(i, residual, variance, mean, by_coef, cov, gain):
 
 
 @compiled
-def _stepped(flow, miss, mean, by_coef, cov, process, buffer):
+def _step(flow, miss, mean, by_coef, cov, process, buffer):
     """Take mean, its derivatives by the coefficients and covariance over one step."""
     d, p = by_coef.shape
     for i in range(d):
@@ -109,7 +109,7 @@ def _stepped(flow, miss, mean, by_coef, cov, process, buffer):
 
 
 @compiled
-def eliminated(flow, misses, residuals, variance, process, free_start):
+def eliminate(flow, misses, residuals, variance, process, free_start):
     """Eliminate all states: what is left of the squares as a function of the coefficients.
 
     variance: (n, d), of the samples' noise; process: (n - 1, d), of the flow's error; free_start:
@@ -133,7 +133,9 @@ def eliminated(flow, misses, residuals, variance, process, free_start):
                 continue
             for a in range(p):
                 row[a] = by_coef[i, a]
-            innovation, spread = _seen(i, residuals[k, i], variance[k, i], mean, by_coef, cov, gain)
+            innovation, spread = _observe(
+                i, residuals[k, i], variance[k, i], mean, by_coef, cov, gain
+            )
             least += innovation * innovation / spread
             log_spread += np.log(spread)
             for a in range(p):
@@ -142,7 +144,7 @@ def eliminated(flow, misses, residuals, variance, process, free_start):
                 for b in range(a + 1):
                     hessian[a, b] += share * row[b]
         if k < n - 1:
-            _stepped(flow[k], misses[k], mean, by_coef, cov, process[k], buffer)
+            _step(flow[k], misses[k], mean, by_coef, cov, process[k], buffer)
     for a in range(p):
         for b in range(a):
             hessian[b, a] = hessian[a, b]
@@ -153,7 +155,7 @@ def eliminated(flow, misses, residuals, variance, process, free_start):
 def departures(flow, misses, residuals, variance, process, free_start):
     """The departures (n, d) of all states from the path that leave the least squares.
 
-    Arguments as for `eliminated`, of whose `flow` the first d columns count. Backwards by the
+    Arguments as for `eliminate`, of whose `flow` the first d columns count. Backwards by the
     adjoint of the filter, which inverts no matrix (Bierman 1973, doi:10.1016/0005-1098(73)90089-3).
     """
     n, d = residuals.shape
@@ -170,12 +172,12 @@ def departures(flow, misses, residuals, variance, process, free_start):
                 covs[k, i, j] = cov[i, j]
         for i in range(d):
             if np.isfinite(residuals[k, i]):
-                innovation, spread = _seen(
+                innovation, spread = _observe(
                     i, residuals[k, i], variance[k, i], mean, none, cov, gains[k, i]
                 )
                 innovations[k, i] = innovation / spread
         if k < n - 1:
-            _stepped(flow[k], misses[k], mean, none, cov, process[k], buffer)
+            _step(flow[k], misses[k], mean, none, cov, process[k], buffer)
     adjoint, carried = np.zeros(d), np.zeros(d)
     for k in range(n - 1, -1, -1):
         for j in range(d):

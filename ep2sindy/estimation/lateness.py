@@ -13,9 +13,9 @@ from math import log
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.estimation.likelihood import Fit, Gram, Level, hessian
-from ep2sindy.estimation.problem import Flow, Problem, Record
-from ep2sindy.estimation.supports import Priced, best_support, inverse_of, priced
+from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, hessian
+from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
+from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
 
 PAYS = 1.0  # by which delays must lower squares and prices, beyond their own price
 MOST_SAMPLES = 10.0  # of a delay that is believed: a larger one is no small error of a clock
@@ -61,7 +61,7 @@ class DelayedGram:
         return best, np.sqrt(np.maximum(np.diag(inverse), 0.0))
 
 
-def delayed_gram(problem: Problem, fit: Fit, level: Level) -> DelayedGram:
+def delayed_gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> DelayedGram:
     """Linearise about a fit, all states delayed: by as much, nothing would show but for inputs.
 
     A state read tau early is, to first order, tau times its rate further on: at the start of a
@@ -69,7 +69,7 @@ def delayed_gram(problem: Problem, fit: Fit, level: Level) -> DelayedGram:
     """
     d, n = len(problem.states), len(fit.support)
 
-    def flow(record: Record, path: np.ndarray) -> Flow:
+    def flow(record: ScaledRecord, path: np.ndarray) -> Flow:
         everything = np.ones_like(fit.support)
         found = problem.flow(record, path[:-1], fit.free, everything, level.n_substeps)
         rates = problem.rates(record, path, fit.free)
@@ -85,8 +85,8 @@ def delayed_gram(problem: Problem, fit: Fit, level: Level) -> DelayedGram:
     return DelayedGram(at_rest, quadratic[:n, n:], quadratic[n:, n:], linear[n:])
 
 
-def suspected(
-    problem: Problem,
+def suspect_delays(
+    problem: EstimationProblem,
     around: DelayedGram,
     support: Bool[np.ndarray, " free"],
     prices: Float[np.ndarray, " free"],
@@ -98,8 +98,8 @@ def suspected(
     late[0] = problem.driven  # what drives has no delay; else the first stands for it
     if not (late.any() and around.of(late).freed.finite):
         return None
-    best = with_delays(problem, around, late, support, prices, max_terms=max_terms)[0]
-    gain = priced(around.at_rest, support, prices).score - best.score
+    best = fit_delays(problem, around, late, support, prices, max_terms=max_terms)[0]
+    gain = penalise(around.at_rest, support, prices).score - best.score
     if gain < log(problem.n_samples) + PAYS:
         return None
     delays = _those_that_show(problem, around, best.support, late)
@@ -107,15 +107,15 @@ def suspected(
     return delays if gain > PAYS and 0.0 < np.abs(delays).max() <= MOST_SAMPLES else None
 
 
-def with_delays(
-    problem: Problem,
+def fit_delays(
+    problem: EstimationProblem,
     around: DelayedGram,
     late: Bool[np.ndarray, " d"],
     support: Bool[np.ndarray, " free"],
     prices: Float[np.ndarray, " free"],
     *,
     max_terms: int,
-) -> tuple[Priced, Float[np.ndarray, " d"]]:
+) -> tuple[PenalisedFit, Float[np.ndarray, " d"]]:
     """The best terms where some states have a delay, and these, in mean steps."""
     own = around.of(late)
     best = best_support(problem, own.freed, prices, support, max_terms=max_terms)
@@ -125,7 +125,7 @@ def with_delays(
 
 
 def _those_that_show(
-    problem: Problem,
+    problem: EstimationProblem,
     around: DelayedGram,
     support: Bool[np.ndarray, " free"],
     late: Bool[np.ndarray, " d"],
@@ -148,9 +148,9 @@ def _those_that_show(
     return np.zeros(len(late))
 
 
-def moved(
-    problem: Problem, paths: Sequence[np.ndarray], delays: Float[np.ndarray, " d"]
-) -> Problem:
+def move_channels(
+    problem: EstimationProblem, paths: Sequence[np.ndarray], delays: Float[np.ndarray, " d"]
+) -> EstimationProblem:
     """The problem with every channel brought forward by its delay, in mean steps.
 
     A sample goes along the path that it lies beside, and keeps its distance: its noise stays white.

@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.estimation.kernels import departures, eliminated
-from ep2sindy.estimation.problem import Flow, Problem, Record
+from ep2sindy.estimation.kernels import departures, eliminate
+from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
 
 FREE_START = 100.0  # variance of the first state before any sample: ten times its RMS
 MOST_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
@@ -33,6 +33,9 @@ RIDGE = 1e-12  # of a Hessian of unit diagonal
 # What samples that resolve the motion never need: then it is coefficients that run away, and each
 # substep costs as much as the first.
 MOST_SUBSTEPS, FEWEST_ALLOWED, MOST_IN_ALL = 32, 4, 20_000
+FAR_OUT = 1e3  # noise beyond a limit, where it is a value to all digits
+TELLS = 1e-3  # share of a value's weight, below which limits say nothing of a state between them
+LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,7 @@ class Level:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class TrajectoryFit:
     """States and coefficients. paths: by record, (samples, d), scaled. free: (free,), zero
     outside the support. squares: (d,), what is least, by state; infinite where the flow is."""
 
@@ -90,7 +93,7 @@ class Gram:
 
 
 def squares(
-    problem: Problem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
+    problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
 ) -> Float[np.ndarray, " d"]:
     """What is least, by state."""
     total = np.zeros(len(problem.states))
@@ -99,12 +102,12 @@ def squares(
             problem.records, paths, level.variances, level.processes, strict=True
         ):
             misses = problem.ends(record, path[:-1], free, level.n_substeps) - path[1:]
-            total += seen(record, path, variance).squares.sum(axis=0)
+            total += observe(record, path, variance).squares.sum(axis=0)
             total += (np.square(misses) / process).sum(axis=0)
     return np.where(np.isfinite(total), total, np.inf)
 
 
-def fitted(problem: Problem, fit: Fit, level: Level) -> Fit:
+def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
     """The nearest least squares over states and coefficients, by Gauss-Newton with halved steps."""
     fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
@@ -133,7 +136,7 @@ def fitted(problem: Problem, fit: Fit, level: Level) -> Fit:
     return fit
 
 
-def gram(problem: Problem, fit: Fit, level: Level) -> Gram:
+def gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Gram:
     """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
     everything = np.ones_like(fit.support)
     quadratic, gradient, least = _hessian(problem, fit, everything, level)[:3]
@@ -143,7 +146,7 @@ def gram(problem: Problem, fit: Fit, level: Level) -> Gram:
 
 
 def covariance(
-    problem: Problem, fit: Fit, level: Level
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> Float[np.ndarray, "support support"] | None:
     """Of the support's free coefficients, scaled; None where the fit runs away."""
     hessian = _hessian(problem, fit, fit.support, level)[0]
@@ -153,7 +156,9 @@ def covariance(
     return np.linalg.pinv(hessian / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
-def enough_substeps(problem: Problem, fit: Fit, level: Level, *, share: float = 0.1) -> int:
+def enough_substeps(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, share: float = 0.1
+) -> int:
     """Runge-Kutta steps between samples that err by less than a share of what the flow may."""
     n = level.n_substeps
     most = min(MOST_SUBSTEPS, max(FEWEST_ALLOWED, MOST_IN_ALL // problem.n_samples))
@@ -176,7 +181,7 @@ def enough_substeps(problem: Problem, fit: Fit, level: Level, *, share: float = 
 
 
 def _step(
-    problem: Problem, fit: Fit, level: Level
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
     """One Gauss-Newton step: of the free coefficients, and of every path."""
     hessian, gradient, _, flows = _hessian(problem, fit, fit.support, level)
@@ -192,7 +197,7 @@ def _step(
     for k, (record, path, flow) in enumerate(zip(problem.records, fit.paths, flows, strict=True)):
         misses = flow.ends - path[1:] + flow.slopes[:, :, d:] @ step
         by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
-        residuals, variance, _ = seen(record, path, level.variances[k])
+        residuals, variance, _ = observe(record, path, level.variances[k])
         moves.append(
             departures(by_state, misses, residuals, variance, level.processes[k], FREE_START)
         )
@@ -200,7 +205,7 @@ def _step(
 
 
 def _hessian(
-    problem: Problem, fit: Fit, support: Bool[np.ndarray, " free"], level: Level
+    problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
 ) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
     """`hessian` by a support's coefficients."""
     return hessian(
@@ -212,7 +217,10 @@ def _hessian(
 
 
 def hessian(
-    problem: Problem, fit: Fit, level: Level, flow_of: Callable[[Record, np.ndarray], Flow]
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    level: Level,
+    flow_of: Callable[[ScaledRecord, np.ndarray], Flow],
 ) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
     """Half the second derivatives by what the flow has slopes of, minus half the first, the least
     squares with none of it changed, and the flows."""
@@ -222,8 +230,8 @@ def hessian(
         problem.records, fit.paths, level.variances, level.processes, strict=True
     ):
         flow = flow_of(record, path)
-        residuals, apparent, _ = seen(record, path, variance)
-        parts = eliminated(
+        residuals, apparent, _ = observe(record, path, variance)
+        parts = eliminate(
             flow.slopes, flow.ends - path[1:], residuals, apparent, process, FREE_START
         )
         total = [whole + part for whole, part in zip(total, parts[:3], strict=True)]
@@ -234,11 +242,6 @@ def hessian(
 def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
     """Roots of the diagonal; one for a term that has no part, whose row is zero or rounding."""
     return np.sqrt(zero_to_one(np.maximum(np.diag(hessian), 0.0)))
-
-
-FAR_OUT = 1e3  # noise beyond a limit, where it is a value to all digits
-TELLS = 1e-3  # share of a value's weight, below which limits say nothing of a state between them
-LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 
 
 class Seen(NamedTuple):
@@ -253,8 +256,10 @@ class Seen(NamedTuple):
     squares: Float[np.ndarray, "samples d"]
 
 
-def seen(
-    record: Record, path: Float[np.ndarray, "samples d"], variance: Float[np.ndarray, "samples d"]
+def observe(
+    record: ScaledRecord,
+    path: Float[np.ndarray, "samples d"],
+    variance: Float[np.ndarray, "samples d"],
 ) -> Seen:
     """How samples of a noise see a path."""
     residuals = record.samples - path

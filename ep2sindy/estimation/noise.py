@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.estimation.kernels import eliminated
-from ep2sindy.estimation.likelihood import FREE_START, Fit, Level, fitted, seen
+from ep2sindy.estimation.kernels import eliminate
+from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, fit_paths, observe
 from ep2sindy.estimation.likelihood import squares as squares_of
-from ep2sindy.estimation.problem import Problem
+from ep2sindy.estimation.problem import EstimationProblem
 
 FLOOR = 1e-3  # of the RMS: no model and no integration is exact
 SIGNIFICANT = 3.5  # standard errors of an autocorrelation
@@ -71,7 +71,7 @@ class Noise:
         return (1.0 - self.memory) / (1.0 + self.memory)
 
 
-def noise_beside(problem: Problem, fit: Fit) -> Noise:
+def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     """Size, shape and memory of what a fit leaves; memory as AR(1)."""
     left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
     n = problem.n_samples
@@ -110,7 +110,7 @@ def noise_beside(problem: Problem, fit: Fit) -> Noise:
 
 
 def _likeliest_std(
-    problem: Problem, fit: Fit, std: Float[np.ndarray, " d"]
+    problem: EstimationProblem, fit: TrajectoryFit, std: Float[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """Where sensors have limits: the noise under which the samples are likeliest, and -2 log of
     their likelihood, beside that of values alone."""
@@ -123,19 +123,19 @@ def _likeliest_std(
         deviance = n_values * (np.log(np.square(tried)) - 1.0)
         for record, path in zip(problem.records, fit.paths, strict=True):
             variance = np.broadcast_to(np.square(tried), path.shape)
-            deviance = deviance + seen(record, path, variance).squares.sum(axis=0)
+            deviance = deviance + observe(record, path, variance).squares.sum(axis=0)
         found = np.where(deviance < best, tried, found)
         best = np.minimum(deviance, best)
     return found, best
 
 
 def _pulls(
-    problem: Problem, fit: Fit, std: Float[np.ndarray, " d"]
+    problem: EstimationProblem, fit: TrajectoryFit, std: Float[np.ndarray, " d"]
 ) -> list[Float[np.ndarray, "samples d"]]:
     """What is left of values; of limits, what the noise is thought to have been."""
     pulls = []
     for record, path in zip(problem.records, fit.paths, strict=True):
-        by_sample = seen(record, path, np.broadcast_to(np.square(std), path.shape))
+        by_sample = observe(record, path, np.broadcast_to(np.square(std), path.shape))
         pull = by_sample.residuals / by_sample.variance * np.square(std)
         pulls.append(np.where(np.isfinite(pull), pull, 0.0))
     return pulls
@@ -175,7 +175,7 @@ def _shapes(
 
 
 def _tails(
-    problem: Problem,
+    problem: EstimationProblem,
     left: Sequence[Float[np.ndarray, "samples d"]],
     memory: Float[np.ndarray, " d"],
 ) -> tuple[Float[np.ndarray, " d"], Int[np.ndarray, " d"]]:
@@ -193,7 +193,7 @@ def _tails(
     return kurtosis, outliers
 
 
-def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
+def flow_error(problem: EstimationProblem, fit: TrajectoryFit, noise: Noise, exact: Level) -> float:
     """rho under which the fit's support is most likely; 0 where an exact flow is.
 
     An exact flow is weighed with noise that lasts, where it does; one with error in white noise.
@@ -204,14 +204,14 @@ def flow_error(problem: Problem, fit: Fit, noise: Noise, exact: Level) -> float:
     best, found = _deviance(problem, fit, white) + by_memory - ERROR_SHOWS, 0.0
     for rho in LEVELS:
         level = replace(white, rho=rho)
-        fit = fitted(problem, fit, level)
+        fit = fit_paths(problem, fit, level)
         deviance = _deviance(problem, fit, level)
         if deviance < best:
             best, found = deviance, rho
     return found
 
 
-def _deviance(problem: Problem, fit: Fit, level: Level) -> float:
+def _deviance(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> float:
     """-2 log likelihood of the samples by their innovations, all noise scaled to its best size.
 
     Where there are limits, by Laplace's approximation, and the noise as it is: it is no scale then.
@@ -222,9 +222,9 @@ def _deviance(problem: Problem, fit: Fit, level: Level) -> float:
         problem.records, fit.paths, level.variances, level.processes, strict=True
     ):
         flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
-        residuals, apparent, _ = seen(record, path, variance)
+        residuals, apparent, _ = observe(record, path, variance)
         misses = flow.ends - path[1:]
-        _, _, squares, logs = eliminated(
+        _, _, squares, logs = eliminate(
             flow.slopes, misses, residuals, apparent, process, FREE_START
         )
         least, spread = least + squares, spread + logs
@@ -251,7 +251,10 @@ def _forgets(
 
 
 def _shown_by_samples(
-    problem: Problem, fit: Fit, std: Float[np.ndarray, " d"], memory: Float[np.ndarray, " d"]
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    std: Float[np.ndarray, " d"],
+    memory: Float[np.ndarray, " d"],
 ) -> Bool[np.ndarray, " d"]:
     """Whether noise of this size and memory would leave differences as large as the samples'.
 

@@ -22,12 +22,15 @@ from ep2sindy.library.library import Library
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.trust.memory import check_memory
 
+NUMBERS = 3.5  # held at once for each pair of coefficients, and for each coefficient and state
+
+SOON = 300  # coefficients that are searched within a minute or so
 # Where each Runge-Kutta stage stands in its step, and the share of its slope in the sum.
 STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class ScaledRecord:
     """One trajectory in scaled variables.
 
     steps: (samples - 1,), in units of the mean step. samples: (samples, d). inputs: cubics
@@ -49,12 +52,12 @@ class Record:
 
     def kept(
         self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
-    ) -> Record:
+    ) -> ScaledRecord:
         """Some samples alone, with others in their place."""
         limits, by = self.limits, samples - self.samples[kept]
         if limits is not None:
             limits = replace(limits, lower=limits.lower[kept] + by, upper=limits.upper[kept] + by)
-        return Record(self.times[kept], samples, self.inputs[kept], limits)
+        return ScaledRecord(self.times[kept], samples, self.inputs[kept], limits)
 
     @cached_property
     def steps(self) -> Float[np.ndarray, " steps"]:
@@ -88,7 +91,7 @@ class Flow:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class EstimationProblem:
     """Records, the library of their variables, and the coefficients: coef = C free + fixed.
 
     library: of scaled variables, states first. term_names: of its terms, variables in SI. equation,
@@ -101,7 +104,7 @@ class Problem:
     library: Library
     term_names: tuple[str, ...]
     states: tuple[str, ...]
-    records: tuple[Record, ...]
+    records: tuple[ScaledRecord, ...]
     equation: Int[np.ndarray, " coefficients"]
     column: Int[np.ndarray, " coefficients"]
     C: Float[np.ndarray, "coefficients free"]
@@ -155,7 +158,7 @@ class Problem:
         return any(record.inputs.shape[1] for record in self.records)
 
     def rates(
-        self, record: Record, states: Float[np.ndarray, "samples d"], free: np.ndarray
+        self, record: ScaledRecord, states: Float[np.ndarray, "samples d"], free: np.ndarray
     ) -> Float[np.ndarray, "samples d"]:
         """Derivatives at the samples, by the mean step."""
         values = self._product_values(states, record.inputs)
@@ -163,7 +166,7 @@ class Problem:
 
     def ends(
         self,
-        record: Record,
+        record: ScaledRecord,
         states: Float[np.ndarray, "steps d"],
         free: Float[np.ndarray, " free"],
         n_substeps: int,
@@ -182,7 +185,7 @@ class Problem:
 
     def flow(
         self,
-        record: Record,
+        record: ScaledRecord,
         states: Float[np.ndarray, "steps d"],
         free: Float[np.ndarray, " free"],
         support: Bool[np.ndarray, " free"],
@@ -218,7 +221,7 @@ class Problem:
         return Flow(states, slopes)
 
     def _products_at(
-        self, record: Record, states: Float[np.ndarray, "steps d"], share: float
+        self, record: ScaledRecord, states: Float[np.ndarray, "steps d"], share: float
     ) -> Float[np.ndarray, "steps products"]:
         return self._product_values(states, record.inputs_at(share))
 
@@ -253,7 +256,7 @@ def scaled_problem(
     terms: Mapping[str, Sequence[str]] | None = None,
     *,
     advance: Advance = nothing,
-) -> Problem:
+) -> EstimationProblem:
     """Scale records and library, and gather the coefficients that may be in the model.
 
     relations: hold between coefficients. terms: by state, all the terms of an equation that is
@@ -271,7 +274,7 @@ def scaled_problem(
     equation = np.array([states.index(state) for state, _ in held.coefficients])
     to_SI = size[equation] / (numbers[column] * step_s)
     known = np.isin(equation, [states.index(state) for state in terms or {}])
-    return Problem(
+    return EstimationProblem(
         library=scaled,
         term_names=over.names,
         states=tuple(states),
@@ -288,9 +291,9 @@ def scaled_problem(
     )
 
 
-def _record(run: Trajectory, size: np.ndarray, step_s: float) -> Record:
+def _record(run: Trajectory, size: np.ndarray, step_s: float) -> ScaledRecord:
     d = len(run.state_names)
-    return Record(
+    return ScaledRecord(
         times=(run.t - run.t[0]) / step_s,
         samples=run.states / size[:d],
         inputs=run.inputs / size[d:],
@@ -301,11 +304,6 @@ def _record(run: Trajectory, size: np.ndarray, step_s: float) -> Record:
 def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:
     found = bounds_of(run.states, run.state_names)
     return found and replace(found, lower=found.lower / size, upper=found.upper / size)
-
-
-NUMBERS = 3.5  # held at once for each pair of coefficients, and for each coefficient and state
-
-SOON = 300  # coefficients that are searched within a minute or so
 
 
 class SlowSearch(UserWarning):
@@ -326,13 +324,14 @@ def check_size(
     check_memory(
         8.0 * NUMBERS * n * (n + n_samples * len(states)),
         f"{what} that are estimated together from {n_samples} samples",
-        way_out="take fewer terms or a lower degree, every second sample (ep2sindy.decimate), or a "
-        "search equation by equation: Recipe(WeightedWeak()), or search=best_subset selection=ebic",
+        way_out="take fewer terms or a lower degree, every second sample "
+        "(ep2sindy.prepare.decimate), or a search equation by equation: "
+        "Regression(WeightedWeak()), or search=best_subset selection=ebic",
     )
     if n > SOON:
         warnings.warn(
             f"{what} are searched together, which may take many minutes: fewer "
-            "terms, or a search equation by equation, Recipe(WeightedWeak()), take seconds",
+            "terms, or a search equation by equation, Regression(WeightedWeak()), take seconds",
             SlowSearch,
             stacklevel=2,
         )

@@ -1,18 +1,42 @@
-"""States and coefficients together: the estimator, its passes, and what it returns."""
+"""The estimator of states and coefficients together: from free states to exact trajectories.
+
+It begins with smoothed states, and every coefficient from their derivatives. Supports are chosen at
+every level on the way (`anneal`), weighed again at its end (`polish`), and with channels that come
+late brought forward (`solve`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import inf, log
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.estimation.anneal import COLD, COOLING, Annealed, annealed, polished, smoothed_start
-from ep2sindy.estimation.lateness import PAYS, moved, suspected, with_delays
+from ep2sindy.data.domain import kept_inside
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.estimation.lateness import (
+    PAYS,
+    DelayedGram,
+    delayed_gram,
+    fit_delays,
+    move_channels,
+    suspect_delays,
+)
+from ep2sindy.estimation.likelihood import (
+    FAR,
+    Level,
+    TrajectoryFit,
+    enough_substeps,
+    fit_paths,
+    gram,
+    squares,
+)
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
-from ep2sindy.estimation.problem import Problem
-from ep2sindy.estimation.supports import term_prices
+from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.supports import alternatives, best_support, excess, term_prices
+from ep2sindy.signals.kalman import KalmanSmoother
 
 SAMPLES_PER_TERM = 5  # of the library: fewer do not tell which
 SAMPLES_PER_COEFFICIENT = 10  # of an equation, where they do not: more terms follow the noise
@@ -20,37 +44,31 @@ LET_GO = 0.5  # of a state's spread: what is left of a state that the model does
 ENOUGH_SAMPLES = 300  # to trust the first start: fewer are quickly tried from all
 # Moves of late channels, since the model of a delay is linear; mean steps that need no other.
 MOST_MOVES, SETTLED = 3, 0.05
+FEWEST_LEFT = 5  # samples of a record, that a smoother takes
 MOST_PASSES = 4  # until noise and support agree: two are the rule
 # Of the smoother, by log10 of process to measurement noise: where the likely one leads astray.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
+# rho, and the share of a term's price that is asked there: free states hide part of what a term
+# explains, and what is dropped too early would have to be found again.
+COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
+COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
+MOST_EXCHANGES = 3  # of supports at one level
+# Where supports are weighed again: colder, a linear model of the flow tells too little of others;
+# warmer, free states hide what tells them apart.
+WEIGHED_AT = 0.003
+WITHIN, MOST_TRIED, MOST_ROUNDS = 12.0, 6, 6  # above the chosen score; of each round; of all
+UNSURE = 0.05  # of the RMS: noise taken for a start where the smoother's is not believed
+CUTOFF = 1e-8  # singular values of unit columns: smaller ones follow noise
 
 
-@dataclass(frozen=True)
-class Joint:
-    """Search by the likelihood of whole trajectories, states and coefficients fitted together.
-
-    For noisy samples of all states of a system whose law the library holds: no derivative is
-    estimated, so it finds what no regression can (docs/estimation.md). White noise, or noise that
-    lasts for some samples. max_terms: of one equation. align: channels that are found to come late
-    are brought forward; else the model is said to be a misfit, with their delays.
-    Raises ValueError for fewer than one term.
-    """
-
-    max_terms: int = 7
-    align: bool = False
-
-    def __post_init__(self) -> None:
-        if self.max_terms < 1:
-            raise ValueError(f"max_terms must be at least 1: {self.max_terms} came")
-
-    def terms_for(self, problem: Problem) -> int:
-        """Terms that one equation may have: fewer where the samples are few."""
-        if enough_samples(problem):
-            return self.max_terms
-        return max(1, min(self.max_terms, problem.n_samples // SAMPLES_PER_COEFFICIENT))
+def max_terms_for(problem: EstimationProblem, max_terms: int) -> int:
+    """Terms that one equation may have: fewer than asked for where the samples are few."""
+    if enough_samples(problem):
+        return max_terms
+    return max(1, min(max_terms, problem.n_samples // SAMPLES_PER_COEFFICIENT))
 
 
-def enough_samples(problem: Problem) -> bool:
+def enough_samples(problem: EstimationProblem) -> bool:
     """Whether they can tell which terms of the library there are."""
     return problem.n_samples >= SAMPLES_PER_TERM * len(problem.library)
 
@@ -59,7 +77,7 @@ def enough_samples(problem: Problem) -> bool:
 class Solution:
     """The end of one start. score: -2 log likelihood plus prices, comparable between starts."""
 
-    annealed: Annealed
+    annealed: AnnealedFit
     noise: Noise
     prices: Float[np.ndarray, " free"]
     flow_error: float
@@ -84,12 +102,12 @@ class Aligned:
     delays: (d,), in mean steps.
     """
 
-    problem: Problem
+    problem: EstimationProblem
     solution: Solution
     delays: Float[np.ndarray, " d"]
 
 
-def solve(problem: Problem, *, max_terms: int) -> tuple[Solution, Aligned | None]:
+def solve(problem: EstimationProblem, *, max_terms: int) -> tuple[Solution, Aligned | None]:
     """The most likely support from the likely smoothing, and from others where it fits badly; and
     what explains the samples better, if some channels come late."""
     spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
@@ -100,32 +118,34 @@ def solve(problem: Problem, *, max_terms: int) -> tuple[Solution, Aligned | None
         return int(let_go.sum()), each.score
 
     best = first = _from_start(problem, None, max_terms)
-    late = _aligned(problem, first, max_terms)
+    late = _align(problem, first, max_terms)
     for log10_ratio in OTHER_STARTS:
         if late or (best.fits and problem.n_samples >= ENOUGH_SAMPLES):
             break
         best = min([best, _from_start(problem, log10_ratio, max_terms)], key=rank)
-    return best, late if best is first else _aligned(problem, best, max_terms)
+    return best, late if best is first else _align(problem, best, max_terms)
 
 
-def _aligned(problem: Problem, found: Solution, max_terms: int) -> Aligned | None:
+def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Aligned | None:
     """What fits, and is likelier, with channels that come late; None where none does."""
     around = found.annealed.around
     if around is None:  # no model follows the samples
         return None
     support = found.annealed.fit.support
-    step = suspected(problem, around, support, found.prices, max_terms=max_terms)
+    step = suspect_delays(problem, around, support, found.prices, max_terms=max_terms)
     if step is None:
         return None
     here, now, late, delays = problem, found, step != 0.0, np.zeros(len(step))
     for _ in range(MOST_MOVES):
         delays = delays + step
-        here = moved(here, now.annealed.fit.paths, step)
+        here = move_channels(here, now.annealed.fit.paths, step)
+        if min(len(record.samples) for record in here.records) < FEWEST_LEFT:
+            return None  # brought as far apart as a record is long: that is no delay
         now = _from_start(here, None, max_terms)
         if now.annealed.around is None:
             return None
         around, support = now.annealed.around, now.annealed.fit.support
-        step = with_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
+        step = fit_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
         if np.abs(step).max() < SETTLED:
             break
     # Samples at the ends are left out: their share of the likelihood is that of the others.
@@ -134,21 +154,179 @@ def _aligned(problem: Problem, found: Solution, max_terms: int) -> Aligned | Non
     return Aligned(here, now, delays) if now.fits and score + price < found.score else None
 
 
-def _from_start(problem: Problem, log10_ratio: float | None, max_terms: int) -> Solution:
+def _from_start(problem: EstimationProblem, log10_ratio: float | None, max_terms: int) -> Solution:
     """Anneal with the smoother's noise, then with the noise that the model leaves, until both
     and the support agree."""
     fit, std = smoothed_start(problem, log10_ratio)
     prices = term_prices(problem, float(problem.n_samples))
-    found = annealed(problem, fit, std, prices, COOLING, max_terms=max_terms)
+    found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)
     for _ in range(MOST_PASSES):
         before, noise = found.fit.support, noise_beside(problem, found.fit)
         prices = term_prices(problem, problem.n_samples * float(noise.independent.mean()))
-        found = annealed(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
+        found = anneal(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
         if np.array_equal(before, found.fit.support):
             break
-    found = polished(problem, found, prices, max_terms=max_terms)
+    found = polish(problem, found, prices, max_terms=max_terms)
     noise = noise_beside(problem, found.fit)
     error = 0.0
     if np.isfinite(found.score) and (noise.std > FLOOR).any():
         error = flow_error(problem, found.fit, noise, found.level)
     return Solution(found, noise, prices, error)
+
+
+@dataclass(frozen=True, eq=False)
+class AnnealedFit:
+    """A fit, the level that it ended at, and its squares plus the prices of its terms.
+
+    around: what is near it, where its support was weighed against others.
+    """
+
+    fit: TrajectoryFit
+    level: Level
+    score: float
+    around: DelayedGram | None = None
+
+
+def anneal(
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    noise: tuple[np.ndarray, ...],
+    prices: Float[np.ndarray, " free"],
+    schedule: Sequence[tuple[float, float]],
+    *,
+    max_terms: int,
+) -> AnnealedFit:
+    """Fit level by level; at each, exchange terms as long as squares plus prices fall."""
+    n_substeps, score = 1, np.inf
+    for rho, share in schedule:
+        fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
+        n_substeps = level.n_substeps
+        fit, score = _exchange_terms(problem, fit, level, share * prices, max_terms)
+    return AnnealedFit(fit, level, score)
+
+
+def polish(
+    problem: EstimationProblem,
+    found: AnnealedFit,
+    prices: Float[np.ndarray, " free"],
+    *,
+    max_terms: int,
+) -> AnnealedFit:
+    """Fit again whatever is nearly as likely by a linear model, and keep what is likelier.
+
+    What does not follow its samples is left: a linear model of that tells nothing.
+    """
+    if not found.fit.total < FAR * problem.n_squares:
+        return found
+    tried = {found.fit.support.tobytes()}
+    for _ in range(MOST_ROUNDS):
+        warmer, level = at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
+        around = delayed_gram(problem, warmer, level)
+        pair = around.at_rest
+        if not (pair.finite and np.isfinite(found.score)):
+            return found
+        others = alternatives(
+            problem, pair, prices, warmer.support, within=WITHIN, max_terms=max_terms
+        )
+        others = [each for each in others if each.support.tobytes() not in tried]
+        for each in others[:MOST_TRIED]:
+            tried.add(each.support.tobytes())
+            start = replace(warmer, support=each.support, free=each.free)
+            fit, cold = at_level(problem, start, level)
+            fit, cold = at_level(problem, fit, replace(cold, rho=found.level.rho))
+            score = float(fit.total + prices[fit.support].sum())
+            if score < found.score:
+                found = AnnealedFit(fit, cold, score)
+                break
+        else:
+            return replace(found, around=around)
+    return found
+
+
+def at_level(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+) -> tuple[TrajectoryFit, Level]:
+    """Fit at a level, with as many substeps as that asks for."""
+    level = replace(level, n_substeps=enough_substeps(problem, fit, level))
+    if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():
+        fit = replace(fit, free=np.zeros_like(fit.free))  # a flow that stands still is finite
+    return fit_paths(problem, fit, level), level
+
+
+def _exchange_terms(
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    level: Level,
+    prices: Float[np.ndarray, " free"],
+    max_terms: int,
+) -> tuple[TrajectoryFit, float]:
+    """Exchange terms by the Gram pair, fit again, and accept what lowers squares plus prices."""
+    score = fit.total + prices[fit.support].sum()
+    for _ in range(MOST_EXCHANGES):
+        pair = gram(problem, fit, level)
+        if not (pair.finite and np.isfinite(score)):
+            break
+        found = best_support(problem, pair, prices, fit.support, max_terms=max_terms)
+        if np.array_equal(found.support, fit.support):
+            break
+        tried = fit_paths(problem, replace(fit, support=found.support, free=found.free), level)
+        tried_score = tried.total + prices[found.support].sum()
+        too_large = excess(problem, fit.support, max_terms) > 0
+        if not (tried_score < score or (too_large and np.isfinite(tried_score))):
+            break
+        fit, score = tried, tried_score
+    return fit, float(score)
+
+
+def smoothed_start(
+    problem: EstimationProblem, log10_ratio: float | None
+) -> tuple[TrajectoryFit, tuple[np.ndarray, ...]]:
+    """All coefficients free, on smoothed states; and the noise beside them, by record (samples, d).
+
+    log10_ratio: of the smoother; None finds the most likely one of each record and state. Below
+    some twenty samples a period the likely one may take signal for noise.
+    """
+    smoother = KalmanSmoother(log10_ratio)
+    estimates = [smoother.estimate(r.times, r.samples) for r in problem.records]
+    variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
+    samples = [np.concatenate([r.samples, r.inputs], axis=1) for r in problem.records]
+    values = [
+        kept_inside(problem.library, np.concatenate([e.smoothed, r.inputs], axis=1), raw)
+        for e, r, raw in zip(estimates, problem.records, samples, strict=True)
+    ]
+    paths = tuple(each[:, : len(problem.states)] for each in values)
+    theta = np.concatenate([problem.library.evaluate(each) for each in values])
+    rates = np.concatenate([e.derivative for e in estimates])
+    support = np.ones(problem.C.shape[1], dtype=np.bool_)
+    fit = TrajectoryFit(
+        paths, _regress(problem, theta, rates), support, np.full(len(variance), np.inf)
+    )
+    std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
+    return fit, tuple(np.tile(std, (len(path), 1)) for path in paths)
+
+
+def _regress(
+    problem: EstimationProblem,
+    theta: Float[np.ndarray, "samples terms"],
+    rates: Float[np.ndarray, "samples d"],
+) -> Float[np.ndarray, " free"]:
+    """Least squares of all equations at once, relations held."""
+    n, d = rates.shape
+    rows = np.zeros((n, d, len(problem.equation)))
+    for k, (equation, column) in enumerate(zip(problem.equation, problem.column, strict=True)):
+        rows[:, equation, k] = theta[:, column]
+    target = (rates - rows @ problem.fixed).reshape(-1)
+    if problem.related:
+        return _solve(rows.reshape(n * d, -1) @ problem.C, target)
+    free = np.zeros(problem.C.shape[1])
+    for equation in range(d):  # far smaller, equation by equation
+        own = problem.equation == equation
+        free[own] = _solve(rows[:, equation, own], target.reshape(n, d)[:, equation])
+    return free
+
+
+def _solve(
+    rows: Float[np.ndarray, "rows columns"], target: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " columns"]:
+    size = zero_to_one(np.linalg.norm(rows, axis=0))
+    return np.linalg.lstsq(rows / size, target, rcond=CUTOFF)[0] / size

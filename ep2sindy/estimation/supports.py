@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, unit_sizes
-from ep2sindy.estimation.problem import Problem
+from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.search.searches import BestSubset
 
 MOST_SWEEPS = 10  # over the equations: two or three are the rule
@@ -19,7 +19,7 @@ CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which ter
 
 
 @dataclass(frozen=True, eq=False)
-class Priced:
+class PenalisedFit:
     """A support, the best free coefficients on it, and its squares plus the prices of its terms."""
 
     support: Bool[np.ndarray, " free"]
@@ -27,7 +27,7 @@ class Priced:
     score: float
 
 
-def term_prices(problem: Problem, n_samples: float) -> Float[np.ndarray, " free"]:
+def term_prices(problem: EstimationProblem, n_samples: float) -> Float[np.ndarray, " free"]:
     """What a coefficient must lower the squares by: log n, and what singles it out.
 
     A term of degree q is one of d C(d + q, q), and every degree above the first is half as likely
@@ -41,68 +41,73 @@ def term_prices(problem: Problem, n_samples: float) -> Float[np.ndarray, " free"
 
 
 def best_support(
-    problem: Problem,
+    problem: EstimationProblem,
     gram: Gram,
     prices: Float[np.ndarray, " free"],
     start: Bool[np.ndarray, " free"],
     *,
     max_terms: int,
     held: int | None = None,
-) -> Priced:
+) -> PenalisedFit:
     """The support of least score: every equation's exactly, given the others', until none changes.
 
     max_terms: of one equation. Those required are always in. held: an equation left as it is.
     """
 
-    def rank(each: Priced) -> tuple[int, float]:
+    def rank(each: PenalisedFit) -> tuple[int, float]:
         return excess(problem, each.support, max_terms), each.score
 
-    best = priced(gram, start, prices)
+    best = penalise(gram, start, prices)
     for _ in range(MOST_SWEEPS):
         before = best
         for block in np.unique(problem.block):
             own = problem.block == block
             if block == held or problem.required[own].all():
                 continue
-            offered = _offered(problem, gram, best.support, own, max_terms)
-            best = min([best, *(priced(gram, s, prices) for s in offered)], key=rank)
+            offered = _offer_supports(problem, gram, best.support, own, max_terms)
+            best = min([best, *(penalise(gram, s, prices) for s in offered)], key=rank)
         if best is before:
             return best
     return best
 
 
-def excess(problem: Problem, support: Bool[np.ndarray, " free"], max_terms: int) -> int:
+def excess(problem: EstimationProblem, support: Bool[np.ndarray, " free"], max_terms: int) -> int:
     """By how many terms a support is too large, of those that are not required."""
     sizes = np.bincount(problem.block[support & ~problem.required], minlength=1)
     return int(np.maximum(sizes - max_terms, 0).sum())
 
 
 def supports_by_size(
-    problem: Problem, gram: Gram, chosen: Bool[np.ndarray, " free"], block: int, *, max_terms: int
+    problem: EstimationProblem,
+    gram: Gram,
+    chosen: Bool[np.ndarray, " free"],
+    block: int,
+    *,
+    max_terms: int,
 ) -> list[Bool[np.ndarray, " free"]]:
     """The best few supports of every size of one equation, the others as chosen."""
-    return _offered(problem, gram, chosen, problem.block == block, max_terms)
+    return _offer_supports(problem, gram, chosen, problem.block == block, max_terms)
 
 
 def alternatives(
-    problem: Problem,
+    problem: EstimationProblem,
     gram: Gram,
     prices: Float[np.ndarray, " free"],
     chosen: Bool[np.ndarray, " free"],
     *,
     within: float,
     max_terms: int,
-) -> list[Priced]:
+) -> list[PenalisedFit]:
     """Supports whose score lies no further than `within` above the chosen one's, best first.
 
     Each is an equation's own, with what is then best for the others: exchanges in two equations
     of which neither pays alone are among them.
     """
-    limit = priced(gram, chosen, prices).score + within
-    found: dict[bytes, Priced] = {}
+    limit = penalise(gram, chosen, prices).score + within
+    found: dict[bytes, PenalisedFit] = {}
     for block in np.unique(problem.block).tolist():
         masks = supports_by_size(problem, gram, chosen, block, max_terms=max_terms)
-        seeds = [priced(gram, m, prices) for m in masks if not np.array_equal(m, chosen)]
+        seeds = [penalise(gram, m, prices) for m in masks if not np.array_equal(m, chosen)]
         seeds = [each for each in seeds if each.score <= limit + within]
         for seed in sorted(seeds, key=lambda each: each.score)[:MOST_ALTERNATIVES]:
             each = best_support(
@@ -114,9 +119,9 @@ def alternatives(
     return sorted(found.values(), key=lambda each: each.score)
 
 
-def priced(
+def penalise(
     gram: Gram, support: Bool[np.ndarray, " free"], prices: Float[np.ndarray, " free"]
-) -> Priced:
+) -> PenalisedFit:
     """The least squares on a support, with its terms' prices."""
     free = np.zeros(len(support))
     quadratic, linear = gram.quadratic[np.ix_(support, support)], gram.linear[support]
@@ -125,11 +130,11 @@ def priced(
     # One refinement: what the cutoff dropped has no part in it.
     free[support] += inverse @ (linear - quadratic @ free[support])
     rest = gram.offset - 2.0 * gram.linear @ free + free @ gram.quadratic @ free
-    return Priced(support, free, float(rest + prices[support].sum()))
+    return PenalisedFit(support, free, float(rest + prices[support].sum()))
 
 
-def _offered(
-    problem: Problem,
+def _offer_supports(
+    problem: EstimationProblem,
     gram: Gram,
     chosen: Bool[np.ndarray, " free"],
     own: Bool[np.ndarray, " free"],

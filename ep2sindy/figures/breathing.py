@@ -13,20 +13,28 @@ from matplotlib.figure import Figure
 
 from ep2sindy.data.fields import cell_edges
 from ep2sindy.figures.maps import CM
-from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above, unit_text
+from ep2sindy.figures.style import (
+    COLOURS,
+    DATA,
+    GREY,
+    legend_above,
+    make_grid,
+    make_panels,
+    unit_text,
+)
 from ep2sindy.signals.spectrum import power_spectrum
 
 PROFILES = ("n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization")
 MAPS = {"n_n": "viridis", "n_i": "magma"}  # colours told apart by any eye, and in grey
-SHARES = (5, 95)  # %, of the inner band of a profile
+BAND_PERCENT = (5, 95)  # %, of the inner band of a profile
 READABLE = {"m/s": (1e-3, "km/s"), "V/m": (1e-3, "kV/m")}
 MS, KHZ = 1e3, 1e-3
 
 
 def current_figure(field: xr.Dataset, window: slice) -> Figure:
     """The discharge current over the whole record, and over a few periods beside the beam's."""
-    figure = Figure(figsize=(9.0, 4.8), layout="constrained")
-    whole, part = figure.subplots(2, 1)
+    figure, axes = make_panels(2, 1, (9.0, 4.8))
+    whole, part = axes.flat
     time = MS * field["time"].values
     whole.plot(time, field["I_d"].values, color=DATA, lw=0.5)
     if window.stop - window.start < time.size:
@@ -40,14 +48,14 @@ def current_figure(field: xr.Dataset, window: slice) -> Figure:
         part.plot(time[window], beam, color=COLOURS[0], lw=1.3, ls="--", label="ion beam current")
     for ax, values in ((whole, field["I_d"].values), (part, highest)):
         ax.set_ylabel("current (A)")
-        _from_zero(ax, values)
+        _hold_zero(ax, values)
         ax.margins(x=0.0)
     part.set_xlabel("time after the warm-up (ms)")
     legend_above(figure, part.lines)
     return figure
 
 
-def spectrum_figure(
+def current_spectrum_figure(
     field: xr.Dataset, *, f_kHz: float, f_max_Hz: float, transit_Hz: float
 ) -> Figure:
     """Power of the discharge current over frequency, both logarithmic; the peak is marked.
@@ -56,8 +64,7 @@ def spectrum_figure(
     """
     frequency, power = power_spectrum(field["time"].values, field["I_d"].values)
     shown = (frequency > 0.0) & (frequency <= f_max_Hz)
-    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
-    ax = figure.subplots()
+    figure, ((ax,),) = make_panels(1, 1, (9.0, 3.8))
     floor = max(1e-12 * power.max(), np.finfo(float).tiny)
     ax.loglog(KHZ * frequency[shown], np.maximum(power[shown], floor), color=DATA, lw=0.8)
     if np.isfinite(f_kHz):
@@ -78,7 +85,7 @@ def profile_table(field: xr.Dataset) -> dict[str, Float[np.ndarray, "5 cells"]]:
     found = {}
     for name in (name for name in PROFILES if name in field):
         values = along_z(field[name])
-        low, high = np.percentile(values, SHARES, axis=0)
+        low, high = np.percentile(values, BAND_PERCENT, axis=0)
         found[name] = np.stack(
             [values.mean(axis=0), low, high, values.min(axis=0), values.max(axis=0)]
         )
@@ -88,44 +95,39 @@ def profile_table(field: xr.Dataset) -> dict[str, Float[np.ndarray, "5 cells"]]:
 def profile_figure(field: xr.Dataset) -> Figure:
     """Mean profiles with bands of 5 to 95 %, and of all that was, the channel's exit dashed."""
     profiles = profile_table(field)
-    n_rows = -(-len(profiles) // 3)
-    figure = Figure(figsize=(10.0, 2.6 * n_rows + 0.4), layout="constrained")
-    axes = figure.subplots(n_rows, 3, squeeze=False, sharex=True)
+    figure, axes = make_grid(
+        len(profiles), width=10 / 3, height=2.6, extra=0.4, sharex=True, most=3,
+        x_label="distance from the anode (cm)",
+    )  # fmt: skip
     z = CM * field["z"].values
-    for ax, (name, values) in zip(axes.flat, profiles.items(), strict=False):
-        (mean, low, high, least, most), unit = scaled(values, field[name].attrs["units"])
+    for ax, (name, values) in zip(axes, profiles.items(), strict=True):
+        (mean, low, high, least, most), unit = scale_to_prefix(values, field[name].attrs["units"])
         ax.fill_between(z, least, most, color=COLOURS[5], alpha=0.3, lw=0, label="whole range")
-        label = f"{SHARES[0]} to {SHARES[1]} % of the time"
+        label = f"{BAND_PERCENT[0]} to {BAND_PERCENT[1]} % of the time"
         ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=label)
         ax.plot(z, mean, color=DATA, lw=1.5, label="mean")
         ax.set_title(_words(field[name]), fontsize=10)
         ax.set_ylabel(unit)
         _mark_exit(ax, field, along="x")
         ax.margins(x=0.0)
-    for ax in axes.flat[len(profiles) :]:
-        ax.remove()
-    for ax in axes.flat[max(0, len(profiles) - 3) : len(profiles)]:
-        ax.set_xlabel("distance from the anode (cm)")
-        ax.tick_params(labelbottom=True)
-    legend_above(figure, axes.flat[0].get_legend_handles_labels()[0])
+    legend_above(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 
-def map_figure(field: xr.Dataset, window: slice) -> Figure:
+def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
     """The current, and below it neutrals and ions over time and axis, for a few periods."""
     names = [name for name in MAPS if name in field]
     shown = field.isel(time=window)
     time = MS * shown["time"].values
-    figure = Figure(figsize=(9.0, 1.7 + 2.4 * len(names)), layout="constrained")
-    axes = figure.subplots(
-        1 + len(names), 1, sharex=True, height_ratios=[1.0, *[1.7] * len(names)], squeeze=False
-    )[:, 0]
+    size, heights = (9.0, 1.7 + 2.4 * len(names)), [1.0, *[1.7] * len(names)]
+    figure, grid = make_panels(1 + len(names), 1, size, sharex=True, heights=heights)
+    axes = grid[:, 0]
     axes[0].plot(time, shown["I_d"].values, color=DATA, lw=1.3)
     axes[0].set_ylabel("discharge\ncurrent (A)")
-    _from_zero(axes[0], shown["I_d"].values)
+    _hold_zero(axes[0], shown["I_d"].values)
     edges = CM * cell_edges(field["z"].values.astype(float))
     for ax, name in zip(axes[1:], names, strict=True):
-        values, unit = scaled(along_z(shown[name]), field[name].attrs["units"])
+        values, unit = scale_to_prefix(along_z(shown[name]), field[name].attrs["units"])
         drawn = ax.pcolormesh(
             cell_edges(time), edges, values.T, cmap=MAPS[name], vmin=0.0, rasterized=True
         )
@@ -145,7 +147,7 @@ def along_z(array: xr.DataArray) -> Float[np.ndarray, "time z"]:
     return array.transpose("time", "z").values.astype(float)
 
 
-def scaled(
+def scale_to_prefix(
     values: Float[np.ndarray, "*shape"], unit: str
 ) -> tuple[Float[np.ndarray, "*shape"], str]:
     """Numbers to read, and what they count: 2e18 m^-3 are 2 in 10^18 m^-3."""
@@ -157,7 +159,7 @@ def scaled(
     return factor * values / 10.0**power, f"$10^{{{power}}}$ {unit_text(name)}"
 
 
-def _from_zero(ax: Axes, values: Float[np.ndarray, " time"]) -> None:
+def _hold_zero(ax: Axes, values: Float[np.ndarray, " time"]) -> None:
     """Limits that hold zero: a steady current must not look like one that moves."""
     low, high = min(0.0, float(values.min())), max(0.0, float(values.max()))
     ax.set_ylim(1.05 * low, (1.08 * high) or 1.0)

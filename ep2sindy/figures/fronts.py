@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS, GREY, hover, legend_above, panel_grid
+from ep2sindy.figures.style import COLOURS, GREY, hover_spot, legend_above, make_grid
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.search.front import Candidate, Cloud, ParetoFront
 from ep2sindy.selection.rule import selected
@@ -33,19 +33,24 @@ def front_figure(
 ) -> Figure:
     """Error against number of terms for every equation, log, the selected candidate marked.
 
+    Of a search of trajectories, which has no rows and so no error of them, the scores instead.
+
     Behind the front, light, every support that the search proposed. Errors below FLOOR are drawn
     on a line at it, those above TOP as marks at the upper edge.
     scores: by state, one per candidate, the lowest selected; label: what they are called.
     """
-    figure, axes = panel_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
+    figure, axes = make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
         chosen = selected(front, scores[state])
         index = front.candidates.index(chosen)
-        _front(ax, front, index)
-        _hovers(ax, front, scores[state], label)
+        if front.problem is None:
+            _draw_scores(ax, front, scores[state], index, label)
+        else:
+            _draw_front(ax, front, index)
+        _add_hovers(ax, front, scores[state], label)
         score = f"{_score_label(label)} = {scores[state][index]:.4g}"
-        ax.set_title(f"${latex_derivative(state)}$: {_terms(chosen)}\n{score}", fontsize=9)
-    entries = {line.get_label(): line for ax in axes for line in ax.lines if _labelled(line)}
+        ax.set_title(f"${latex_derivative(state)}$: {_write_terms(chosen)}\n{score}", fontsize=9)
+    entries = {line.get_label(): line for ax in axes for line in ax.lines if _has_label(line)}
     shown = [entries[name] for name in _LAYERS if name in entries]
     legend_above(figure, shown, n_columns=2 if len(axes) == 1 else None, size=9.0)
     return figure
@@ -55,31 +60,16 @@ def front_figure(
 _LAYERS = ("all supports fitted", "runners-up", "best of size", "selected")
 
 
-def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
+def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
     """All supports, runners-up, the best of every size as a line, and the star."""
-    every, runners_up, best_of_size, star = _LAYERS
     lowest = front.errors.min()
     if front.cloud is not None:
-        _cloud(ax, front.cloud, label=every)
+        _draw_cloud(ax, front.cloud, label=_LAYERS[0])
         lowest = min(lowest, front.cloud.errors.min(initial=np.inf))
-    best, errors = front.leading, np.clip(front.errors, FLOOR, TOP)
-    if not best.all():
-        others = front.sizes[~best], errors[~best]
-        ax.plot(*others, "o", mfc="none", mec=COLOURS[0], ms=5, zorder=3, label=runners_up)
-    ax.plot(
-        front.sizes[best], errors[best], "o-", c=COLOURS[0], ms=5, lw=1, zorder=4,
-        label=best_of_size,
-    )  # fmt: skip
-    ax.plot(
-        front.sizes[chosen], errors[chosen], "*", ms=14, color=COLOURS[1], mec="white", mew=0.5,
-        zorder=5, label=star,
-    )  # fmt: skip
-    rows = "held-out" if front.problem.test.any() else "training"
-    ax.set(xlabel="number of terms", ylabel=f"error, $1 - R^2$ ({rows} rows)", yscale="log")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _draw_candidates(ax, front, np.clip(front.errors, FLOOR, TOP), chosen)
+    rows = "held-out" if front.held_out else "training"
+    ax.set(ylabel=f"error, $1 - R^2$ ({rows} rows)", yscale="log")
     ax.set_ylim(0.4 * max(FLOOR, float(lowest)), TOP)
-    ax.margins(x=0.06)
-    ax.grid(axis="y", alpha=0.25)
     if lowest <= FLOOR:
         ax.axhline(FLOOR, color=GREY, lw=0.8, ls=":", zorder=1)
         ax.annotate(
@@ -88,17 +78,56 @@ def _front(ax: Axes, front: ParetoFront, chosen: int) -> None:
         )  # fmt: skip
 
 
-def _hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
+def _draw_scores(ax: Axes, front: ParetoFront, scores: np.ndarray, chosen: int, label: str) -> None:
+    """Runners-up, the best of every size as a line, and the star, by their scores.
+
+    Linear near zero, where the best are. A candidate that cannot be run, such as an equation
+    without terms, has no finite score, and stands at the upper edge.
+    """
+    _draw_candidates(ax, front, _finite(scores), chosen)
+    ax.set(ylabel=_score_label(label))
+    ax.set_yscale("symlog", linthresh=1.0)
+
+
+def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: int) -> None:
+    """Runners-up, the best of every size as a line, and the star."""
+    _, runners_up, best_of_size, star = _LAYERS
+    best = front.leading
+    if not best.all():
+        others = front.sizes[~best], heights[~best]
+        ax.plot(*others, "o", mfc="none", mec=COLOURS[0], ms=5, zorder=3, label=runners_up)
+    ax.plot(
+        front.sizes[best], heights[best], "o-", c=COLOURS[0], ms=5, lw=1, zorder=4,
+        label=best_of_size,
+    )  # fmt: skip
+    ax.plot(
+        front.sizes[chosen], heights[chosen], "*", ms=14, color=COLOURS[1], mec="white", mew=0.5,
+        zorder=5, label=star,
+    )  # fmt: skip
+    ax.set(xlabel="number of terms")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.margins(x=0.06)
+    ax.grid(axis="y", alpha=0.25)
+
+
+def _finite(scores: np.ndarray) -> np.ndarray:
+    """Scores, those without a finite one at ten times the largest that has."""
+    known = scores[np.isfinite(scores)]
+    return np.where(np.isfinite(scores), scores, 10.0 * max(known.max(initial=1.0), 1.0))
+
+
+def _add_hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
     """Over every candidate something that cannot be seen, and says which it is."""
-    errors = np.clip(front.errors, FLOOR, TOP)
-    for each, error, score in zip(front.candidates, errors, scores, strict=True):
-        (spot,) = ax.plot(each.n_terms, error, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
+    has_rows = front.problem is not None
+    heights = np.clip(front.errors, FLOOR, TOP) if has_rows else _finite(scores)
+    for each, height, score in zip(front.candidates, heights, scores, strict=True):
         terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
         text = f"{front.equation}' of {each.n_terms} terms: {terms}"
-        hover(spot, f"{text} | 1 - R2 = {error:.3g} | {label} = {score:.4g}")
+        error = f" | 1 - R2 = {height:.3g}" if has_rows else ""
+        hover_spot(ax, each.n_terms, height, f"{text}{error} | {label} = {score:.4g}")
 
 
-def _cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
+def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
     """Light dots; where the model is worse than none by far, carets at the upper edge."""
     above = cloud.errors > TOP
     style: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
@@ -112,14 +141,14 @@ def _cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
         ax.plot(sizes, at_edge, marker=6, ms=5, clip_on=False, **style)  # 6: a caret up
 
 
-def _terms(candidate: Candidate) -> str:
+def _write_terms(candidate: Candidate) -> str:
     """Of a title; a few in a line."""
     names = [f"${latex_term_name(name)}$" for name in candidate.terms]
     lines = [names[k : k + TERMS_A_LINE] for k in range(0, len(names), TERMS_A_LINE)]
     return ",\n".join(", ".join(line) for line in lines) or "0"
 
 
-def _labelled(line: Line2D) -> bool:
+def _has_label(line: Line2D) -> bool:
     return not str(line.get_label()).startswith("_")
 
 

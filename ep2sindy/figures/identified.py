@@ -24,10 +24,12 @@ from ep2sindy.figures.style import (
     DATA,
     GREY,
     Limits,
-    framing,
+    frame_limits,
     legend_above,
-    legend_marks,
+    legend_curves,
+    make_panels,
     mark_exits,
+    write_in_cell,
 )
 from ep2sindy.library.equations import latex_name
 from ep2sindy.model.rollout import Rollout
@@ -83,8 +85,8 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
     points: as `Study.points` of `studies.frontier` gives them.
     """
     variants = list(points["variant"].unique())
-    figure = Figure(figsize=(2.6 * len(variants) + 0.4, 3.5), layout="constrained")
-    axes = figure.subplots(1, len(variants), squeeze=False, sharex=True, sharey=True)[0]
+    size = (2.6 * len(variants) + 0.4, 3.5)
+    figure, (axes,) = make_panels(1, len(variants), size, sharex=True, sharey=True)
     for ax, variant in zip(axes, variants, strict=True):
         for (found, ran), marker in _MARKERS.items():
             kind = (points["identified"] == found) & ((points["reason"] == "") == ran)
@@ -119,18 +121,16 @@ def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
     """
     tables = {merit: merit_table(cells, thesis, merit) for merit in PANELS}
     n_rows, n_columns = tables["on_front"].shape
-    figure = Figure(
-        figsize=(1.8 + 2 * (0.36 * n_columns + 0.1), 0.9 + 0.25 * n_rows), layout="constrained"
-    )
-    axes = figure.subplots(1, len(PANELS), sharey=True, squeeze=False)[0]
+    size = (1.8 + 2 * (0.36 * n_columns + 0.1), 0.9 + 0.25 * n_rows)
+    figure, (axes,) = make_panels(1, len(PANELS), size, sharey=True)
     for ax, (merit, table) in zip(axes, tables.items(), strict=True):
-        _heat_map(ax, table)
+        _draw_heat_map(ax, table)
         ax.set_title(f"{PANELS[merit]} (%)", fontsize=10, pad=24)
     _name_rows(axes[0], tables["on_front"].index)
     return figure
 
 
-def _heat_map(ax: Axes, table: pd.DataFrame) -> None:
+def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
     values = table.to_numpy(dtype=float)
     scale = Normalize(0.0, 100.0)
     ax.pcolormesh(
@@ -138,16 +138,9 @@ def _heat_map(ax: Axes, table: pd.DataFrame) -> None:
     )
     for (row, column), value in np.ndenumerate(values):
         known = np.isfinite(value)
-        ax.text(
-            column + 0.5,
-            row + 0.5,
-            f"{value:.0f}" if known else "–",
-            ha="center",
-            va="center",
-            fontsize=7.5,
-            color="#777777" if not known else "white" if scale(value) > DARK else "black",
-            style="italic" if table.index[row][1] else "normal",
-        )
+        colour = "#777777" if not known else "white" if scale(value) > DARK else "black"
+        text = write_in_cell(ax, column, row, f"{value:.0f}" if known else "–", colour=colour)
+        text.set_fontstyle("italic" if table.index[row][1] else "normal")
     for row, (_, published) in enumerate(table.index):
         if not published:
             ax.axhline(row, color="white", lw=3)  # a variant and what the thesis says of it
@@ -205,15 +198,14 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
     noises = sorted({each.noise for each in found})
     width, height = (3.4, 1.7) if over_time else (2.6, 2.5)
     size = (width * len(systems) + 0.6, height * len(noises) + 0.9)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(len(noises), len(systems), squeeze=False, sharex="col", sharey="col")
+    figure, axes = make_panels(len(noises), len(systems), size, sharex="col", sharey="col")
     limits = {
-        system: _limits([each for each in found if each.system == system], over_time)
+        system: _frame_samples([each for each in found if each.system == system], over_time)
         for system in systems
     }
     for each in found:
         ax = axes[noises.index(each.noise), systems.index(each.system)]
-        _draw(ax, each, limits[each.system], over_time=over_time)
+        _draw_one(ax, each, limits[each.system], over_time=over_time)
         first, last = each.samples.state_names[0], each.samples.state_names[-1]
         across, up = ("time (s)", first) if over_time else (f"${latex_name(first)}$", last)
         ax.set_ylabel(f"${latex_name(up)}$", labelpad=1)
@@ -223,18 +215,20 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
         ax.set_title(f"{SYSTEM_LABELS.get(system, system)}\n{ax.get_title()}", fontsize=9)
     for ax, noise in zip(axes[:, 0], noises, strict=True):
         ax.set_ylabel(f"noise {100 * noise:g} %\n\n{ax.get_ylabel()}")
-    legend_above(figure, [*axes[0, 0].lines[:3], *legend_marks(axes.flat)], size=9.0)
+    legend_curves(figure, list(axes.flat), n=3)
     return figure
 
 
-def _limits(found: Sequence[Identified], over_time: bool) -> tuple[Limits, Limits]:
+def _frame_samples(found: Sequence[Identified], over_time: bool) -> tuple[Limits, Limits]:
     """Of all samples of one system, whatever the models do."""
     pairs = [_coordinates(each.samples.t, each.samples.states, over_time) for each in found]
-    x, y = (framing(np.concatenate(column), np.empty(0)) for column in zip(*pairs, strict=True))
-    return x, y
+    x, y = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return frame_limits(x, np.empty(0)), frame_limits(y, np.empty(0))
 
 
-def _draw(ax: Axes, each: Identified, limits: tuple[Limits, Limits], *, over_time: bool) -> None:
+def _draw_one(
+    ax: Axes, each: Identified, limits: tuple[Limits, Limits], *, over_time: bool
+) -> None:
     """Samples as dots, the truth as a line, the model as one that both show beneath."""
     x, y = _coordinates(each.samples.t, each.samples.states, over_time)
     step = -(-len(x) // MOST_DOTS)

@@ -15,9 +15,10 @@ from ep2sindy.figures.style import (
     DATA,
     GREY,
     axis_label,
-    framing,
+    frame_limits,
     legend_above,
-    panel_grid,
+    make_grid,
+    make_panels,
 )
 from ep2sindy.model.likeness import LONG
 from ep2sindy.model.rollout import Rollout
@@ -36,8 +37,7 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
     shown = min(PERIODS * period_s, 0.5 * float(run.t[-1] - run.t[0]))
     factor, unit = run.clock.scale(shown)
     n = len(run.state_names)
-    figure = Figure(figsize=(9.0, 2.2 * n + 0.8), layout="constrained")
-    axes = figure.subplots(n, 2, squeeze=False, sharex="col", sharey="row")
+    figure, axes = make_panels(n, 2, (9.0, 2.2 * n + 0.8), sharex="col", sharey="row")
     since = run.t - run.t[0]
     parts = (since <= shown, since >= since[-1] - shown)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
@@ -49,7 +49,7 @@ def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Fi
                 factor * since[: len(model)][reached], model[reached], color=COLOURS[0], lw=1.1,
                 label="model",
             )  # fmt: skip
-        row[0].set_ylim(framing(run.states[:, k], model))
+        row[0].set_ylim(frame_limits(run.states[:, k], model))
         row[0].set_ylabel(axis_label(name, run.units[name]))
     for ax, words in zip(axes[0], ("first periods", "last periods"), strict=True):
         ax.set_title(words, fontsize=9)
@@ -72,7 +72,7 @@ def cycle_figure(
     that leaves the panel does not come back to it.
     """
     pair = [run.state_names.index(name) for name in plane]
-    figure, (ax,) = panel_grid(1, width=4.4, height=3.8, extra=0.5)
+    figure, (ax,) = make_grid(1, width=4.4, height=3.8, extra=0.5)
     ax.plot(*run.states[:, pair].T, color=GREY, lw=0.6)
     for path in paths:
         x, y = (path.states[:, path.state_names.index(name)] for name in plane)
@@ -82,7 +82,7 @@ def cycle_figure(
     ax.plot(*closed.T, color=COLOURS[1], lw=2.0)
     for set_limits, k in ((ax.set_xlim, 0), (ax.set_ylim, 1)):
         starts = np.array([path.states[0, path.state_names.index(plane[k])] for path in paths])
-        set_limits(framing(run.states[:, pair[k]], np.concatenate([closed[:, k], starts])))
+        set_limits(frame_limits(run.states[:, pair[k]], np.concatenate([closed[:, k], starts])))
     ax.set_xlabel(axis_label(plane[0], run.units[plane[0]]))
     ax.set_ylabel(axis_label(plane[1], run.units[plane[1]]))
     handles = [
@@ -104,7 +104,7 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
     found = _waveforms(run, rollout)
     assert found is not None
     data, model = found
-    figure, axes = panel_grid(len(run.state_names), width=4.2, height=3.0, extra=0.5)
+    figure, axes = make_grid(len(run.state_names), width=4.2, height=3.0, extra=0.5)
     ours = data.waveform(2.0 * np.pi * PHASES)
     theirs = model.waveform(2.0 * np.pi * PHASES + best_shift(data, model))
     phase = np.mod(data.phase / (2.0 * np.pi), 1.0)

@@ -21,32 +21,24 @@ from matplotlib.typing import ColorType
 
 from ep2sindy.data.fields import SPACE, cell_edges
 from ep2sindy.discovery.regimes import Regimes
-from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, unit_text
+from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, make_panels, unit_text
 from ep2sindy.library.equations import latex_derivative, latex_term_name, sum_latex
 from ep2sindy.thruster.parameters import Thruster
 
 ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
-
 DECADE = 10.0  # over which magnitudes along a line are drawn on a logarithmic scale
-
 GAP = 0.12  # half width of the colour bar's middle, where terms are absent
-
-SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
-
-HALF = r"the same at $R^2 \times$ share of bootstraps = 0.5"
-
-MEDIANS = "terms that act, with medians over the regime's points that have them"
-
-STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
-
 CM = 100.0  # per m
-
 PANEL_WIDTH = 1.9  # inches
 
+SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
+STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
 # Neither has a shade near white, which is a cell without a value.
-SHARES = colormaps["viridis"]
+SHARE_COLOURS = colormaps["viridis"]
+COUNT_COLOURS = ListedColormap(colormaps["Purples"](np.linspace(0.35, 1.0, 256)))
 
-COUNTS = ListedColormap(colormaps["Purples"](np.linspace(0.35, 1.0, 256)))
+HALF = r"the same at $R^2 \times$ share of bootstraps = 0.5"
+MEDIANS = "terms that act, with medians over the regime's points that have them"
 
 
 def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
@@ -65,14 +57,14 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
     coef, trust = result["coef"].sel(term=terms), _trust(result)
     flat = len(space_axes(coef)) == 1
     shape = coef.sizes["equation"], len(terms)
-    figure = map_figure(coef, shape, extra=1.1)
-    axes = figure.subplots(*shape, squeeze=False, sharex=True, sharey="col" if flat else True)
+    size = _fit_size(coef, *shape, extra=1.1)
+    figure, axes = make_panels(*shape, size, sharex=True, sharey="col" if flat else True)
     for column, term in zip(axes.T, terms, strict=True):
         column[0].set_title(f"${latex_term_name(str(term))}$", fontsize=10)
         if flat:
-            _signed_points(list(column), coef.sel(term=term), trust.sel(term=term))
+            _draw_signed_points(list(column), coef.sel(term=term), trust.sel(term=term))
         else:
-            _signed_maps(figure, list(column), coef.sel(term=term), trust.sel(term=term))
+            _draw_signed_maps(figure, list(column), coef.sel(term=term), trust.sel(term=term))
     for row, equation in zip(axes, coef["equation"].values, strict=True):
         name = f"${latex_derivative(str(equation))}$"
         row[0].annotate(
@@ -80,7 +72,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
             ha="right", va="center",
         )  # fmt: skip
     finish_panels(axes, coef, outline)
-    (half,) = _faded(SOURCE, np.array([0.5]))
+    (half,) = _fade(SOURCE, np.array([0.5]))
     entries: dict[str, Any] = {"source (+)": SOURCE, "sink (−)": SINK, HALF: half}
     if not flat:
         entries |= {"not selected": ABSENT}
@@ -95,7 +87,7 @@ def _trust(result: xr.Dataset) -> xr.DataArray:
     return result[r2_name(result)].clip(0.0, 1.0) * share
 
 
-def _faded(
+def _fade(
     colour: ColorType, trust: Float[np.ndarray, " points"]
 ) -> Float[np.ndarray, "points rgb"]:
     """From the colour at 1 to the grey of absent terms at 0."""
@@ -108,7 +100,7 @@ def r2_name(result: xr.Dataset) -> str:
     return "r2_test" if np.isfinite(result["r2_test"]).any() else "r2_train"
 
 
-def _signed_maps(
+def _draw_signed_maps(
     figure: Figure, column: Sequence[Axes], coef: xr.DataArray, opacity: xr.DataArray
 ) -> None:
     """One term in all equations, with their colour bar: the grey in its middle ends at +-10^low."""
@@ -170,7 +162,7 @@ def _signed_colours() -> ListedColormap:
     )
 
 
-def _signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArray) -> None:
+def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArray) -> None:
     """Magnitudes of one term in all equations along the one axis, sources and sinks apart."""
     (axis,) = space_axes(coef)
     sizes = np.abs(coef.values[np.isfinite(coef.values) & (coef.values != 0.0)])
@@ -185,7 +177,7 @@ def _signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArr
         for sign, colour, marker in ((1, SOURCE, "^"), (-1, SINK, "v")):
             chosen = sign * values.values > 0
             at, magnitudes = CM * coef[axis].values[chosen], np.abs(values.values[chosen])
-            faded = _faded(colour, shown.fillna(1.0).values[chosen])
+            faded = _fade(colour, shown.fillna(1.0).values[chosen])
             ax.scatter(at, magnitudes, s=10, marker=marker, c=faded, linewidths=0)
         ax.set_ylabel(_coef_unit(values), fontsize=7, labelpad=2)
 
@@ -202,16 +194,14 @@ def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
     n_columns = 1 if flat or n <= 3 else 2
     text = -(-n // n_columns) * (0.15 * (1 + n_equations) + 0.12)
     shape = (2, 1) if flat else (1, 2)
-    figure = map_figure(regimes.labels, shape, scale=2.2, extra=text + 0.75)
+    size = _fit_size(regimes.labels, *shape, scale=2.2, extra=text + 0.75)
     heights = [1, 2] if flat else None
-    axes = figure.subplots(
-        *shape, squeeze=False, sharex=True, sharey=not flat, height_ratios=heights
-    )
+    figure, axes = make_panels(*shape, size, sharex=True, sharey=not flat, heights=heights)
     labels = regimes.labels.where(regimes.labels >= 0)
     norm = BoundaryNorm(np.arange(n + 1) - 0.5, n)
     draw_map(axes.flat[0], labels, ListedColormap(list(colours[:n])), norm)
     axes.flat[0].set_title("regime", fontsize=10)
-    draw_values(figure, axes.flat[1], regimes.confidence, SHARES, Normalize(0.0, 1.0))
+    draw_values(axes.flat[1], regimes.confidence, SHARE_COLOURS, Normalize(0.0, 1.0))
     axes.flat[1].set_title("confidence", fontsize=10)
     finish_panels(axes, regimes.labels, outline)
     figure.legend(
@@ -242,28 +232,27 @@ def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figu
     r2, held_out = result[name], name == "r2_test"
     n_equations = result.sizes["equation"]
     n_columns = 3 if (result["status"] != 0).any() else 2
-    figure = map_figure(r2, (n_equations, n_columns), scale=1.4, extra=0.9)
-    axes = figure.subplots(n_equations, n_columns, squeeze=False, sharex=True)
+    size = _fit_size(r2, n_equations, n_columns, scale=1.4, extra=0.9)
+    figure, axes = make_panels(n_equations, n_columns, size, sharex=True)
     most = max(1, int(result["n_terms"].max()))
     counts = BoundaryNorm(np.arange(most + 2) - 0.5, 256)
     for row, equation in zip(axes, result["equation"].values, strict=True):
         name = latex_derivative(str(equation))
-        draw_values(
-            figure, row[0], r2.sel(equation=equation).clip(min=0.0), SHARES, Normalize(0.0, 1.0)
-        )
+        shown = r2.sel(equation=equation).clip(min=0.0)
+        draw_values(row[0], shown, SHARE_COLOURS, Normalize(0.0, 1.0))
         row[0].set_title(f"${name}$: $R^2$, {'held-out' if held_out else 'training'}", fontsize=9)
-        draw_values(figure, row[1], result["n_terms"].sel(equation=equation), COUNTS, counts)
+        draw_values(row[1], result["n_terms"].sel(equation=equation), COUNT_COLOURS, counts)
         row[1].set_title(f"${name}$: number of terms", fontsize=9)
     finish_panels(axes[:, :2], r2, outline)
     if n_columns == 3:
-        _status(figure, axes[0, 2], result["status"])
+        _draw_status(figure, axes[0, 2], result["status"])
         for ax in axes[1:, 2]:
             ax.remove()
         finish_panels(axes[:1, 2:], r2, outline)
     return figure
 
 
-def _status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
+def _draw_status(figure: Figure, ax: Axes, status: xr.DataArray) -> None:
     meanings = str(status.attrs["flag_meanings"]).split()
     found = [k for k in range(len(meanings)) if (status == k).any()]
     norm = BoundaryNorm(np.arange(len(meanings) + 1) - 0.5, len(meanings))
@@ -285,18 +274,14 @@ def space_axes(array: xr.DataArray | xr.Dataset) -> list[str]:
     return [axis for axis in SPACE if axis in array.dims]
 
 
-def map_figure(
-    array: xr.DataArray, shape: tuple[int, int], *, scale: float = 1.0, extra: float
-) -> Figure:
-    """A canvas whose panels come out at the field's own proportions; extra: inches around them."""
-    n_rows, n_columns = shape
+def _fit_size(
+    array: xr.DataArray, n_rows: int, n_columns: int, *, scale: float = 1.0, extra: float
+) -> tuple[float, float]:
+    """Of a canvas whose panels come out at the field's own proportions; extra: inches around."""
     spans = [float(np.ptp(_edges(array, axis))) for axis in space_axes(array)]
     width = scale * PANEL_WIDTH
     height = width * min(max(spans[1] / spans[0], 0.25), 2.0) if len(spans) == 2 else 1.3
-    return Figure(
-        figsize=(max(n_columns * (width + 0.35) + 0.8, 5.5), n_rows * (height + 0.45) + extra),
-        layout="constrained",
-    )
+    return max(n_columns * (width + 0.35) + 0.8, 5.5), n_rows * (height + 0.45) + extra
 
 
 def _edges(array: xr.DataArray, axis: str) -> Float[np.ndarray, " edges"]:
@@ -327,9 +312,7 @@ def draw_map(
     ax.set_aspect("equal")
 
 
-def draw_values(
-    figure: Figure, ax: Axes, values: xr.DataArray, colours: Colormap, norm: Normalize
-) -> None:
+def draw_values(ax: Axes, values: xr.DataArray, colours: Colormap, norm: Normalize) -> None:
     """A map with its colour bar; over one axis, points on an ordinate."""
     space = space_axes(values)
     if len(space) == 1:
@@ -340,7 +323,7 @@ def draw_values(
             ax.set_yticks(_middles(norm))
         return
     draw_map(ax, values, colours, norm)
-    bar = figure.colorbar(ScalarMappable(norm, colours), ax=ax, shrink=0.7, aspect=12, pad=0.02)
+    bar = ax.figure.colorbar(ScalarMappable(norm, colours), ax=ax, shrink=0.7, aspect=12, pad=0.02)
     if isinstance(norm, BoundaryNorm):
         bar.set_ticks(_middles(norm))
     bar.ax.tick_params(labelsize=7)
@@ -358,7 +341,7 @@ def finish_panels(axes: np.ndarray, array: xr.DataArray, outline: Thruster | Non
         if len(space) == 1:
             ax.set_xlim(*CM * _edges(array, space[0])[[0, -1]])
         if outline is not None:
-            _outline(ax, space, outline)
+            _draw_channel(ax, space, outline)
     for ax in axes[-1]:
         ax.tick_params(labelbottom=True)
         ax.set_xlabel(f"{space[0]} (cm)", fontsize=9)
@@ -367,7 +350,7 @@ def finish_panels(axes: np.ndarray, array: xr.DataArray, outline: Thruster | Non
             ax.set_ylabel("r (cm)", fontsize=9)
 
 
-def _outline(ax: Axes, space: Sequence[str], thruster: Thruster) -> None:
+def _draw_channel(ax: Axes, space: Sequence[str], thruster: Thruster) -> None:
     """Walls, anode and front face as one line, the exit plane dashed; the limits stay."""
     length, inner, outer = (
         CM * x for x in (thruster.channel_length, thruster.inner_radius, thruster.outer_radius)

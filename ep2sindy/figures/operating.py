@@ -25,9 +25,12 @@ from ep2sindy.figures.style import (
     DATA,
     GREY,
     MORE_COLOURS,
-    equals_label,
+    held_label,
     legend_above,
-    panel_grid,
+    make_grid,
+    make_panels,
+    name_label,
+    sample_line,
     unit_text,
 )
 from ep2sindy.library.equations import latex_derivative, latex_name, latex_term_name
@@ -38,15 +41,11 @@ FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # of errors; what is farther off stands f
 
 LEAST_RANGE = 0.1  # of a coefficient's size: what is constant is drawn so
 
-N_LINE = 60  # points of a law's line
 MOST_LINES = 5  # values of the second parameter that are drawn
 
 QUANTITIES = ("f_kHz", "relative_amplitude")
-
 _MARK = {"ls": "none", "color": COLOURS[1], "zorder": 4}
-
 CROSS: dict[str, Any] = {**_MARK, "marker": "x", "mew": 1.8, "ms": 6.5}
-
 DIAMOND: dict[str, Any] = {**_MARK, "marker": "D", "mfc": "white", "mew": 1.5, "ms": 6.0}
 
 
@@ -63,50 +62,48 @@ def laws_figure(
     """
     along, others = parameters[-1], list(parameters[:-1])
     pairs = list(law.coefficients)
-    figure, axes = panel_grid(len(pairs), width=3.3, height=2.5, extra=0.7, most=3)
-    groups: list[tuple[tuple[float, ...], pd.DataFrame]] = [((), coefficients)]
-    if others:
-        by_value = coefficients.groupby(others)
-        groups = [(tuple(np.array(key, dtype=float)), rows) for key, rows in by_value]
-    groups = _spread([g for g in groups if g[1][along].nunique() > 1] or groups)
+    figure, axes = make_grid(len(pairs), width=3.3, height=2.5, extra=0.7, most=3)
+    groups = _choose_lines(coefficients, along, others)
     for ax, (state, term) in zip(axes, pairs, strict=True):
-        unit = unit_text(_coef_unit(law, state, term))
+        unit = unit_text(_unit_of_coef(law, state, term))
         name = f"${latex_derivative(state)}$:  ${latex_term_name(term)}$  ({unit})"
         ax.set_title(name, fontsize=10, pad=14.0)
-        for (values, rows), colour in zip(groups, MORE_COLOURS, strict=False):
-            held = dict(zip(others, values, strict=True))
+        for (held, rows), colour in zip(groups, MORE_COLOURS, strict=False):
             here = rows[(rows["state"] == state) & (rows["term"] == term)].sort_values(along)
-            _law_line(ax, here, law, (state, term), along, held, colour)
+            _draw_law(ax, here, law, (state, term), along, held, colour)
         ax.grid(alpha=0.3)
-        ax.set_xlabel(parameter_label(along, labels))
+        ax.set_xlabel(name_label(along, labels))
         ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useOffset=False)
         _focus(ax, coefficients[(coefficients["state"] == state) & (coefficients["term"] == term)])
     if others:
         entries = [
             Line2D(
-                [],
-                [],
-                color=colour,
-                marker="o",
-                ms=4,
-                mfc="white",
-                label=_held(others, values, labels),
+                [], [], color=colour, marker="o", ms=4, mfc="white", label=held_label(held, labels)
             )
-            for (values, _), colour in zip(groups, MORE_COLOURS, strict=False)
+            for (held, _), colour in zip(groups, MORE_COLOURS, strict=False)
         ]
         legend_above(figure, entries, size=9.0)
     return figure
 
 
-def _spread(
-    groups: list[tuple[tuple[float, ...], pd.DataFrame]],
-) -> list[tuple[tuple[float, ...], pd.DataFrame]]:
-    """At most so many, evenly chosen."""
+def _choose_lines(
+    rows: pd.DataFrame, along: str, others: list[str]
+) -> list[tuple[dict[str, float], pd.DataFrame]]:
+    """Values of the other parameters with their rows: at most so many, evenly chosen.
+
+    Those with one point alone are left out, where there are others.
+    """
+    by_value = rows.groupby(others) if others else [((), rows)]
+    groups = [
+        (dict(zip(others, np.array(key, dtype=float).tolist(), strict=True)), of)
+        for key, of in by_value
+    ]
+    groups = [group for group in groups if group[1][along].nunique() > 1] or groups
     n = min(len(groups), MOST_LINES)
     return [groups[k] for k in np.unique(np.linspace(0, len(groups) - 1, n).round().astype(int))]
 
 
-def _law_line(
+def _draw_law(
     ax: Axes,
     rows: pd.DataFrame,
     law: OperatingLaw,
@@ -115,16 +112,13 @@ def _law_line(
     held: Mapping[str, float],
     colour: str,
 ) -> None:
-    x = rows[along].to_numpy(float)
-    line = np.linspace(x.min(), x.max(), N_LINE)
-    columns = [line if p == along else np.full(N_LINE, held[p]) for p in law.parameters]
+    line, points = sample_line(rows[along], along, held, law.parameters)
     coef = law.coef[law.coefficients.index(pair)]
-    values = law.functions.evaluate(np.column_stack(columns)) @ coef
-    ax.plot(line, values, color=colour, lw=1.5)
+    ax.plot(line, law.functions.evaluate(points) @ coef, color=colour, lw=1.5)
     reach = None
     if {"alone_low", "alone_high"} <= set(rows):
         reach = 0.5 * (rows["alone_high"] - rows["alone_low"]).fillna(0.0)
-    ax.errorbar(x, rows["alone"], reach, fmt="o", ms=4, mfc="white", color=colour, lw=0.8,
+    ax.errorbar(rows[along], rows["alone"], reach, fmt="o", ms=4, mfc="white", color=colour, lw=0.8,
                 capsize=2, zorder=3)  # fmt: skip
 
 
@@ -137,7 +131,7 @@ def _focus(ax: Axes, rows: pd.DataFrame) -> None:
     ax.set_ylim(low - margin, high + margin)
 
 
-def _coef_unit(law: OperatingLaw, state: str, term: str) -> str:
+def _unit_of_coef(law: OperatingLaw, state: str, term: str) -> str:
     """Of a term's coefficient in the rate of a state."""
     units = {name: law.units.get(name, "1") for name in law.library.variables}
     of_term = law.library.units(units)[law.library.index(term)]
@@ -150,10 +144,9 @@ def left_out_figure(rows: pd.DataFrame) -> Figure:
     states = [name.removeprefix("amplitude_") for name in columns if name.startswith("amplitude_")]
     cycles = list(dict.fromkeys(rows["branch"]))
     colours = dict(zip(cycles, MORE_COLOURS, strict=False))
-    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    _frequencies(left, rows, colours)
-    _shapes(right, rows, states, colours)
+    figure, ((left, right),) = make_panels(1, 2, (9.0, 4.2))
+    _draw_frequencies(left, rows, colours)
+    _draw_shapes(right, rows, states, colours)
     for ax in (left, right):
         ax.set_box_aspect(1.0)
         ax.grid(alpha=0.3)
@@ -163,7 +156,7 @@ def left_out_figure(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def _frequencies(ax: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
+def _draw_frequencies(ax: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
     """Of the free runs over those of the records."""
     factor, unit = frequency_scale(rows["f_kHz"])
     for name, colour in colours.items():
@@ -186,7 +179,7 @@ def _frequencies(ax: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> No
     ax.set(xlim=ends, ylim=ends)
 
 
-def _shapes(
+def _draw_shapes(
     ax: Axes, rows: pd.DataFrame, states: Sequence[str], colours: Mapping[str, str]
 ) -> None:
     """Errors of waveforms over those of amplitudes."""
@@ -213,17 +206,7 @@ def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:
     return 1e3 * factor, f"{prefix}Hz"
 
 
-def parameter_label(name: str, labels: Mapping[str, str]) -> str:
-    return labels.get(name, f"${latex_name(name)}$")
-
-
-def _held(names: Sequence[str], values: Sequence[float], labels: Mapping[str, str]) -> str:
-    """`$V_D$ = 300 V`."""
-    pairs = zip(names, values, strict=True)
-    return ", ".join(equals_label(parameter_label(n, labels), v) for n, v in pairs)
-
-
-def map_figure(
+def cycle_map_figure(
     rows: pd.DataFrame,
     points: pd.DataFrame,
     fitted: np.ndarray,
@@ -238,25 +221,24 @@ def map_figure(
     oscillate), f_kHz and relative_amplitude of the records. fitted: those of the law.
     """
     x, y = (np.unique(rows[name].to_numpy(float)) for name in parameters)
-    own, quiet, other = _parted(points, branch)
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    own, quiet, other = _split_records(points, branch)
+    figure, (axes,) = make_panels(1, 2, (11.0, 4.4), sharex=True, sharey=True)
     for ax, quantity in zip(axes, QUANTITIES, strict=True):
-        factor, title = _scaled(quantity, own)
+        factor, title = _scale_quantity(quantity, own)
         values = factor * rows[quantity].to_numpy(float).reshape(len(x), len(y))
         seen = factor * own[quantity].to_numpy(float)
         scale, colours = _colour_range(values, seen), colormaps["viridis"]
         ax.pcolormesh(x, y, values.T, norm=scale, cmap=colours, shading="nearest", rasterized=True)
-        _boundaries(ax, x, y, rows, fitted)
+        _draw_boundaries(ax, x, y, rows, fitted)
         at = own[list(parameters)].to_numpy(float)
         ax.scatter(*at.T, c=colours(scale(seen)), s=52, edgecolor="white", lw=1.2, zorder=4)
         for which, style in ((quiet, CROSS), (other, DIAMOND)):
             ax.plot(*which[list(parameters)].to_numpy(float).T, **style)
-        xlabel, ylabel = (parameter_label(name, labels) for name in parameters)
+        xlabel, ylabel = (name_label(name, labels) for name in parameters)
         ax.set(xlabel=xlabel, ylabel=ylabel)
         bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, pad=0.02, extend="both")
         bar.set_label(title)
-    entries = _entries(Line2D([], [], ls="none", marker="o", color=GREY, mec=DATA), quiet, other)
+    entries = _list_entries(quiet, other, color=GREY, mec=DATA)
     entries += [
         Line2D([], [], color="black", lw=1.8, label="the model's cycle ends"),
         Line2D([], [], color="black", lw=1.3, ls="--", label="its fixed point turns stable"),
@@ -266,7 +248,7 @@ def map_figure(
     return figure
 
 
-def line_figure(
+def cycle_line_figure(
     rows: pd.DataFrame,
     points: pd.DataFrame,
     fitted: np.ndarray,
@@ -275,21 +257,21 @@ def line_figure(
     parameters: Sequence[str],
     labels: Mapping[str, str],
 ) -> Figure:
-    """The same as `map_figure` over the one parameter that there is."""
+    """The same as `cycle_map_figure` over the one parameter that there is."""
     (name,) = parameters
-    own, quiet, other = _parted(points, branch)
-    figure = Figure(figsize=(8.4, 3.6), layout="constrained")
-    for ax, quantity in zip(figure.subplots(1, 2), QUANTITIES, strict=True):
-        factor, title = _scaled(quantity, own)
+    own, quiet, other = _split_records(points, branch)
+    figure, (axes,) = make_panels(1, 2, (8.4, 3.6))
+    for ax, quantity in zip(axes, QUANTITIES, strict=True):
+        factor, title = _scale_quantity(quantity, own)
         ax.axvspan(fitted.min(), fitted.max(), color=GREY, alpha=0.2, lw=0)
         ax.plot(rows[name], factor * rows[quantity], color=COLOURS[0], lw=1.8)
         ax.plot(own[name], factor * own[quantity], "o", color=DATA, mfc="white", zorder=3)
         ax.plot(other[name], factor * other[quantity], **DIAMOND)
         bottom = ax.get_xaxis_transform()
         ax.plot(quiet[name], np.full(len(quiet), 0.05), transform=bottom, **CROSS)
-        ax.set(xlabel=parameter_label(name, labels), ylabel=title)
+        ax.set(xlabel=name_label(name, labels), ylabel=title)
         ax.grid(alpha=0.3)
-    entries = _entries(Line2D([], [], ls="none", marker="o", color=DATA, mfc="white"), quiet, other)
+    entries = _list_entries(quiet, other, color=DATA, mfc="white")
     law = Line2D([], [], color=COLOURS[0], lw=1.8, label="the model's cycle")
     legend_above(
         figure, [law, *entries, Patch(color=GREY, alpha=0.2, label="points fitted")], size=9.0
@@ -297,26 +279,22 @@ def line_figure(
     return figure
 
 
-def _parted(points: pd.DataFrame, branch: str) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def _split_records(
+    points: pd.DataFrame, branch: str
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
     """Records of this cycle, points that do not oscillate, and records of another cycle."""
     own, quiet = points["branch"] == branch, points["branch"] == ""
     return points[own], points[quiet], points[~own & ~quiet]
 
 
-def _entries(record: Line2D, quiet: pd.DataFrame, other: pd.DataFrame) -> list[Artist]:
-    """Of a legend: records, and what else there is among the points."""
-    record.set_label("record")
-    found: list[Artist] = [record]
-    for which, style, label in (
-        (quiet, CROSS, "not oscillating"),
-        (other, DIAMOND, "record of another cycle"),
-    ):
-        if len(which):
-            found.append(Line2D([], [], **style, label=label))
-    return found
+def _list_entries(quiet: pd.DataFrame, other: pd.DataFrame, **style: Any) -> list[Artist]:
+    """Of a legend: records in this style, and what else there is among the points."""
+    there = ((quiet, CROSS, "not oscillating"), (other, DIAMOND, "record of another cycle"))
+    record = Line2D([], [], ls="none", marker="o", label="record", **style)
+    return [record, *(Line2D([], [], **mark, label=label) for of, mark, label in there if len(of))]
 
 
-def _scaled(quantity: str, records: pd.DataFrame) -> tuple[float, str]:
+def _scale_quantity(quantity: str, records: pd.DataFrame) -> tuple[float, str]:
     """Factor on a quantity, and what its axis says."""
     if quantity != "f_kHz":
         return 1.0, "relative amplitude"
@@ -335,7 +313,7 @@ def _colour_range(values: np.ndarray, seen: np.ndarray) -> Normalize:
     return Normalize(low, high)
 
 
-def _boundaries(
+def _draw_boundaries(
     ax: Axes, x: np.ndarray, y: np.ndarray, rows: pd.DataFrame, fitted: np.ndarray
 ) -> None:
     """Where cycles end, where the fixed point turns stable, and the hull of what was fitted."""
@@ -349,10 +327,10 @@ def _boundaries(
             x, y, np.ma.masked_invalid(growth.T), levels=[0.0], colors="black", linewidths=1.3,
             linestyles="--",
         )  # fmt: skip
-    ax.plot(*_outline(fitted).T, color=GREY, lw=1.5)
+    ax.plot(*_enclose(fitted).T, color=GREY, lw=1.5)
 
 
-def _outline(points: np.ndarray) -> np.ndarray:
+def _enclose(points: np.ndarray) -> np.ndarray:
     """Closed convex outline; the ends of a line where all lie on one."""
     scaled = (points - points.min(axis=0)) / np.ptp(points, axis=0)
     try:

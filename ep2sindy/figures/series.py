@@ -13,7 +13,6 @@ from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
@@ -24,11 +23,11 @@ from ep2sindy.figures.style import (
     MORE_COLOURS,
     Limits,
     axis_label,
-    framing,
-    legend_above,
-    legend_marks,
+    frame_limits,
+    legend_curves,
+    make_grid,
+    make_panels,
     mark_exits,
-    panel_grid,
     slope_label,
     unit_text,
 )
@@ -46,8 +45,7 @@ RARE = 0.01  # of a derivative's samples, low or high, may be edge spikes: they 
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
     """A row per state: its first `duration_s`, and its power spectrum up to `f_max_Hz`."""
     n = len(run.state_names)
-    figure = Figure(figsize=(9.0, 2.2 * n + 0.6), layout="constrained")
-    axes = figure.subplots(n, 2, squeeze=False, sharex="col", width_ratios=[3, 2])
+    figure, axes = make_panels(n, 2, (9.0, 2.2 * n + 0.6), sharex="col", widths=[3, 2])
     states = first_part(run.t, run.states, duration_s, run.clock)
     spectra = _spectra(run.t, run.states, f_max_Hz, run.clock)
     for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
@@ -81,12 +79,11 @@ def trajectory_figure(
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = {n: first_part(r.t, r.states, duration_s, run.clock) for n, r in rollouts.items()}
     titles = [axis_label(name, run.units[name]) for name in run.state_names]
-    figure, axes = _rows(
+    return _draw_rows(
         data, models, titles=titles, x_label=_time_label(run.clock, duration_s, since),
-        labels=run_labels(rollouts, verdicts),
-    )  # fmt: skip
-    _frame(figure, axes, data, models, diverged=diverged_within(rollouts, duration_s))
-    return figure
+        labels=run_labels(rollouts, verdicts), limits=limits_of(data, models),
+        diverged=find_diverged(rollouts, duration_s),
+    )[0]  # fmt: skip
 
 
 def derivative_figure(
@@ -107,9 +104,8 @@ def derivative_figure(
         order = [model.states.index(state) for state in run.state_names]
         sides[name] = first_part(run.t, slopes[:, order], duration_s, clock)
     titles = [slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
-    figure, axes = _rows(data, sides, titles=titles, x_label=_time_label(run.clock, duration_s))
-    _frame(figure, axes, data, sides, rare=RARE)
-    return figure
+    x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
+    return _draw_rows(data, sides, titles=titles, x_label=x_label, limits=limits)[0]
 
 
 def spectrum_figure(
@@ -128,7 +124,7 @@ def spectrum_figure(
     data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz, run.clock)
     models = {name: _spectra(r.t, r.states, f_max_Hz, run.clock) for name, r in rollouts.items()}
     titles = [f"power of {axis_label(name, _power_unit(run, name))}" for name in run.state_names]
-    figure, axes = _rows(
+    figure, axes = _draw_rows(
         data, models, titles=titles, x_label=_frequency_label(run.clock, f_max_Hz),
         labels=run_labels(rollouts, verdicts),
     )  # fmt: skip
@@ -142,24 +138,27 @@ def spectrum_figure(
             if not rollout.diverged:
                 text = run.clock.frequency_text(dominant_frequency(rollout.t, rollout.states[:, k]))
                 ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=8)
-    legend_above(figure, axes[0, 0].lines[:1], size=9.0)
     return figure
 
 
-def _rows(
+def _draw_rows(
     data: Curves,
     models: Mapping[str, Curves],
     *,
     titles: Sequence[str],
     x_label: str,
     labels: Mapping[str, str] = MappingProxyType({}),
+    limits: Sequence[Limits] = (),
+    diverged: Collection[str] = (),
 ) -> tuple[Figure, np.ndarray]:
-    """A row per model, a column per state; the data in grey behind. labels: of rows, by name."""
+    """A row per model, a column per state; the data in grey behind. labels: of rows, by name.
+
+    limits: of every column; marks tell where curves leave them, and which runs diverged.
+    """
     n_rows, n_columns = len(models), len(titles)
     height = float(np.clip(5.0 / n_rows, 1.05, 2.2))
     size = (max(10.0, 2.6 * n_columns + 1.0), height * n_rows + 1.2)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey="col")
+    figure, axes = make_panels(n_rows, n_columns, size, sharex=True, sharey="col")
     for row, colour, (name, curves) in zip(axes, cycle(MORE_COLOURS), models.items(), strict=False):
         for k, ax in enumerate(row):
             # Wider than the model, so that it shows on both sides of one that follows it.
@@ -167,6 +166,13 @@ def _rows(
             ax.plot(curves.x, curves.y[:, k], color=colour, lw=1.1)
             ax.tick_params(labelsize=8)
             ax.yaxis.get_offset_text().set(size=8)
+            for shown, shade in ((data, GREY), (curves, colour)):
+                if limits and len(shown.x):
+                    frame = (float(shown.x[0]), float(shown.x[-1])), limits[k]
+                    stops = name in diverged and shown is curves
+                    mark_exits(
+                        ax, shown.x, shown.y[:, k], colour=shade, limits=frame, diverged=stops
+                    )
         text = labels.get(name, name).replace(", ", ",\n")
         row[0].set_ylabel(text, rotation=0, ha="right", va="center", fontsize=9)
     for ax in axes[1:].flat:  # columns share their axis, so the first row's factor is everyone's
@@ -174,32 +180,10 @@ def _rows(
     for column, title in zip(axes.T, titles, strict=True):
         column[0].set_title(title, fontsize=10)
         column[-1].set_xlabel(x_label)
+    for column, ends in zip(axes.T, limits, strict=False):
+        column[0].set_ylim(ends)
+    legend_curves(figure, list(axes.flat))
     return figure, axes
-
-
-def _frame(
-    figure: Figure,
-    axes: np.ndarray,
-    data: Curves,
-    models: Mapping[str, Curves],
-    *,
-    rare: float = 0.0,
-    diverged: Collection[str] = (),
-) -> None:
-    """Limits of every column, marks where curves leave them, and the legend."""
-    for k, (column, limits) in enumerate(zip(axes.T, limits_of(data, models, rare), strict=True)):
-        column[0].set_ylim(limits)
-        drawn = zip(column, cycle(MORE_COLOURS), models.items(), strict=False)
-        for ax, colour, (name, model) in drawn:
-            for curves, shade in ((data, GREY), (model, colour)):
-                if len(curves.x):
-                    ends = float(curves.x[0]), float(curves.x[-1])
-                    stops = name in diverged and curves is model
-                    mark_exits(
-                        ax, curves.x, curves.y[:, k], colour=shade, limits=(ends, limits),
-                        diverged=stops,
-                    )  # fmt: skip
-    legend_above(figure, [*axes[0, 0].lines[:1], *legend_marks(axes.flat)], size=9.0)
 
 
 def _spectra(
@@ -256,10 +240,10 @@ def first_part(
 
 def limits_of(data: Curves, models: Mapping[str, Curves], rare: float = 0.0) -> list[Limits]:
     together = np.concatenate([curves.y for curves in models.values()])
-    return [framing(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
+    return [frame_limits(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
 
 
-def diverged_within(rollouts: Mapping[str, Rollout], duration_s: float) -> set[str]:
+def find_diverged(rollouts: Mapping[str, Rollout], duration_s: float) -> set[str]:
     """Names of the runs that stop before the end of what is shown."""
     return {name for name, r in rollouts.items() if r.diverged and r.lasted_s <= duration_s}
 
@@ -298,8 +282,11 @@ def phase_figure(
     models = {
         n: first_part(r.t, r.states[:, pair], duration_s, run.clock) for n, r in rollouts.items()
     }
-    diverged, labels = diverged_within(rollouts, duration_s), run_labels(rollouts, verdicts)
-    figure, axes = panel_grid(len(models), width=2.75, height=2.75, extra=0.7, shared=True)
+    diverged, labels = find_diverged(rollouts, duration_s), run_labels(rollouts, verdicts)
+    x_label, y_label = (axis_label(name, run.units[name]) for name in plane)
+    figure, axes = make_grid(
+        len(models), width=2.75, height=2.75, extra=0.7, sharex=True, sharey=True, x_label=x_label
+    )
     limits = dict(enumerate(limits_of(data, models)))
     for ax, colour, (name, curves) in zip(axes, cycle(MORE_COLOURS), models.items(), strict=False):
         ax.plot(*data.y.T, color=GREY, lw=1.4, label="data")
@@ -311,22 +298,11 @@ def phase_figure(
             diverged=name in diverged,
         )  # fmt: skip
     axes[0].set(xlim=limits[0], ylim=limits[1])
-    _label_plane(axes, run, plane)
-    legend_above(figure, [*axes[0].lines[:1], *legend_marks(axes)], size=9.0)
-    return figure
-
-
-def _label_plane(axes: Sequence[Axes], run: Trajectory, plane: Sequence[str]) -> None:
-    """Names at the left of rows and below columns; the first panel's factor is everyone's."""
-    labels = [axis_label(name, run.units[name]) for name in plane]
     for ax in axes:
         place = ax.get_subplotspec()
-        assert place is not None
-        n_columns = place.get_gridspec().ncols
-        if place.is_first_col():
-            ax.set_ylabel(labels[1])
+        if place is not None and place.is_first_col():
+            ax.set_ylabel(y_label)
+            # The first panel's factor is everyone's.
             ax.yaxis.get_offset_text().set_visible(place.is_first_row())
-        if axes.index(ax) + n_columns >= len(axes):  # none below it
-            ax.tick_params(labelbottom=True)
-            ax.xaxis.get_offset_text().set_visible(True)
-            ax.set_xlabel(labels[0])
+    legend_curves(figure, axes)
+    return figure

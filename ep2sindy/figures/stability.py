@@ -16,7 +16,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above
+from ep2sindy.figures.style import (
+    COLOURS,
+    DATA,
+    GREY,
+    legend_above,
+    make_grid,
+    make_panels,
+    write_in_cell,
+)
 
 BREATHES = "oscillating"
 HATCHES = {"steady": "//", "decaying": "\\\\", "transit": "..", "diverged": "xx", "failed": "++"}
@@ -42,26 +50,22 @@ def stability_figure(
     along, up, *others = axes
     groups = list(points.groupby(others, sort=False)) if others else [((), points)]
     x, y = (list(dict.fromkeys(points[name])) for name in (along, up))
-    n_columns = min(len(groups), max(1, 12 // (2 * len(x))))
-    n_rows = -(-len(groups) // n_columns)
-    size = n_columns * (0.95 * len(x) + 0.7) + 1.8, n_rows * (0.62 * len(y) + 0.9) + 0.7
-    figure = Figure(figsize=(max(size[0], 5.5), size[1]), layout="constrained")
-    panels = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True, sharey=True)
+    figure, panels = make_grid(
+        len(groups), width=0.95 * len(x) + 0.7, height=0.62 * len(y) + 0.9, extra=0.7,
+        sharex=True, sharey=True, most=max(1, 12 // (2 * len(x))),
+    )  # fmt: skip
+    figure.set_figwidth(max(figure.get_figwidth() + 1.8, 5.5))
     known = points.loc[~points["status"].isin(WORTHLESS), "I_d_std"]
     scale = Normalize(0.0, float(known.max()) if len(known) and known.max() > 0 else 1.0)
-    for ax, (held, group) in zip(panels.flat, groups, strict=False):
+    for ax, (held, group) in zip(panels, groups, strict=True):
         for row in group.to_dict("records"):
-            _cell(ax, x.index(row[along]), y.index(row[up]), row, scale)
+            _draw_cell(ax, x.index(row[along]), y.index(row[up]), row, scale)
         title = [f"{labels[name]}: {value}" for name, value in zip(others, held, strict=True)]
         ax.set_title(", ".join(title), fontsize=10)
         ax.set(xlim=(0, len(x)), ylim=(0, len(y)))
         ax.set_xticks(np.arange(len(x)) + 0.5, x)
         ax.set_yticks(np.arange(len(y)) + 0.5, y)
         ax.tick_params(length=0)
-    for ax in panels.flat[len(groups) :]:
-        ax.remove()
-    for ax in panels.flat[max(0, len(groups) - n_columns) : len(groups)]:
-        ax.tick_params(labelbottom=True)
     figure.supxlabel(labels[along], fontsize=10)
     figure.supylabel(fill(labels[up], 26), fontsize=10, multialignment="center")
     bar = figure.colorbar(ScalarMappable(scale, colormaps["Blues"]), ax=panels, pad=0.02)
@@ -73,7 +77,7 @@ def stability_figure(
     return figure
 
 
-def _cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale: Normalize) -> None:
+def _draw_cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale: Normalize) -> None:
     """One point: the colour its amplitude, hatched and named where it does not breathe."""
     status, std = point["status"], float(point["I_d_std"])
     known = status not in WORTHLESS and np.isfinite(std)
@@ -86,17 +90,9 @@ def _cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale: Norm
         lines += [f"{point['f_kHz']:.1f} kHz"]
     lines += [str(point["cycle"]) if status == BREATHES else status]
     dark = known and hatch is None and scale(std) > DARK
-    box = {"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5} if hatch else None
-    ax.text(
-        column + 0.5,
-        row + 0.5,
-        "\n".join(lines),
-        ha="center",
-        va="center",
-        fontsize=7.5,
-        color="white" if dark else "black",
-        bbox=box,
-    )
+    text = write_in_cell(ax, column, row, "\n".join(lines), colour="white" if dark else "black")
+    if hatch:
+        text.set_bbox({"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5})
 
 
 def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
@@ -104,8 +100,7 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
 
     points: values or texts in the column `along`, and what CURVES names; markers tell statuses.
     """
-    figure = Figure(figsize=(8.0, 5.2), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True)
+    figure, panels = make_panels(2, 2, (8.0, 5.2), sharex=True)
     numbers = pd.api.types.is_numeric_dtype(points[along])
     x = points[along].to_numpy(float) if numbers else np.arange(len(points), dtype=float)
     for ax, (name, (title, factor)) in zip(panels.flat, CURVES.items(), strict=True):
@@ -114,13 +109,12 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
         values = factor * points[name].to_numpy(float)
         if numbers:
             ax.plot(x[kept][order], values[kept][order], color=GREY, lw=1.0, zorder=1)
-        for status, marker in MARKERS.items():
+        for status in MARKERS:
             here = (points["status"] == status).to_numpy()
             reach = points["I_d_std"][here] if name == "I_d_mean" else None
-            colour = COLOURS[0] if status == BREATHES else COLOURS[1]
-            ax.errorbar(x[here], values[here], reach, fmt=marker, color=colour, capsize=3, ms=5)
+            ax.errorbar(x[here], values[here], reach, capsize=3, ms=5, **_status_style(status))
         for place, status in zip(x[~kept], points["status"][~kept], strict=True):
-            ax.axvline(place, color=COLOURS[3], lw=1.0, ls=":" if status == "diverged" else "--")
+            ax.axvline(place, lw=1.0, **_status_style(status))
         ax.set_title(title, fontsize=10)
         ax.grid(alpha=0.3)
         ax.margins(x=0.08)
@@ -128,20 +122,14 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
             ax.set_xticks(x, points[along])
     for ax in panels[-1]:
         ax.set_xlabel(label)
-    legend_above(figure, _statuses(points))
+    seen = [name for name in (BREATHES, *HATCHES) if (points["status"] == name).any()]
+    legend_above(figure, [Line2D([], [], label=name, **_status_style(name)) for name in seen])
     return figure
 
 
-def _statuses(points: pd.DataFrame) -> list[Line2D]:
-    """What the markers and lines of the curves mean, of those that there are."""
-    entries = []
-    for status in (BREATHES, *HATCHES):
-        if not (points["status"] == status).any():
-            continue
-        if status in MARKERS:
-            colour = COLOURS[0] if status == BREATHES else COLOURS[1]
-            style: dict[str, Any] = {"ls": "none", "marker": MARKERS[status], "color": colour}
-        else:
-            style = {"ls": ":" if status == "diverged" else "--", "color": COLOURS[3]}
-        entries.append(Line2D([], [], label=status, **style))
-    return entries
+def _status_style(status: str) -> dict[str, Any]:
+    """A marker, or an upright line where the current says nothing."""
+    if status in MARKERS:
+        colour = COLOURS[0] if status == BREATHES else COLOURS[1]
+        return {"ls": "none", "marker": MARKERS[status], "color": colour}
+    return {"ls": ":" if status == "diverged" else "--", "color": COLOURS[3]}

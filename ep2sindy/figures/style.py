@@ -6,15 +6,17 @@ Frames are what a panel shows of curves that may leave it, and where they do.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 
 from ep2sindy.library.equations import latex_derivative, latex_name
 
@@ -28,6 +30,8 @@ MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
 
 Limits = tuple[float, float]
 
+Sharing = bool | Literal["row", "col"]
+
 # Tips at the edge that a curve crosses: left, right, below, above.
 CARETS = {(0, 0): 4, (0, 1): 5, (1, 0): 7, (1, 1): 6}
 
@@ -35,21 +39,59 @@ OFF_SCALE, STOPS = "off scale", "diverged"
 
 SIGN = "#555555"  # of marks in a legend, which stand for those of every colour
 
+N_LINE = 60  # points of the line of a law
 
-def panel_grid(
-    n: int, *, width: float, height: float, extra: float, shared: bool = False, most: int = 4
+
+def make_panels(
+    n_rows: int,
+    n_columns: int,
+    size: tuple[float, float],
+    *,
+    sharex: Sharing = False,
+    sharey: Sharing = False,
+    widths: Sequence[float] | None = None,
+    heights: Sequence[float] | None = None,
+) -> tuple[Figure, np.ndarray]:
+    """A figure of this width and height in inches, and its panels by row and column.
+
+    sharex, sharey: as in matplotlib. widths, heights: of columns and rows, relative to each other.
+    """
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(
+        n_rows, n_columns, squeeze=False, sharex=sharex, sharey=sharey, width_ratios=widths,
+        height_ratios=heights,
+    )  # fmt: skip
+    return figure, axes
+
+
+def make_grid(
+    n: int,
+    *,
+    width: float,
+    height: float,
+    extra: float,
+    sharex: bool = False,
+    sharey: bool = False,
+    most: int = 4,
+    x_label: str = "",
 ) -> tuple[Figure, Sequence[Axes]]:
     """A canvas of n panels of this size in inches, at most so many in a row, none empty.
 
-    extra: height around them. shared: whether they share both axes.
+    extra: height around them. sharex, sharey: whether they share these axes. x_label: below the
+    lowest of every column.
     """
     n_rows = -(-n // most)
     n_columns = -(-n // n_rows)
-    figure = Figure(figsize=(width * n_columns, height * n_rows + extra), layout="constrained")
-    axes = figure.subplots(n_rows, n_columns, squeeze=False, sharex=shared, sharey=shared).flat
-    for ax in axes[n:]:
+    size = (width * n_columns, height * n_rows + extra)
+    figure, grid = make_panels(n_rows, n_columns, size, sharex=sharex, sharey=sharey)
+    axes = list(grid.flat[:n])
+    for ax in grid.flat[n:]:
         ax.remove()
-    return figure, list(axes[:n])
+    for ax in axes[-n_columns:]:  # what sharing hides of a panel above a gap
+        ax.tick_params(labelbottom=True)
+        ax.xaxis.get_offset_text().set_visible(True)
+        ax.set_xlabel(x_label)
+    return figure, axes
 
 
 def legend_above(
@@ -69,6 +111,19 @@ def legend_above(
     )
 
 
+def write_in_cell(ax: Axes, column: int, row: int, text: str, *, colour: str) -> Text:
+    """Small letters in the middle of a cell, of a map whose cells have a side of one."""
+    return ax.text(
+        column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7.5, color=colour
+    )
+
+
+def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:
+    """Over a point something that cannot be seen, and says more."""
+    (spot,) = ax.plot(x, y, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
+    hover(spot, text)
+
+
 def hover(artist: Artist, text: str) -> None:
     """Let an artist say more where a page is read with a mouse; a bar parts the lines."""
     artist.set_gid(f"hover: {text}")
@@ -78,10 +133,28 @@ def axis_label(name: str, unit: str) -> str:
     return f"${latex_name(name)}$ ({unit_text(unit)})"
 
 
-def equals_label(label: str, value: float) -> str:
-    """`$V_D$ (V)` at 300 -> `$V_D$ = 300 V`."""
+def name_label(name: str, labels: Mapping[str, str]) -> str:
+    """What axes and legends call a quantity; else its name as a symbol."""
+    return labels.get(name, f"${latex_name(name)}$")
+
+
+def held_label(held: Mapping[str, float], labels: Mapping[str, str]) -> str:
+    """Parameters at their values: `$V_D$ (V)` at 300 -> `$V_D$ = 300 V`."""
+    return ", ".join(_equals(name_label(name, labels), value) for name, value in held.items())
+
+
+def _equals(label: str, value: float) -> str:
     symbol, _, unit = label.removesuffix(")").rpartition(" (")
     return f"{symbol} = {value:g} {unit}" if symbol else f"{label} = {value:g}"
+
+
+def sample_line(
+    x: pd.Series, along: str, held: Mapping[str, float], parameters: Sequence[str]
+) -> tuple[Float[np.ndarray, " line"], Float[np.ndarray, "line parameters"]]:
+    """A line from the least to the largest x of one parameter, and its points of all of them."""
+    line = np.linspace(x.min(), x.max(), N_LINE)
+    columns = [line if name == along else np.full(N_LINE, held[name]) for name in parameters]
+    return line, np.column_stack(columns)
 
 
 def slope_label(name: str, unit: str) -> str:
@@ -94,7 +167,7 @@ def unit_text(unit: str) -> str:
     return re.sub(r"\^(-?[\d.]+)", r"$^{\1}$", unit)
 
 
-def framing(
+def frame_limits(
     data: Float[np.ndarray, " samples"],
     models: Float[np.ndarray, " values"],
     *,
@@ -118,7 +191,7 @@ def framing(
     return bottom - margin, top + margin
 
 
-def exits(
+def find_exits(
     x: Float[np.ndarray, " points"],
     y: Float[np.ndarray, " points"],
     x_limits: Limits,
@@ -133,13 +206,13 @@ def exits(
     inside = ((points >= limits[:, 0]) & (points <= limits[:, 1])).all(axis=1)
     found = []
     if len(points) and not inside[0]:
-        found.append(_crossing(limits.mean(axis=1), points[0], limits, nearest=True))
+        found.append(_cross(limits.mean(axis=1), points[0], limits, nearest=True))
     for k in np.flatnonzero(inside[:-1] & ~inside[1:]):
-        found.append(_crossing(points[k], points[k + 1], limits))
+        found.append(_cross(points[k], points[k + 1], limits))
     return found
 
 
-def _crossing(
+def _cross(
     start: np.ndarray, end: np.ndarray, limits: np.ndarray, *, nearest: bool = False
 ) -> tuple[float, float, int]:
     """Of the line from a point inside to one outside, and the caret of that edge."""
@@ -166,7 +239,7 @@ def mark_exits(
     diverged: bool = False,
 ) -> None:
     """Carets where a curve leaves the panel; a cross where a run that diverged stops inside."""
-    for at_x, at_y, marker in exits(x, y, *limits):
+    for at_x, at_y, marker in find_exits(x, y, *limits):
         ax.plot(
             at_x, at_y, marker=marker, ls="none", color=colour, ms=7.0, clip_on=False, zorder=5,
             label=f"_{OFF_SCALE}",
@@ -178,12 +251,13 @@ def mark_exits(
         ax.plot(x[-1], y[-1], "x", color=colour, ms=6, mew=1.6, zorder=5, label=f"_{STOPS}")
 
 
-def legend_marks(panels: Iterable[Axes]) -> Sequence[Line2D]:
-    """Entries for the marks that there are in any of the panels."""
-    there = {str(line.get_label()) for ax in panels for line in ax.lines}
+def legend_curves(figure: Figure, axes: Sequence[Axes], n: int = 1) -> None:
+    """A legend of the first panel's first n curves, and of the marks that there are in any."""
+    there = {str(line.get_label()) for ax in axes for line in ax.lines}
     signs: dict[str, Any] = {OFF_SCALE: 6, STOPS: "x"}
-    return [
+    marks = [
         Line2D([], [], ls="none", marker=marker, color=SIGN, label=label)
         for label, marker in signs.items()
         if f"_{label}" in there
     ]
+    legend_above(figure, [*axes[0].lines[:n], *marks], size=9.0)

@@ -18,8 +18,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from ep2sindy.figures.style import COLOURS, equals_label, hover, legend_above, panel_grid
-from ep2sindy.library.equations import latex_name
+from ep2sindy.figures.style import (
+    COLOURS,
+    SIGN,
+    held_label,
+    hover_spot,
+    legend_above,
+    make_grid,
+    make_panels,
+    name_label,
+    sample_line,
+)
 from ep2sindy.operating.quantity_law import ControlLaw
 
 Style = str | tuple[int, tuple[int, ...]]
@@ -67,25 +76,28 @@ def trends_figure(
     labels: what axes and the legend call parameters, quantities and fits; else their names.
     """
     size = (4.4 * len(trends) + 0.8, 2.3 * len(panels) + 1.1)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(len(panels), len(trends), squeeze=False, sharex="col", sharey="row")
+    figure, axes = make_panels(len(panels), len(trends), size, sharex="col", sharey="row")
     fits = list(dict.fromkeys([*estimates["fit"], *published["fit"]]))
-    signs = _signs(fits, panels, laws)
+    signs = _choose_signs(fits, panels, laws)
     for row, panel in zip(axes, panels, strict=True):
         for ax, (along, at) in zip(row, trends, strict=True):
             here = [rows_at(table, at) for table in (estimates, published)]
+            x = pd.concat([table[along].astype(float) for table in here])
+            width = float(np.ptp(x)) if len(x) else 0.0
             for k, fit in enumerate(fits):
-                offset = APART * (k - 0.5 * (len(fits) - 1))
+                offset = APART * width * (k - 0.5 * (len(fits) - 1))
                 of_fit = [table[table["fit"] == fit] for table in here]
-                _points(ax, of_fit, along, panel, signs, offset=offset * _width(here, along))
-                _laws(ax, laws.get(fit, {}), here, (along, at), panel, fit, signs)
-            _ticks(ax, here, along)
-        row[0].set_ylabel(", ".join(_label(name, labels) for name in panel))
+                _draw_points(ax, of_fit, along, panel, fit, signs, offset=offset)
+                if width:
+                    _draw_laws(ax, laws.get(fit, {}), x, (along, at), panel, fit, signs)
+            ax.set_xticks(np.unique(x), [f"{value:g}" for value in np.unique(x)])
+            ax.margins(x=0.08)
+            ax.grid(alpha=0.3)
+        row[0].set_ylabel(", ".join(name_label(name, labels) for name in panel))
     for column, (along, at) in zip(axes.T, trends, strict=True):
-        column[-1].set_xlabel(_label(along, labels))
-        held = ", ".join(equals_label(_label(name, labels), value) for name, value in at.items())
-        column[0].set_title(held, fontsize=10)
-    entries = _legend(signs, labels, published=len(published) > 0)
+        column[-1].set_xlabel(name_label(along, labels))
+        column[0].set_title(held_label(at, labels), fontsize=10)
+    entries = _list_entries(signs, labels, published=len(published) > 0)
     legend_above(figure, entries, n_columns=5, size=9.0)
     return figure
 
@@ -97,7 +109,7 @@ def rows_at(table: pd.DataFrame, held: Mapping[str, Any]) -> pd.DataFrame:
     return table
 
 
-def _signs(
+def _choose_signs(
     fits: Sequence[str],
     panels: Sequence[Sequence[str]],
     laws: Mapping[str, Mapping[str, ControlLaw]],
@@ -117,11 +129,12 @@ def _signs(
     )
 
 
-def _points(
+def _draw_points(
     ax: Axes,
     tables: Sequence[pd.DataFrame],
     along: str,
     panel: Sequence[str],
+    fit: str,
     signs: Signs,
     *,
     offset: float,
@@ -129,67 +142,38 @@ def _points(
     """One fit in one panel: estimates with their intervals, and, open, what was published."""
     for name in panel:
         ours, theirs = (table[table["quantity"] == name] for table in tables)
-        marker = signs.markers.get(name, MARKERS[0])
-        for fit, rows in ours.groupby("fit"):
-            reach = np.abs(rows[["low", "high"]].sub(rows["value"], axis=0).to_numpy().T)
+        style: dict[str, Any] = {"color": signs.colours[fit], "ls": "none"}
+        style["marker"] = signs.markers.get(name, MARKERS[0])
+        if len(ours):
+            reach = np.abs(ours[["low", "high"]].sub(ours["value"], axis=0).to_numpy().T)
             ax.errorbar(
-                rows[along] + offset, rows["value"], reach, fmt=marker, ms=5, capsize=3, lw=1,
-                color=signs.colours[str(fit)], zorder=3,
-            )  # fmt: skip
-        for fit, rows in theirs.groupby("fit"):
-            ax.plot(
-                rows[along] + offset, rows["value"], ls="none", marker=marker, ms=7, mfc="none",
-                color=signs.colours[str(fit)], zorder=2,
-            )  # fmt: skip
+                ours[along] + offset, ours["value"], reach, ms=5, capsize=3, lw=1, zorder=3, **style
+            )
+        if len(theirs):
+            ax.plot(theirs[along] + offset, theirs["value"], ms=7, mfc="none", zorder=2, **style)
 
 
-def _laws(
+def _draw_laws(
     ax: Axes,
     laws: Mapping[str, ControlLaw],
-    tables: Sequence[pd.DataFrame],
+    x: pd.Series,
     trend: tuple[str, Mapping[str, float]],
     panel: Sequence[str],
     fit: str,
     signs: Signs,
 ) -> None:
     """Lines of one fit's laws from the least to the largest value of the parameter."""
-    along, at = trend
-    x = pd.concat([table[along] for table in tables])
-    for name in panel:
-        if name in laws and _width(tables, along):
-            line = np.linspace(x.min(), x.max(), 60)
-            parameters = [
-                line if variable == along else np.full(60, at[variable])
-                for variable in laws[name].library.variables
-            ]
-            predicted = laws[name].predict(np.column_stack(parameters))
-            ax.plot(
-                line, predicted, color=signs.colours[fit], ls=signs.lines[fit, name], lw=1.2,
-                alpha=0.8, zorder=1,
-            )  # fmt: skip
+    for name in (name for name in panel if name in laws):
+        line, points = sample_line(x, *trend, laws[name].library.variables)
+        style: dict[str, Any] = {"color": signs.colours[fit], "ls": signs.lines[fit, name]}
+        ax.plot(line, laws[name].predict(points), lw=1.2, alpha=0.8, zorder=1, **style)
 
 
-def _width(tables: Sequence[pd.DataFrame], along: str) -> float:
-    x = pd.concat([table[along] for table in tables])
-    return float(np.ptp(x)) if len(x) else 0.0
-
-
-def _ticks(ax: Axes, tables: Sequence[pd.DataFrame], along: str) -> None:
-    values = np.unique(np.concatenate([table[along].to_numpy(dtype=float) for table in tables]))
-    ax.set_xticks(values, [f"{value:g}" for value in values])
-    ax.margins(x=0.08)
-    ax.grid(alpha=0.3)
-
-
-def _label(name: str, labels: Mapping[str, str]) -> str:
-    return labels.get(name, f"${latex_name(name)}$")
-
-
-def _legend(signs: Signs, labels: Mapping[str, str], *, published: bool) -> list[Line2D]:
+def _list_entries(signs: Signs, labels: Mapping[str, str], *, published: bool) -> list[Line2D]:
     """A fit's entry bears the line of its laws; a quantity's its marker, and a line of its own."""
 
     def entry(label: str, **style: object) -> Line2D:
-        return Line2D([], [], **({"color": "#555555", "ls": "none"} | style), label=label)  # type: ignore[arg-type]
+        return Line2D([], [], **({"color": SIGN, "ls": "none"} | style), label=label)  # type: ignore[arg-type]
 
     entries = [
         entry(
@@ -199,7 +183,7 @@ def _legend(signs: Signs, labels: Mapping[str, str], *, published: bool) -> list
     ]
     for name, marker in signs.markers.items():
         own = [s for (fit, q), s in signs.lines.items() if q == name and s != signs.of_fit(fit)]
-        entries.append(entry(_label(name, labels), marker=marker, ls=own[0] if own else "none"))
+        entries.append(entry(name_label(name, labels), marker=marker, ls=own[0] if own else "none"))
     if published:
         entries.append(entry(labels.get("published", "published"), marker="o", mfc="none", ms=7))
     return entries + ([entry("lines: control laws")] if signs.lines else [])
@@ -216,13 +200,12 @@ def sweep_figure(
 
     x: what the jobs were given, or their numbers. values: NaN where a job has none.
     """
-    figure, axes = panel_grid(len(values), width=3.4, height=2.5, extra=0.2, most=3)
+    figure, axes = make_grid(len(values), width=3.4, height=2.5, extra=0.2, most=3)
     for ax, (name, numbers) in zip(axes, values.items(), strict=True):
         there = np.isfinite(numbers)
         ax.plot(x[there], numbers[there], "o", color=COLOURS[0], ms=6)
         for k in np.flatnonzero(there).tolist():
-            (spot,) = ax.plot(x[k], numbers[k], "o", ms=13, alpha=0.0)
-            hover(spot, f"{jobs[k]} | {name}: {numbers[k]:.4g}")
+            hover_spot(ax, x[k], numbers[k], f"{jobs[k]} | {name}: {numbers[k]:.4g}")
         ax.set_title(name.replace(": ", ":\n"), fontsize=9)
         ax.set_xlabel(x_label, fontsize=9)
         ax.tick_params(labelsize=8)

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above
+from ep2sindy.figures.style import COLOURS, DATA, GREY, legend_above, make_panels
 
 
 def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
@@ -19,8 +19,7 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
     rows: method, window (samples), loss, f_error, nrmse, f_error_started, nrmse_started.
     period: of the data, in samples.
     """
-    figure = Figure(figsize=(10.0, 3.6), layout="constrained")
-    axes = figure.subplots(1, 3, sharex=True)
+    figure, (axes,) = make_panels(1, 3, (10.0, 3.6), sharex=True)
     lengths = [int(n) for n in rows["window"].unique()]
     titles = ("loss (1: a constant)", "frequency error (%)", "nrmse on held-out data")
     for (name, each), colour in zip(rows.groupby("method", sort=False), COLOURS, strict=False):
@@ -57,16 +56,16 @@ def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Fi
     noisy = cells[cells["noise"] > 0.0]
     shown = noisy if len(noisy) else cells
     lengths = cells["n_points"].dropna().unique()
-    figure = Figure(figsize=(2.9 * len(lengths) + 0.4, 3.6), layout="constrained")
-    axes = figure.subplots(1, len(lengths), squeeze=False, sharex=True, sharey=True)[0]
+    size = (2.9 * len(lengths) + 0.4, 3.6)
+    figure, (axes,) = make_panels(1, len(lengths), size, sharex=True, sharey=True)
     for ax, n_points in zip(axes, lengths, strict=True):
         for style, name in zip(("--", "-", ":"), references, strict=False):
             label = name.replace("_", ", ")
-            _error_line(ax, shown[shown["setting"] == name], label=label, color=DATA, ls=style)
+            _draw_error(ax, shown[shown["setting"] == name], label=label, color=DATA, ls=style)
         panel = shown[shown["n_points"] == n_points]
         for colour, n_windows in zip(COLOURS, panel["n_windows"].unique(), strict=False):
             one = panel[panel["n_windows"] == n_windows]
-            _error_line(ax, one, label=f"{n_windows} windows", color=colour, marker="o", ms=3.5)
+            _draw_error(ax, one, label=f"{n_windows} windows", color=colour, marker="o", ms=3.5)
         ax.set_title(f"{n_points} points per window", fontsize=10)
         ax.set_xlabel("noise (% of RMS)")
         ax.grid(which="major", alpha=0.3)
@@ -81,6 +80,6 @@ def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Fi
     return figure
 
 
-def _error_line(ax: Axes, cells: pd.DataFrame, *, label: str, **style: Any) -> None:
+def _draw_error(ax: Axes, cells: pd.DataFrame, *, label: str, **style: Any) -> None:
     ordered = cells.sort_values("noise")
     ax.plot(100.0 * ordered["noise"], ordered["error_mean"], label=label, lw=1.2, **style)

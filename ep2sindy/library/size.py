@@ -53,6 +53,6 @@ def check_values(n_terms: int, shape: Sequence[int]) -> None:
     check_memory(
         24.0 * n_terms * n_samples,  # and what they are made of
         f"{n_terms} terms at {n_samples} samples",
-        way_out="take every second sample (ep2sindy.decimate), or fewer terms",
+        way_out="take every second sample (ep2sindy.prepare.decimate), or fewer terms",
         each=24.0 * n_terms,
     )

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from ep2sindy.data.given import Run, is_run, trajectory_of
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.model.display import model_html, model_lines
@@ -24,6 +23,7 @@ from ep2sindy.model.rates import rates
 from ep2sindy.model.rollout import Rollout, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import N_LINES
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother

@@ -9,7 +9,6 @@ from itertools import count
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.model.closed_orbit import (
     N_SAMPLES,
     RETURNS,
@@ -20,6 +19,7 @@ from ep2sindy.model.closed_orbit import (
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.runge_kutta import rk4_step
 from ep2sindy.model.scaled import ScaledModel
+from ep2sindy.runtime.arrays import read_only
 
 # A modulus this close to one is neutral: a departure takes a thousand periods or more to change
 # e-fold, longer than any record. The multipliers themselves are exact to 1e-6 or better.

@@ -10,15 +10,15 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.operating.fit import (
-    LeftOut,
+    LeaveOneOut,
     OperatingFit,
     Structure,
     Windows,
-    left_out,
+    leave_one_out,
     operating_fit,
 )
 from ep2sindy.operating.law import OperatingLaw
@@ -27,9 +27,9 @@ from ep2sindy.operating.records import (
     OperatingRecord,
     branches_of,
     check_records,
-    measured_left_out,
+    interpolation_errors,
 )
-from ep2sindy.refinement.law import TiedRefinement
+from ep2sindy.refinement.law import LawRefinement
 from ep2sindy.regression.differential import Differential
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -41,7 +41,7 @@ CLOSE = 0.05  # of its bound: a deviation that is no reason for another term
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class StructureTrial:
     """A structure with laws of one degree, weighted by information, at points left out.
 
     errors: by record, the largest deviation from its cycle in units of its bound, ten at most, and
@@ -50,7 +50,7 @@ class Tried:
 
     fit: OperatingFit
     degree: int
-    found: Sequence[LeftOut]
+    found: Sequence[LeaveOneOut]
 
     @property
     def n_numbers(self) -> int:
@@ -72,9 +72,9 @@ def candidate_structures(
 
     One search over all records: a term is in or out everywhere. Rows are those of the derivative.
     """
-    recipe = Recipe(formulation=Differential(), search=BestSubset(max_terms=max_terms))
+    method = Regression(formulation=Differential(), search=BestSubset(max_terms=max_terms))
     runs = {record.label: [record.run] for record in records}
-    found = discover_jointly(runs, library, recipe, progress=progress)
+    found = discover_jointly(runs, library, method, progress=progress)
     sizes = {
         state: [support for support in front.supports if len(support) >= 2]
         for state, front in found.fronts.items()
@@ -82,7 +82,7 @@ def candidate_structures(
     return [dict(zip(sizes, chosen, strict=True)) for chosen in product(*sizes.values())]
 
 
-def tried(
+def try_structures(
     records: Sequence[OperatingRecord],
     library: Library,
     structures: Sequence[Structure],
@@ -92,13 +92,18 @@ def tried(
     seed: int = 0,
     workers: Workers | None = None,
     progress: Progress = SILENT,
-) -> list[Tried]:
+) -> list[StructureTrial]:
     """Every structure with every degree that leaves a point over.
 
     Raises ValueError where the records suffice for none.
     """
     one = partial(
-        _tried, records=records, library=library, degrees=degrees, windows=windows, seed=seed
+        _try_structure,
+        records=records,
+        library=library,
+        degrees=degrees,
+        windows=windows,
+        seed=seed,
     )
     stage = progress.stage(len(structures), "structure", "laws at points left out")
     by_structure = collect(workers or Serial(), one, structures, stage)
@@ -112,7 +117,7 @@ def tried(
     return found
 
 
-def chosen(found: Sequence[Tried]) -> Tried:
+def choose(found: Sequence[StructureTrial]) -> StructureTrial:
     """The one of fewest numbers whose mean error is not told apart from the least.
 
     That is within one standard error of the difference, point by point.
@@ -127,7 +132,7 @@ def chosen(found: Sequence[Tried]) -> Tried:
     return min(near, key=lambda each: (each.n_numbers, float(each.errors.mean())))
 
 
-def _tried(
+def _try_structure(
     structure: Structure,
     *,
     records: Sequence[OperatingRecord],
@@ -135,12 +140,12 @@ def _tried(
     degrees: Sequence[int],
     windows: Windows,
     seed: int,
-) -> list[Tried]:
+) -> list[StructureTrial]:
     fit = operating_fit(records, library, structure, windows=windows, seed=seed)
     found = []
     for degree in degrees:
         try:
-            found.append(Tried(fit, degree, left_out(fit, fit.functions(degree))))
+            found.append(StructureTrial(fit, degree, leave_one_out(fit, fit.functions(degree))))
         except ValueError:
             continue  # too few points for this degree
     return found
@@ -181,11 +186,11 @@ class Branch:
     """
 
     name: str
-    trials: Sequence[Tried]
-    choice: Tried
+    trials: Sequence[StructureTrial]
+    choice: StructureTrial
     law: OperatingLaw
-    tied: TiedRefinement
-    left_out: Sequence[LeftOut]
+    tied: LawRefinement
+    left_out: Sequence[LeaveOneOut]
     smooth: tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]
     at_points: Sequence[MapPoint]
     map: Sequence[MapPoint]
@@ -195,7 +200,7 @@ class Branch:
         return self.choice.fit
 
 
-def grouped(records: Sequence[OperatingRecord]) -> dict[str, list[OperatingRecord]]:
+def group_by_cycle(records: Sequence[OperatingRecord]) -> dict[str, list[OperatingRecord]]:
     """Records by cycle: all, or strong and weak."""
     check_records(records)
     number = branches_of(records)
@@ -208,7 +213,7 @@ def grouped(records: Sequence[OperatingRecord]) -> dict[str, list[OperatingRecor
     }
 
 
-def branch_of(
+def find_branch(
     name: str,
     records: Sequence[OperatingRecord],
     points: Sequence[Mapping[str, float]],
@@ -225,7 +230,7 @@ def branch_of(
     structures = (
         [how.structure] if how.structure is not None else _structures(records, how, progress)
     )
-    trials = tried(
+    trials = try_structures(
         records,
         how.library,
         structures,
@@ -235,7 +240,7 @@ def branch_of(
         workers=workers,
         progress=progress,
     )
-    choice = chosen(trials)
+    choice = choose(trials)
     functions = choice.fit.functions(choice.degree)
     law, found = choice.fit.tied(functions, progress=progress)
     grid = map_points(points, how.n_map)
@@ -245,10 +250,12 @@ def branch_of(
         choice=choice,
         law=law,
         tied=found,
-        left_out=left_out(choice.fit, functions, start=law, workers=workers, progress=progress),
-        smooth=measured_left_out(records, choice.fit.basis(functions)),
-        at_points=_followed(law, records, points, workers, progress),
-        map=_followed(law, records, grid, workers, progress),
+        left_out=leave_one_out(
+            choice.fit, functions, start=law, workers=workers, progress=progress
+        ),
+        smooth=interpolation_errors(records, choice.fit.basis(functions)),
+        at_points=_follow(law, records, points, workers, progress),
+        map=_follow(law, records, grid, workers, progress),
     )
 
 
@@ -274,7 +281,7 @@ def _structures(
     )
 
 
-def _followed(
+def _follow(
     law: OperatingLaw,
     records: Sequence[OperatingRecord],
     points: Sequence[Mapping[str, float]],

@@ -15,20 +15,22 @@ from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import FreeRunBounds, deviation
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.law import OperatingLaw, in_hull
+from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
 from ep2sindy.operating.records import (
     OperatingRecord,
     check_records,
     values_of,
 )
-from ep2sindy.refinement.law import TiedRefinement, refine_tied
+from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.refine import Refinement, refine_many
-from ep2sindy.refinement.weighted_law import Basis, information_of, weighted_law
+from ep2sindy.refinement.problem import RefinementSettings
+from ep2sindy.refinement.refine import Refinement, refine
+from ep2sindy.refinement.weighted_law import information_of, weighted_law
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import Progress, as_progress
+from ep2sindy.signals.spectrum import samples_in
 
 MOST = 10.0  # deviations count no more, however far a run is off, or where there is none
 
@@ -47,8 +49,9 @@ class Windows:
             raise ValueError(f"windows must be one or more, of positive length: {self} came")
 
     def samples(self, records: Sequence[OperatingRecord]) -> int:
-        each = [self.periods / (r.cycle.frequency_Hz * r.run.dt_s) for r in records]
-        wanted = round(float(np.median(each))) + 1
+        frequency_Hz = [record.cycle.frequency_Hz for record in records]
+        dt_s = [record.run.dt_s for record in records]
+        wanted = samples_in(self.periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
         return min(wanted, *(record.run.n_samples // 2 for record in records))
 
 
@@ -104,7 +107,7 @@ class OperatingFit:
     def functions(self, degree: int) -> Library:
         """Polynomials of the parameters; ValueError where the records do not suffice."""
         found = polynomial(list(self.records[0].parameters), degree=degree)
-        Basis(self.basis(found))
+        law_basis(found, values_of(self.records))
         return found
 
     def weighted(self, functions: Library) -> OperatingLaw:
@@ -118,7 +121,7 @@ class OperatingFit:
         *,
         start: OperatingLaw | None = None,
         progress: Progress | bool = False,
-    ) -> tuple[OperatingLaw, TiedRefinement]:
+    ) -> tuple[OperatingLaw, LawRefinement]:
         """The law refined over all records at once, with intervals.
 
         start: a law that is close; the weighted one, and all stages, otherwise.
@@ -128,14 +131,12 @@ class OperatingFit:
         method = MultipleShooting()
         if start is not None:
             method = MultipleShooting(first_block=window, tolerance=1e-4)
-        found = refine_tied(
+        found = refine_law(
             [fit.model for fit in self.fits],
             [[record.run] for record in self.records],
             self.basis(functions),
-            window=window,
-            n_windows=self.windows.n_windows,
+            RefinementSettings(self.windows.n_windows, window, method=method, n_reweights=0),
             start=near.coef,
-            method=method,
             rng=self.seed,
             progress=progress,
         )
@@ -187,12 +188,12 @@ def operating_fit(
     for record in records:
         problems = rows.assemble([record.run], library, rng=np.random.default_rng(seed))
         starts.append(constrained_fit(problems, held, units=record.run.units))
-    fits = refine_many(
+    # States count by their standard deviation, as they are judged.
+    settings = RefinementSettings(windows.n_windows, windows.samples(records), n_reweights=0)
+    fits = refine(
         starts,
         [[record.run] for record in records],
-        window=windows.samples(records),
-        n_windows=windows.n_windows,
-        n_reweights=0,  # states count by their standard deviation, as they are judged
+        settings,
         rng=seed,
         progress=progress,
     )
@@ -201,7 +202,7 @@ def operating_fit(
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class LeaveOneOut:
     """A point read off the law of the others, and run freely from one sample of its record.
 
     inside: whether the others enclose it.
@@ -222,37 +223,37 @@ class LeftOut:
         return MOST if np.isnan(found) else min(found, MOST)
 
 
-def left_out(
+def leave_one_out(
     fit: OperatingFit,
     functions: Library,
     *,
     start: OperatingLaw | None = None,
     workers: Workers | None = None,
     progress: Progress | bool = False,
-) -> list[LeftOut]:
+) -> list[LeaveOneOut]:
     """Every point in turn by the law of the others: weighted, or tied, beginning at `start`.
 
     Raises ValueError where points without one do not suffice for the law.
     """
     for k, record in enumerate(fit.records):
         try:
-            Basis(fit.without(k).basis(functions))
+            law_basis(functions, values_of(fit.without(k).records))
         except ValueError as error:
             raise ValueError(f"{record.label} cannot be left out: {error}") from error
-    one = partial(_left_out, fit=fit, functions=functions, start=start)
+    one = partial(_leave_out, fit=fit, functions=functions, start=start)
     n_points = len(fit.records)
     stage = as_progress(progress).stage(n_points, "point", "law without a point")
     return collect(workers or Serial(), one, range(n_points), stage)
 
 
-def _left_out(
+def _leave_out(
     number: int, *, fit: OperatingFit, functions: Library, start: OperatingLaw | None
-) -> LeftOut:
+) -> LeaveOneOut:
     record, others = fit.records[number], fit.without(number)
     law = others.weighted(functions) if start is None else others.tied(functions, start=start)[0]
     model = law.model_at(record.parameters, extrapolate=True)
     at = values_of([record])[0]
-    return LeftOut(record, free_run(model, record.from_slowest), in_hull(law.points, at))
+    return LeaveOneOut(record, free_run(model, record.from_slowest), in_hull(law.points, at))
 
 
 def _values(model: SparseModel) -> list[float]:

@@ -1,4 +1,4 @@
-"""A model whose coefficients are functions of the operating point, with intervals and bounds."""
+"""A model whose coefficients are functions of the operating point, and its fit to all rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from scipy.special import ndtri
 from scipy.stats import f as f_distribution
 
 from ep2sindy.data.scales import column_norms, zero_to_one
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.discovery.shared_support import JointDiscovery, JointFront
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
@@ -25,15 +24,17 @@ from ep2sindy.library.library import Library, named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
-from ep2sindy.operating.records import point_label
+from ep2sindy.operating.records import check_varying, point_label
+from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.rule import FLOOR
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 
-# Steps of weighting and correction of the last fit, as `reweighted` takes them.
+# Steps of weighting and correction of the last fit, as `reweight` takes them.
 N_STEPS = 8
 
 INSIDE = 1e-6  # a point this far outside the hull, in ranges of the parameters, lies on its edge
@@ -94,6 +95,14 @@ class OperatingLaw:
     def parameters(self) -> tuple[str, ...]:
         return tuple(self.functions.variables)
 
+    @property
+    def numbers(self) -> dict[str, dict[str, dict[str, float]]]:
+        """State -> term -> function -> its number in that term's coefficient."""
+        found: dict[str, dict[str, dict[str, float]]] = {state: {} for state in self.states}
+        for (state, term), row in zip(self.coefficients, self.coef.tolist(), strict=True):
+            found[state][term] = dict(zip(self.functions.names, row, strict=True))
+        return found
+
     def model_at(
         self, parameters: Mapping[str, float], *, extrapolate: bool = False
     ) -> SparseModel:
@@ -115,7 +124,8 @@ class OperatingLaw:
             coef[place] = value
         if self.covariance is not None:
             spread = np.kron(np.eye(len(self.coefficients)), functions)
-            order = [k for k in np.lexsort(np.transpose(places)) if coef[places[k]] != 0.0]
+            by_state = sorted(range(len(places)), key=lambda k: (places[k][1], places[k][0]))
+            order = [k for k in by_state if coef[places[k]] != 0.0]
             covariance = (spread @ self.covariance @ spread.T)[np.ix_(order, order)]
         provenance = {**self.provenance, "point": point_label(parameters)}
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
@@ -145,10 +155,10 @@ class OperatingLaw:
 
     def text(self, *, digits: int = 3) -> str:
         """One line per coefficient: `n_i: n_n = 4.83e+03 + 12.1 V_d`."""
+        numbers = self.numbers
         lines = []
-        for (state, term), row in zip(self.coefficients, self.coef.tolist(), strict=True):
-            by_function = dict(zip(self.functions.names, row, strict=True))
-            right = equation_text("c", by_function, digits=digits).partition("= ")[2]
+        for state, term in self.coefficients:
+            right = equation_text("c", numbers[state][term], digits=digits).partition("= ")[2]
             lines.append(f"{state}: {term} = {right}")
         return "\n".join(lines)
 
@@ -237,129 +247,122 @@ def in_hull(
     return float(nnls(columns, target)[1]) <= INSIDE
 
 
-@dataclass(frozen=True, eq=False)
-class TiedEquation:
-    """One equation whose coefficients follow a law: coef_j(point) = sum_m coef_jm law_m(point).
+def law_basis(
+    functions: Library,
+    points: Float[np.ndarray, "points parameters"],
+    *,
+    n_spare: int = 0,
+    remedy: str = "leave it out, or add points",
+) -> Basis:
+    """The functions of a law at the points that it is to be fitted to: the check of all laws.
 
-    coef: (support, law terms), in SI. r2_free, r2_tied: by point, on its training rows, with
-    coefficients of its own and with those of the law. F: growth of the residual per coefficient
-    given up, in variances of a row; p_value: the chance of more if the law holds, for rows with
-    independent Gaussian errors; both NaN if the law gives up none.
-    covariance: of the coefficients, row by row, where noise has been followed to them.
+    points: columns in the order of the functions' variables. n_spare: points that must be left
+    over. remedy: what to do about a parameter that does not vary.
+    Raises ValueError where the points do not suffice; it names a parameter if one is to blame.
+    """
+    try:
+        if n_spare and len(points) < len(functions) + n_spare:
+            raise ValueError(
+                f"a law of {len(functions)} functions of {list(functions.variables)} needs more "
+                f"points than these, since each is left out in turn: {len(points)} came"
+            )
+        return Basis(functions.evaluate(points))
+    except ValueError:
+        check_varying(points, functions.variables, remedy=remedy)
+        raise
+
+
+@dataclass(frozen=True, eq=False)
+class LawTest:
+    """Whether the coefficients of one equation follow a law.
+
+    r2_free, r2_tied: by point, on its training rows, with coefficients of its own and with those
+    of the law. F: growth of the residual per coefficient given up, in variances of a row; p_value:
+    the chance of more if the law holds, for rows with independent Gaussian errors; both NaN if the
+    law gives up none.
     """
 
-    terms: tuple[str, ...]
-    coef: Float[np.ndarray, "support law_terms"]
     r2_free: Mapping[str, float]
     r2_tied: Mapping[str, float]
     F: float
     p_value: float
-    covariance: Float[np.ndarray, "coefs coefs"] | None
 
 
 @dataclass(frozen=True, eq=False)
-class TiedFit:
-    """Equations by state, and what they say at any operating point."""
+class LawFit:
+    """A law fitted to the rows of all points, and whether it holds, by state."""
 
-    law: Library
-    equations: Mapping[str, TiedEquation]
-    library: Library
-    units: Mapping[str, str]
-
-    def model_at(self, parameters: Mapping[str, float]) -> SparseModel:
-        """The model at one operating point, which need not be among those of the fit.
-
-        Raises ValueError unless `parameters` are exactly the variables of the law.
-        """
-        law = _law_terms(self.law, {"this point": parameters})[0]
-        coef = [dict(zip(e.terms, e.coef @ law, strict=True)) for e in self.equations.values()]
-        blocks = []
-        for equation in self.equations.values():
-            spread = np.kron(np.eye(len(equation.terms)), law)
-            if equation.covariance is not None:
-                blocks.append(spread @ equation.covariance @ spread.T)
-        return SparseModel(
-            library=self.library,
-            states=list(self.equations),
-            coef=coef_matrix(self.library, coef),
-            units=self.units,
-            provenance={"point": ", ".join(f"{k}={v:g}" for k, v in parameters.items())},
-            covariance=block_diag(*blocks) if len(blocks) == len(coef) else None,
-        )
+    law: OperatingLaw
+    tests: Mapping[str, LawTest]
 
 
-def tied_fit(
-    found: JointDiscovery, law: Library, *, parameters: Mapping[str, Mapping[str, float]]
-) -> TiedFit:
+def fit_law(
+    shared: JointDiscovery, functions: Library, *, parameters: Mapping[str, Mapping[str, float]]
+) -> LawFit:
     """Fit the chosen supports again, all points at once, their coefficients tied by a law.
 
-    coef_j(point) = sum_m coef_jm law_m(parameters of the point): one least squares per equation
-    with columns theta_j law_m. Rows are weighted by their covariance where it is known, and every
+    coef_j(point) = sum_m coef_jm f_m(parameters of the point): one least squares per equation
+    with columns theta_j f_m. Rows are weighted by their covariance where it is known, and every
     point by the residual variance of its free fit, so that neither units nor noise of one point
     lead. Compare `r2_tied` to `r2_free` and see F: a law that does not hold costs R2 at the
     points that depart from it. Rows that are not independent (`Differential`) make F too large.
-    parameters: point -> {variable of the law: value}, in any units.
+    functions: of the parameters. parameters: point -> {variable of the law: value}, in any units.
     Raises ValueError for points or variables that are missing or unknown, and for points that
-    cannot tell the terms of the law apart.
+    cannot tell the functions apart.
     """
-    points = list(found.models)
-    if set(parameters) != set(points):
+    names = list(shared.models)
+    if set(parameters) != set(names):
         raise ValueError(
-            f"every point needs parameters, and no other: the points are {points}, parameters "
+            f"every point needs parameters, and no other: the points are {names}, parameters "
             f"came for {list(parameters)}"
         )
-    values = _law_terms(law, {point: parameters[point] for point in points})
-    _check_law(law, values, {point: parameters[point] for point in points})
-    model = found.models[points[0]]
-    return TiedFit(
-        law=law,
-        equations={
-            state: _tied(front, found, dict(zip(points, values, strict=True)))
-            for state, front in found.fronts.items()
-        },
+    points = _values_at(functions, {name: parameters[name] for name in names})
+    basis = law_basis(functions, points)
+    law_at = dict(zip(names, basis.values, strict=True))
+    tied = {state: _tied(front, shared, law_at) for state, front in shared.fronts.items()}
+    blocks = [equation.covariance for equation in tied.values() if equation.covariance is not None]
+    model = shared.models[names[0]]
+    law = OperatingLaw(
+        functions=functions,
         library=model.library,
+        states=tuple(tied),
+        coefficients=tuple((state, term) for state, each in tied.items() for term in each.terms),
+        coef=np.concatenate([equation.coef for equation in tied.values()]),
+        points=points,
+        covariance=block_diag(*blocks) if len(blocks) == len(tied) else None,
         units=model.units,
+        provenance={"law": f"least squares, {len(names)} points"},
     )
+    return LawFit(law, {state: equation.test for state, equation in tied.items()})
 
 
-def _law_terms(
-    law: Library, parameters: Mapping[str, Mapping[str, float]]
-) -> Float[np.ndarray, "points law_terms"]:
+def _values_at(
+    functions: Library, parameters: Mapping[str, Mapping[str, float]]
+) -> Float[np.ndarray, "points parameters"]:
+    names = list(functions.variables)
     for point, known in parameters.items():
-        if set(known) != set(law.variables) or not np.isfinite(list(known.values())).all():
+        if set(known) != set(names) or not np.isfinite(list(known.values())).all():
             raise ValueError(
-                f"{point!r} needs one finite value for each of {list(law.variables)}: "
-                f"{dict(known)} came"
+                f"{point!r} needs one finite value for each of {names}: {dict(known)} came"
             )
-    return law.evaluate(
-        np.array([[float(known[v]) for v in law.variables] for known in parameters.values()])
-    )
+    return np.array([[float(known[name]) for name in names] for known in parameters.values()])
 
 
-def _check_law(
-    law: Library,
-    values: Float[np.ndarray, "points law_terms"],
-    parameters: Mapping[str, Mapping[str, float]],
-) -> None:
-    if len(values) < len(law):
-        raise ValueError(
-            f"a law of {len(law)} terms needs as many points: {len(values)} came; use a law of "
-            "fewer terms"
-        )
-    if np.linalg.matrix_rank(values / column_norms(values)) < len(law):
-        same = [v for v in law.variables if len({p[v] for p in parameters.values()}) == 1]
-        raise ValueError(
-            f"the points must tell the terms {list(law.names)} of the law apart: "
-            + (f"{same} do not vary" if same else "some are combinations of others there")
-            + "; leave some out"
-        )
+@dataclass(frozen=True, eq=False)
+class _Tied:
+    """One equation's part of a law. covariance: where noise has been followed to it."""
+
+    terms: tuple[str, ...]
+    coef: Float[np.ndarray, "support functions"]
+    covariance: Float[np.ndarray, "coefs coefs"] | None
+    test: LawTest
 
 
 def _tied(
-    front: JointFront, found: JointDiscovery, law_at: Mapping[str, Float[np.ndarray, " law_terms"]]
-) -> TiedEquation:
+    front: JointFront, shared: JointDiscovery, law_at: Mapping[str, Float[np.ndarray, " functions"]]
+) -> _Tied:
     """One least squares over the rows of all points."""
-    terms = found.chosen[front.equation]
+    terms = shared.chosen[front.equation]
     fits = {
         p: _FreeFit.of(each, front.supports.index(terms), terms) for p, each in front.points.items()
     }
@@ -379,12 +382,10 @@ def _tied(
     n_given_up = sum(fit.n_terms for fit in fits.values()) - coef.size
     n_left = len(target) - sum(fit.n_terms for fit in fits.values())
     F = max(float(growth), 0.0) / n_given_up if n_given_up > 0 else np.nan
-    known = all(each.problem.noisy is not None for each in front.points.values())
-    return TiedEquation(
-        terms=terms,
-        coef=coef,
+    known = all(each.rows.noisy is not None for each in front.points.values())
+    test = LawTest(
         r2_free={
-            p: _r2(each, found.models[p].terms(front.equation)) for p, each in front.points.items()
+            p: _r2(each, shared.models[p].terms(front.equation)) for p, each in front.points.items()
         },
         r2_tied={
             p: _r2(each, dict(zip(terms, coef @ law_at[p], strict=True)))
@@ -392,8 +393,8 @@ def _tied(
         },
         F=F,
         p_value=float(f_distribution.sf(F, n_given_up, n_left)) if n_given_up > 0 else np.nan,
-        covariance=root @ root.T if known else None,
     )
+    return _Tied(terms, coef, root @ root.T if known else None, test)
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,7 +411,7 @@ class _FreeFit:
 
     @staticmethod
     def of(front: ParetoFront, k: int, terms: Sequence[str]) -> _FreeFit:
-        problem, candidate = front.problem, front.candidates[k]
+        problem, candidate = front.rows, front.candidates[k]
         equation = problem.equations.index(front.equation)
         scale = problem.coef_scale(equation)
         theta, target = problem.train_theta, problem.train_target(equation)
@@ -435,7 +436,7 @@ class _FreeFit:
 
 def _r2(front: ParetoFront, coef: Mapping[str, float]) -> float:
     """R2 of SI coefficients on the training rows of one point."""
-    problem = front.problem
+    problem = front.rows
     equation = problem.equations.index(front.equation)
     scale = problem.coef_scale(equation)
     scaled = coef_matrix(problem.library, [coef])[:, 0] / scale

@@ -14,12 +14,12 @@ from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.scales import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
-from ep2sindy.operating.law import TiedFit, tied_fit
+from ep2sindy.operating.law import LawFit, fit_law
 from ep2sindy.operating.quantities import (
     FITTED,
     REFINED,
@@ -34,7 +34,7 @@ from ep2sindy.operating.records import OperatingRecord, check_alike, naming
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
-from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
@@ -83,7 +83,8 @@ class PointStudy:
     bootstrap: TimeBootstrap
     refining: Refining
     searched: Library
-    recipe: Recipe
+    recipe: AnyMethod
+    formulation: Formulation
 
     def __post_init__(self) -> None:
         for case in self.cases.values():
@@ -147,7 +148,7 @@ def _point_result(
         return result
     period_s = 1.0 / result.f_Hz
     rows, *streams, last = rng.spawn(2 * len(study.cases) + 2)
-    problems = study.recipe.formulation.assemble([run], study.library, rng=rows)
+    problems = study.formulation.assemble([run], study.library, rng=rows)
     fits = {}
     for k, (name, case) in enumerate(study.cases.items()):
         fits[name] = _least_squares(run, problems, case, study, period_s, rng=streams[2 * k])
@@ -167,7 +168,7 @@ def _least_squares(
     rng: np.random.Generator,
 ) -> Fitted:
     """The case's fit, its intervals and covariance from rows redrawn in blocks of time."""
-    provenance = {"formulation": repr(study.recipe.formulation), "trajectories": run.label}
+    provenance = {"formulation": repr(study.formulation), "trajectories": run.label}
     model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
     n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
     group_s = (run.t[-1] - run.t[0]) / n_groups
@@ -226,8 +227,10 @@ def _refined(
 
 def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
     found = discover(run, study.searched, study.recipe, seed=rng)
-    problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
-    return Fitted(model=found.model, status=SEARCHED, r2=_r2(problems, found.model))
+    fronts = found.fronts.values()
+    problems = list(dict.fromkeys(front.problem for front in fronts if front.problem is not None))
+    no_rows = dict.fromkeys(found.model.states, float("nan"))  # of a search of trajectories
+    return Fitted(model=found.model, status=SEARCHED, r2=no_rows | _r2(problems, found.model))
 
 
 def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
@@ -341,7 +344,7 @@ class JointResult:
 
     found: JointDiscovery
     fitted: Sequence[Fitted | None]
-    tied: TiedFit | None
+    tied: LawFit | None
     why_not_tied: str = ""
 
 
@@ -364,12 +367,15 @@ def searched_jointly(
         for point, result in zip(points, results, strict=True)
         if result.fits and point.trajectory is not None
     }
-    if len(used) < 2 or not isinstance(study.recipe.search, BestSubset):
+    method = study.recipe
+    if len(used) < 2:
+        return None
+    if not (isinstance(method, Regression) and isinstance(method.search, BestSubset)):
         return None
     found = discover_jointly(
         {label: [point.trajectory] for label, point in used.items() if point.trajectory},
         study.searched,
-        replace(study.recipe, bootstraps=Bootstraps(n=0)),
+        replace(method, bootstraps=Bootstraps(n=0)),
         seed=rng,
         progress=progress,
     )
@@ -377,7 +383,7 @@ def searched_jointly(
     try:
         parameters = {label: point.parameters for label, point in used.items()}
         with progress.stage(None, "", "coefficients tied by a law"):
-            tied = tied_fit(found, law, parameters=parameters)
+            tied = fit_law(found, law, parameters=parameters)
     except ValueError as error:
         reason = str(error)
     labels = [point.label for point in points]

@@ -11,10 +11,11 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.data.scales import column_norms
-from ep2sindy.data.trajectory import read_only
 from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.quantities import PointResult
+from ep2sindy.operating.records import check_varying
+from ep2sindy.runtime.arrays import read_only
 
 # A share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
@@ -104,12 +105,7 @@ def _check(
         )
     if not (np.isfinite(values).all() and np.isfinite(parameters).all()):
         raise ValueError("values and parameters must be finite: leave out points that are not")
-    for name, column in zip(names, parameters.T, strict=True):
-        if np.ptp(column) == 0.0:
-            raise ValueError(
-                f"a parameter must vary: {name!r} is {column[0]:g} at all {len(values)} points; "
-                "leave it out of the library"
-            )
+    check_varying(parameters, names, remedy="leave it out of the library")
     if max_terms is not None and max_terms < 1:
         raise ValueError(f"max_terms must be at least 1: {max_terms} came")
 

@@ -14,6 +14,7 @@ from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
+from ep2sindy.signals.spectrum import steps_in
 
 LEAST_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
 
@@ -99,7 +100,7 @@ class OperatingRecord:
 
         A free run starts here: in the pulse a small error of the model is a large one in phase.
         """
-        n = round(2.0 / (self.cycle.frequency_Hz * self.run.dt_s))
+        n = round(steps_in(2.0, frequency_Hz=self.cycle.frequency_Hz, dt_s=self.run.dt_s))
         x = self.run.states[: max(n, 3)] / zero_to_one(self.cycle.std)
         return int(np.argmin(np.linalg.norm(np.gradient(x, axis=0), axis=1)))
 
@@ -136,12 +137,15 @@ def check_varying(
     *,
     remedy: str = "leave it out, or add points",
 ) -> None:
-    """Raise ValueError for a parameter that is the same at all points: no law can hold it."""
+    """Raise ValueError for a parameter that is the same at all points: no law can hold it.
+
+    remedy: what to do about it, with `{name}` for the parameter's.
+    """
     for name, column in zip(parameters, points.T, strict=True):
         if np.ptp(column) == 0.0:
             raise ValueError(
                 f"a parameter must vary: {name!r} is {column[0]:g} at all {len(points)} operating "
-                f"points; {remedy}"
+                f"points; {remedy.format(name=name)}"
             )
 
 
@@ -170,7 +174,7 @@ def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records 
     return np.array([[record.parameters[name] for name in names] for record in records])
 
 
-def measured_left_out(
+def interpolation_errors(
     records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
     """How smooth the records are: what functions of the parameters miss at points left out.

@@ -14,15 +14,25 @@ from torch import nn
 from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.judge import FLAT
+from ep2sindy.refinement.judge import RefinementStatus, is_flat, status_of
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.gradient_descent import trajectories as integrate
 from ep2sindy.refinement.ode import ODE, unconstrained
-from ep2sindy.refinement.problem import Fit, Iteration, Problem, recorder
+from ep2sindy.refinement.problem import (
+    Iteration,
+    RefinementFit,
+    RefinementProblem,
+    RefinementSettings,
+    record,
+)
 from ep2sindy.refinement.refine import with_coef
-from ep2sindy.refinement.windows import WindowBatch, cut_windows
+from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
+
+# Where nobody says otherwise.
+SETTINGS = RefinementSettings(n_reweights=0)
+DESCENT = GradientDescent(max_iter=60, tolerance=1e-3, patience=5)
 
 # A step is fine enough when half of it moves the trajectories by less than either of these.
 ERROR_PER_RESIDUAL, LEAST_ERROR = 0.1, 1e-3  # rms, the second in std
@@ -51,7 +61,7 @@ class Corrected:
     loss_before: float
     loss: float
     window_loss: Float[np.ndarray, " windows"]
-    status: str
+    status: RefinementStatus
     history: tuple[Iteration, ...]
     batch: WindowBatch
     trajectories: Float[np.ndarray, "windows samples n_states"]
@@ -83,13 +93,15 @@ def refine_with_correction(
     model: SparseModel,
     trajectories: Sequence[Trajectory],
     correction: nn.Module,
+    settings: RefinementSettings = SETTINGS,
     *,
-    window: int,
-    n_windows: int = 30,
+    n_windows: int | None = None,
+    window: int | None = None,
+    periods: float | None = None,
     method: GradientDescent | None = None,
     constraint: Constraint | None = None,
-    free_start: bool = True,
-    n_reweights: int = 0,
+    free_start: bool | None = None,
+    n_reweights: int | None = None,
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
@@ -102,29 +114,46 @@ def refine_with_correction(
     known part has over the data. Best zero at first (last layer of zeros), so that training
     starts from the known part. It is copied; its initial weights, and so the only randomness
     besides the windows, are the caller's: seed them by torch.manual_seed.
-    window: short at first: long windows of a model that lacks a term are hard to follow.
-    method: None means GradientDescent(max_iter=60, tolerance=1e-3, patience=5).
+    n_windows to n_reweights: in place of what `settings` say, as in `refine`; no reweighting if
+    left out. window: short at first: long windows of a model that lacks a term are hard to
+    follow. method: None means GradientDescent(max_iter=60, tolerance=1e-3, patience=5).
     constraint: relations, or known coefficients that shall not move. The rest as in `refine`.
-    Raises ValueError as `refine`, and for a correction of the wrong shape. A failed fit is a
-    result: see `status`.
+    Raises ValueError as `refine`, for a correction of the wrong shape, and for another method. A
+    failed fit is a result: see `status`.
     Source: Rackauckas et al. 2020, arXiv:2001.04385.
     """
-    rng = np.random.default_rng(rng)
-    batch = cut_windows(
-        trajectories,
-        states=model.states,
-        inputs=model.inputs,
-        n_windows=n_windows,
-        window=window,
-        rng=rng,
-    )
-    known, ode = _known_and_whole(model, correction, batch, constraint, device)
-    method = GradientDescent(max_iter=60, tolerance=1e-3, patience=5) if method is None else method
+    settings = settings.override(
+        {
+            "n_windows": n_windows, "window": window, "periods": periods, "method": method,
+            "constraint": constraint, "free_start": free_start, "n_reweights": n_reweights,
+        }
+    )  # fmt: skip
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
-        history, observe = recorder(callback, advance)
-        problem = Problem((ode,), (batch,), free_start, n_reweights, observe)
-        fit = method.fit(problem)
-    relations = unconstrained(model) if constraint is None else constraint
+        history, observe = record(callback, advance)
+        return _train(model, trajectories, correction, settings, rng, history, observe, device)
+
+
+def _train(
+    model: SparseModel,
+    trajectories: Sequence[Trajectory],
+    correction: nn.Module,
+    settings: RefinementSettings,
+    rng: np.random.Generator | int,
+    history: Sequence[Iteration],
+    observe: Callable[[Iteration], None],
+    device: str,
+) -> Corrected:
+    """From settings and trajectories to the result."""
+    method = DESCENT if settings.method is None else settings.method
+    if not isinstance(method, GradientDescent):
+        raise ValueError(f"a learned correction is trained by GradientDescent alone: {method} came")
+    (batch,) = settings.cut([model], [trajectories], np.random.default_rng(rng))
+    known, ode = _known_and_whole(model, correction, batch, settings.constraint, device)
+    problem = RefinementProblem(
+        (ode,), (batch,), settings.free_start, settings.n_reweights, observe
+    )
+    fit = method.fit(problem)
+    relations = unconstrained(model) if settings.constraint is None else settings.constraint
     return _result(
         model, correction, known, problem, fit, relations, history, n_substeps=method.n_substeps
     )
@@ -134,8 +163,8 @@ def _result(
     model: SparseModel,
     correction: nn.Module,
     known: ODE,
-    problem: Problem,
-    fit: Fit,
+    problem: RefinementProblem,
+    fit: RefinementFit,
     constraint: Constraint,
     history: Sequence[Iteration],
     *,
@@ -143,8 +172,8 @@ def _result(
 ) -> Corrected:
     """Back to SI; what was given where the fit did not stay finite."""
     (ode,), (batch,) = problem.odes, problem.batches
-    nodes, window_loss, status = _judged(problem, fit, n_substeps)
-    trained = status != "non_finite"
+    nodes, window_loss, status = _judge(problem, fit, n_substeps)
+    trained = status is not RefinementStatus.NON_FINITE
     coef = (ode if trained else known).coef.detach().cpu().numpy()
     term = ode.correction
     assert isinstance(term, _Scaled)
@@ -220,29 +249,26 @@ def _check_shape(term: nn.Module, known: ODE, device: str) -> None:
         )
 
 
-def _judged(problem: Problem, fit: Fit, n_substeps: int) -> tuple[np.ndarray, np.ndarray, str]:
+def _judge(
+    problem: RefinementProblem, fit: RefinementFit, n_substeps: int
+) -> tuple[np.ndarray, np.ndarray, RefinementStatus]:
     """Trajectories in std, the loss of each window, and the gravest status that applies."""
     nodes, data = fit.nodes[0], problem.data[0]
     with np.errstate(over="ignore", invalid="ignore"):  # a blow-up is a status
         window_loss = np.square(nodes - data).mean(axis=(1, 2))
-    loss = window_loss.mean()
-    level = data.mean(axis=1, keepdims=True) if problem.free_start else data[:, :1]
-    if not (fit.finite[0] and np.isfinite(loss)):
-        status = "non_finite"
-    elif loss > FLAT * np.square(data - level).mean():
-        status = "flat"
-    elif not fit.finished[0]:
-        status = "max_iter"
-    elif not _step_error(problem, nodes, n_substeps) < max(
-        ERROR_PER_RESIDUAL * np.sqrt(loss), LEAST_ERROR
-    ):
-        status = "coarse_step"
-    else:
-        status = "converged"
+    loss = float(window_loss.mean())
+    allowed = max(ERROR_PER_RESIDUAL * np.sqrt(loss), LEAST_ERROR)
+    status = status_of(
+        finite=bool(fit.finite[0] and np.isfinite(loss)),
+        flat=is_flat(loss, data, free_start=problem.free_start),
+        unidentifiable=False,  # the coefficients have no covariance
+        settled=bool(fit.finished[0]),
+        coarse=lambda: not _step_error(problem, nodes, n_substeps) < allowed,
+    )
     return nodes, window_loss, status
 
 
-def _step_error(problem: Problem, nodes: np.ndarray, n_substeps: int) -> float:
+def _step_error(problem: RefinementProblem, nodes: np.ndarray, n_substeps: int) -> float:
     """Rms change of the trajectories, in std, under half the time step."""
     start = torch.tensor(nodes[:, 0].copy(), device=problem.device)
     with torch.no_grad():
@@ -250,7 +276,7 @@ def _step_error(problem: Problem, nodes: np.ndarray, n_substeps: int) -> float:
     return float((finer - torch.tensor(nodes, device=problem.device)).square().mean().sqrt())
 
 
-def _loss_from_data(known: ODE, problem: Problem, n_substeps: int) -> float:
+def _loss_from_data(known: ODE, problem: RefinementProblem, n_substeps: int) -> float:
     """Of a module that follows each window from its first sample."""
     data = torch.tensor(problem.data[0], device=problem.device)
     with torch.no_grad():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 import torch
@@ -12,7 +14,7 @@ from torchdiffeq import odeint
 
 from ep2sindy.refinement.kernels import condense, propagate
 from ep2sindy.refinement.methods.multiple_shooting import least_change, step_maps
-from ep2sindy.refinement.problem import Fit, Problem
+from ep2sindy.refinement.problem import LawMap, Method, RefinementFit, RefinementProblem
 from ep2sindy.refinement.windows import WindowBatch
 
 FLAT = 0.95  # share of the loss of a constant from which on a model follows nothing
@@ -33,25 +35,169 @@ STATIONARY = 1e-3
 # Independent windows that a sandwich needs, per scaling.
 CLUSTERS = 2.0
 
-STATUSES = ("converged", "max_iter", "coarse_step", "unidentifiable", "flat", "non_finite")
+
+class RefinementStatus(StrEnum):
+    """How a refinement ended; see `Refinement`."""
+
+    CONVERGED = "converged"
+    MAX_ITER = "max_iter"
+    COARSE_STEP = "coarse_step"
+    UNIDENTIFIABLE = "unidentifiable"
+    FLAT = "flat"
+    NON_FINITE = "non_finite"
+
+
+def status_of(
+    *,
+    finite: bool,
+    flat: bool,
+    unidentifiable: bool,
+    settled: bool,
+    coarse: Callable[[], bool],
+) -> RefinementStatus:
+    """The gravest that applies; the time step is looked at where nothing else is wrong."""
+    if not finite:
+        return RefinementStatus.NON_FINITE
+    if flat:
+        return RefinementStatus.FLAT
+    if unidentifiable:
+        return RefinementStatus.UNIDENTIFIABLE
+    if not settled:
+        return RefinementStatus.MAX_ITER
+    return RefinementStatus.COARSE_STEP if coarse() else RefinementStatus.CONVERGED
+
+
+def is_flat(
+    loss: float, data: Float[np.ndarray, "*points windows samples n_states"], *, free_start: bool
+) -> bool:
+    """Whether constants do as well: each window's mean, or its first sample where that is given."""
+    level = data.mean(axis=-2, keepdims=True) if free_start else data[..., :1, :]
+    return bool(loss > FLAT * np.square(data - level).mean())
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """One point of a fit, judged. Covariances are those of the scalings.
+class RefinementVerdict:
+    """One point of a fit, judged, or all points that a law ties.
 
-    window_loss: mean square of (trajectory - data) / std in each window.
-    bias: change of the scalings that the error of the time step causes, to first order.
+    window_loss: mean square of (trajectory - data) / std in each window, point after point.
+    covariance, covariance_naive: of the unknowns, which are the scalings of a point or the theta
+    of a law.
     """
 
-    status: str
+    status: RefinementStatus
     window_loss: Float[np.ndarray, " windows"]
-    covariance: Float[np.ndarray, "free free"]
-    covariance_naive: Float[np.ndarray, "free free"]
-    bias: Float[np.ndarray, " free"]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    covariance_naive: Float[np.ndarray, "unknowns unknowns"]
 
 
-def integrated(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
+def fit_and_judge(
+    problem: RefinementProblem, method: Method
+) -> tuple[RefinementFit, list[RefinementVerdict]]:
+    """Fit with steps as short as they must be, and judge the trajectories, integrated again.
+
+    Returns a verdict for each point, or a single one where a law ties them.
+    """
+    fit = method.fit(problem)
+    closed, verdicts = judge(problem, fit)
+    while any(coarse := [v.status is RefinementStatus.COARSE_STEP for v in verdicts]):
+        points = np.flatnonzero(np.broadcast_to(coarse, len(problem.odes)))
+        again = method.finer(problem, closed if problem.law is None else fit, points)
+        if again is None:
+            break
+        fit = again
+        closed, verdicts = judge(problem, fit)
+    return closed, verdicts
+
+
+def judge(
+    problem: RefinementProblem, fit: RefinementFit
+) -> tuple[RefinementFit, list[RefinementVerdict]]:
+    """Verdicts on every point, or on all that a law ties; also the trajectories integrated again.
+
+    A point that blows up makes all that a law ties to it not finite.
+    """
+    fit, maps = integrate(problem, fit)
+    n_start, window = problem.n_start, fit.nodes.shape[2]
+    sound = maps if fit.finite.all() else np.where(np.isfinite(maps), maps, 0.0)
+    condensed = condense(sound, fit.nodes, problem.data, fit.weights, window, n_start)
+    triangles = condensed[:, :, 0, n_start:, n_start:]
+    overflown = ~np.isfinite(triangles).all(axis=(1, 2, 3))
+    triangles[overflown] = 0.0
+    fit = replace(fit, finite=problem.agree(fit.finite & ~overflown, np.all))
+    bias = least_change(step_triangles(problem, fit, sound), problem.law)
+    change = least_change(triangles[:, :, None], problem.law)
+    points = np.arange(len(problem.odes))
+    if problem.law is not None:
+        rows = problem.law.rows(triangles)
+        rows = rows.reshape(-1, *rows.shape[2:])
+        return fit, [_judge_points(problem, fit, problem.law, points, rows, bias, change)]
+    verdicts = []
+    for p, ode in enumerate(problem.odes):
+        n_free = len(ode.free0)
+        rows = triangles[p][..., np.append(np.arange(n_free), -1)]
+        law, unknowns = LawMap.identity(n_free), (bias[p, :n_free], change[p, :n_free])
+        verdicts.append(_judge_points(problem, fit, law, points[[p]], rows, *unknowns))
+    return fit, verdicts
+
+
+def _judge_points(
+    problem: RefinementProblem,
+    fit: RefinementFit,
+    law: LawMap,
+    points: np.ndarray,
+    rows: Float[np.ndarray, "windows size columns"],
+    bias: Float[np.ndarray, " unknowns"],
+    change: Float[np.ndarray, " unknowns"],
+) -> RefinementVerdict:
+    """Of points that share their unknowns.
+
+    rows: each window's condensed residuals by the unknowns, right-hand side last.
+    bias: change of the unknowns that the error of the time step causes, to first order.
+    change: of the unknowns by one more Gauss-Newton step.
+    """
+    data = problem.data[points]
+    n_residuals = data.size - problem.n_start * len(rows) - law.n_theta
+    batch = _join_windows([problem.batches[p] for p in points])
+    robust, naive = covariances(rows, batch, n_residuals=max(n_residuals, 1))
+    with np.errstate(invalid="ignore", over="ignore"):
+        squares = [np.square(fit.nodes[p] - problem.data[p]) for p in points]
+    window_loss = np.concatenate([square.mean(axis=(1, 2)) for square in squares])
+    loss = float(window_loss.mean())
+    scaling = fit.scaling[points, : law.n_free]
+    by_point = law.spread @ robust @ law.spread.transpose(0, 2, 1)
+    error = np.sqrt(np.maximum(np.diagonal(by_point, axis1=1, axis2=2), 0.0))
+    gain = np.square(rows[..., :-1] @ change).sum()
+    share = gain / max(np.square(rows[..., -1]).sum(), 1e-300)
+    relative = np.abs(law.scaling(change) / scaling).max() if scaling.all() else np.inf
+    stationary = bool(min(share, relative) < STATIONARY)
+    steps = zip(law.scaling(bias), by_point, scaling, strict=True)
+    status = status_of(
+        finite=bool(fit.finite[points].all() and np.isfinite(loss)),
+        flat=is_flat(loss, data, free_start=problem.free_start),
+        unidentifiable=bool((~(error < WIDE * np.abs(scaling))).all(axis=0).any()),
+        settled=bool(fit.finished[points].all()) and stationary,
+        coarse=lambda: any(is_coarse(*step) for step in steps),
+    )
+    return RefinementVerdict(status, window_loss, robust, naive)
+
+
+def _join_windows(batches: Sequence[WindowBatch]) -> WindowBatch:
+    """Windows of all points as if of one set: which ones overlap. The first's scale stands."""
+    if len(batches) == 1:
+        return batches[0]
+    offset = np.cumsum([0, *(batch.trajectory.max() + 1 for batch in batches)])
+    numbers = [b.trajectory + int(k) for b, k in zip(batches, offset[:-1], strict=True)]
+    return replace(
+        batches[0],
+        steps=np.concatenate([batch.steps for batch in batches]),
+        data=np.concatenate([batch.data for batch in batches]),
+        inputs=np.concatenate([batch.inputs for batch in batches]),
+        trajectory=np.concatenate(numbers),
+        start=np.concatenate([batch.start for batch in batches]),
+    )
+
+
+def integrate(problem: RefinementProblem, fit: RefinementFit) -> tuple[RefinementFit, np.ndarray]:
     """Integrate every window from its fitted start; also the one-step maps along the way.
 
     All steps at once: Newton's method closes the gaps between them with starts and scalings
@@ -83,8 +229,8 @@ def integrated(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
     return replace(fit, nodes=nodes, finite=finite), maps
 
 
-def closed(problem: Problem, fit: Fit) -> np.ndarray:
-    """Trajectories from the fitted starts, as `integrated` closes them, window by window.
+def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndarray:
+    """Trajectories from the fitted starts, as `integrate` closes them, window by window.
 
     Returns (points, windows, samples, n_states), NaN in windows that do not close.
     """
@@ -103,7 +249,7 @@ def closed(problem: Problem, fit: Fit) -> np.ndarray:
     return nodes
 
 
-def rollout(problem: Problem, fit: Fit, *, n_substeps: int = 4) -> np.ndarray:
+def rollout(problem: RefinementProblem, fit: RefinementFit, *, n_substeps: int = 4) -> np.ndarray:
     """Integrate every window step after step by torchdiffeq's rk4, from its fitted start."""
     system, n_steps = problem.system, fit.nodes.shape[2] - 1
     start = torch.tensor(fit.nodes[:, :, 0].transpose(0, 2, 1).copy(), device=problem.device)
@@ -118,7 +264,7 @@ def rollout(problem: Problem, fit: Fit, *, n_substeps: int = 4) -> np.ndarray:
     return path.permute(1, 3, 0, 2).cpu().numpy()
 
 
-def step_triangles(problem: Problem, fit: Fit, maps: np.ndarray) -> np.ndarray:
+def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndarray) -> np.ndarray:
     """Condensed residuals by scaling, with the error of the time step in the defects' place.
 
     That is the error of each step against two steps of half its length.
@@ -130,11 +276,6 @@ def step_triangles(problem: Problem, fit: Fit, maps: np.ndarray) -> np.ndarray:
     window = fit.nodes.shape[2]
     condensed = condense(shifted, fit.nodes, fit.nodes, fit.weights, window, n_start)
     return condensed[..., n_start:, n_start:]
-
-
-def step_bias(problem: Problem, fit: Fit, maps: np.ndarray) -> np.ndarray:
-    """Change of the scalings, (points, free), that the error of the time step causes."""
-    return least_change(step_triangles(problem, fit, maps))
 
 
 def is_coarse(bias: np.ndarray, covariance: np.ndarray, scaling: np.ndarray) -> bool:
@@ -177,55 +318,3 @@ def covariances(
     n_clusters = n_windows / batch.multiplicity
     widening = (stdtrit(n_clusters - n_free, 0.975) / ndtri(0.975)) ** 2
     return widening * bread @ scores.T @ together @ scores @ bread, naive
-
-
-def judge(problem: Problem, fit: Fit) -> tuple[Fit, list[Verdict]]:
-    """Verdicts on every point, from trajectories integrated again; also those trajectories."""
-    fit, maps = integrated(problem, fit)
-    n_start = fit.nodes.shape[-1] if problem.free_start else 0
-    sound = maps if fit.finite.all() else np.where(np.isfinite(maps), maps, 0.0)
-    condensed = condense(sound, fit.nodes, problem.data, fit.weights, fit.nodes.shape[2], n_start)[
-        :, :, 0, n_start:, n_start:
-    ]
-    overflown = ~np.isfinite(condensed).all(axis=(1, 2, 3))
-    condensed[overflown] = 0.0
-    fit = replace(fit, finite=fit.finite & ~overflown)
-    bias = step_bias(problem, fit, sound)
-    step = least_change(condensed[:, :, None])
-    verdicts = []
-    for p, (ode, batch) in enumerate(zip(problem.odes, problem.batches, strict=True)):
-        n_free = len(ode.free0)
-        scaling, own = fit.scaling[p, :n_free], np.append(np.arange(n_free), -1)
-        with np.errstate(invalid="ignore", over="ignore"):
-            residual = np.square(fit.nodes[p] - problem.data[p])
-        n_residuals = residual.size - n_start * len(residual) - n_free
-        triangles = condensed[p][..., own]
-        robust, naive = covariances(triangles, batch, n_residuals=max(n_residuals, 1))
-        losses = residual.mean(axis=(1, 2))
-        verdict = Verdict("converged", losses, robust, naive, bias[p, :n_free])
-        gain = np.square(triangles[..., :-1] @ step[p, :n_free]).sum()
-        share = gain / max(np.square(triangles[..., -1]).sum(), 1e-300)
-        relative = np.abs(step[p, :n_free] / scaling).max() if scaling.all() else np.inf
-        stationary = bool(min(share, relative) < STATIONARY)
-        verdicts.append(replace(verdict, status=_status(problem, fit, p, verdict, stationary)))
-    return fit, verdicts
-
-
-def _status(problem: Problem, fit: Fit, p: int, verdict: Verdict, stationary: bool) -> str:
-    """The gravest that applies."""
-    loss = float(verdict.window_loss.mean())
-    if not (fit.finite[p] and np.isfinite(loss)):
-        return "non_finite"
-    data = problem.data[p]
-    level = data.mean(axis=1, keepdims=True) if problem.free_start else data[:, :1]
-    if loss > FLAT * np.square(data - level).mean():
-        return "flat"
-    error = np.sqrt(np.maximum(np.diag(verdict.covariance), 0.0))
-    scaling = fit.scaling[p, : len(error)]
-    if (~(error < WIDE * np.abs(scaling))).any():
-        return "unidentifiable"
-    if not (fit.finished[p] and stationary):
-        return "max_iter"
-    if is_coarse(verdict.bias, verdict.covariance, scaling):
-        return "coarse_step"
-    return "converged"

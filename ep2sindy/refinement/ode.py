@@ -141,7 +141,7 @@ def unconstrained(model: SparseModel) -> Constraint:
     return build_constraint(model.library, {s: tuple(model.terms(s)) for s in model.states})
 
 
-def held(model: SparseModel) -> Constraint:
+def all_fixed(model: SparseModel) -> Constraint:
     """Every coefficient of a model that is not zero, none of them free."""
     every = unconstrained(model)
     values = _coef(model, every)
@@ -255,7 +255,7 @@ class Augmented:
         return rate
 
 
-def augmented(odes: Sequence[ODE]) -> Augmented:
+def augment(odes: Sequence[ODE]) -> Augmented:
     """Modules of the same variables as one batch of points, on the device of the first.
 
     Terms may differ: products are those that any module needs, and columns of zeros stand for

@@ -1,19 +1,119 @@
-"""What every way of integral least squares starts from, and what it hands back."""
+"""How integral least squares is set, what every way of it starts from, and what it hands back."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from ep2sindy.refinement.ode import ODE, ONE_RUNGE_KUTTA, Augmented, Drive, Step, augmented
-from ep2sindy.refinement.windows import WindowBatch
+from ep2sindy.constraints.relations import Constraint
+from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.ode import ODE, ONE_RUNGE_KUTTA, Augmented, Drive, Step, augment
+from ep2sindy.refinement.weighted_law import Basis
+from ep2sindy.refinement.windows import (
+    PERIODS,
+    WindowBatch,
+    check_windows,
+    cut_windows,
+    dominant_window,
+)
 from ep2sindy.runtime.progress import Advance, nothing
+
+Values = TypeVar("Values", bound=np.ndarray)
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """How a refinement is set: the windows that are followed, and the way to follow them.
+
+    n_windows: spread over the trajectories, fewer where there are not that many places.
+    window: samples in each; None takes `periods`.
+    periods: of the dominant frequency in each window, as the data allow; None takes one and a
+    half, or what `window` says.
+    method: None means MultipleShooting(), or what a function says of its own.
+    constraint: relations between coefficients, or known ones that shall not move; None leaves
+    every coefficient free.
+    free_start: fit each window's initial state as well, without which noise in it biases the
+    coefficients; False starts at the data, as the thesis.
+    n_reweights: passes with each state weighted by 1/std of its residuals.
+    Raises ValueError for less than one window or one that holds too little, for windows set by
+    both samples and periods, or for a negative number of passes.
+
+    >>> ep.RefinementSettings(n_windows=20, periods=2.0).free_start
+    True
+    """
+
+    n_windows: int = 30
+    window: int | None = None
+    periods: float | None = None
+    method: Method | None = None
+    constraint: Constraint | None = None
+    free_start: bool = True
+    n_reweights: int = 1
+
+    def __post_init__(self) -> None:
+        check_windows(self.n_windows, self.window)
+        if self.periods is not None:
+            if self.window is not None:
+                raise ValueError(
+                    "a window is set by its samples or by its periods: "
+                    f"window={self.window} and periods={self.periods} came; leave out one"
+                )
+            if not self.periods > 0.0:
+                raise ValueError(
+                    f"periods must be positive: {self.periods} came; leave it out for one and a "
+                    "half"
+                )
+        if self.n_reweights < 0:
+            raise ValueError(f"n_reweights must be zero or more: {self.n_reweights} came")
+
+    def override(self, given: Mapping[str, Any]) -> RefinementSettings:
+        """The same but for the values that are given: those that are not None."""
+        changes = {name: value for name, value in given.items() if value is not None}
+        if changes.keys() & {"window", "periods"}:  # two ways to say one thing
+            changes = {"window": None, "periods": None} | changes
+        return replace(self, **changes)
+
+    def cut(
+        self,
+        models: Sequence[SparseModel],
+        trajectories: Sequence[Sequence[Trajectory]],
+        rng: np.random.Generator,
+    ) -> list[WindowBatch]:
+        """Windows for every model, of its own trajectories, all as long as the shortest of them.
+
+        Raises ValueError unless there is a list of trajectories for each model.
+        """
+        if len(models) != len(trajectories):
+            raise ValueError(
+                "every model needs a list of trajectories of its own: "
+                f"{len(models)} models and {len(trajectories)} lists came"
+            )
+        window = self.window
+        if window is None:
+            lengths = [
+                dominant_window(runs, model.states, periods=self.periods or PERIODS)
+                for model, runs in zip(models, trajectories, strict=True)
+            ]
+            window = min(lengths, default=0)
+        return [
+            cut_windows(
+                runs,
+                states=model.states,
+                inputs=model.inputs,
+                n_windows=self.n_windows,
+                window=window,
+                rng=rng,
+            )
+            for model, runs in zip(models, trajectories, strict=True)
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +133,7 @@ class Iteration:
     defect: float
 
 
-def recorder(
+def record(
     callback: Callable[[Iteration], None] | None, advance: Advance = nothing
 ) -> tuple[list[Iteration], Callable[[Iteration], None]]:
     """A list that fills as a fit goes, and who fills it; `callback` and `advance` are told."""
@@ -48,12 +148,79 @@ def recorder(
     return history, observe
 
 
+def ignore(iteration: Iteration) -> None:
+    """The observer of a fit that nobody watches."""
+
+
 @dataclass(frozen=True, eq=False)
-class Problem:
+class LawMap:
+    """Scalings of point p = spread[p] @ theta; the law in SI = to_law @ theta.
+
+    theta: coefficient by coefficient, what multiplies an orthonormal basis, in units of the
+    coefficient's RMS over the points. The law: the same order, what multiplies the basis given.
+    start: theta that a fit begins with.
+    """
+
+    spread: Float[np.ndarray, "points free theta"]
+    to_law: Float[np.ndarray, "theta theta"]
+    start: Float[np.ndarray, " theta"]
+
+    def __post_init__(self) -> None:
+        for name in ("spread", "to_law", "start"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @staticmethod
+    def of(
+        free0: Float[np.ndarray, "points free"],
+        basis: Basis,
+        law: Float[np.ndarray, "free terms"],
+    ) -> LawMap:
+        """free0: values of the free coefficients that a scaling of one stands for; law: to begin
+        with, both in SI.
+        """
+        n_points, n_free = free0.shape
+        n_terms = basis.values.shape[1]
+        size = zero_to_one(np.sqrt(np.square(free0).mean(axis=0)))
+        spread = np.zeros((n_points, n_free, n_free, n_terms))
+        each = np.arange(n_free)
+        by_point = (size / free0)[..., None] * basis.orthonormal[:, None]
+        spread[:, each, each] = by_point
+        to_law = np.kron(np.diag(size), basis.back)
+        start = np.linalg.solve(to_law, law.ravel())
+        return LawMap(spread.reshape(n_points, n_free, -1), to_law, start)
+
+    @staticmethod
+    def identity(n_free: int) -> LawMap:
+        """Of one point that no law ties: its unknowns are its scalings."""
+        return LawMap(np.eye(n_free)[None], np.eye(n_free), np.ones(n_free))
+
+    @property
+    def n_free(self) -> int:
+        return self.spread.shape[1]
+
+    @property
+    def n_theta(self) -> int:
+        return self.spread.shape[-1]
+
+    def scaling(self, theta: Float[np.ndarray, " theta"]) -> Float[np.ndarray, "points free"]:
+        return self.spread @ theta
+
+    def rows(
+        self, triangles: Float[np.ndarray, "points windows size size"]
+    ) -> Float[np.ndarray, "points windows size columns"]:
+        """Triangles of condensed residuals by scaling as rows by theta, right-hand side last."""
+        by_theta = triangles[..., :-1] @ self.spread[:, None]
+        return np.concatenate([by_theta, triangles[..., -1:]], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementProblem:
     """Models of the same states, a batch of windows for each, on one device.
 
     free_start: each window's initial state is fitted too; else it is the data's.
     n_reweights: passes of weights 1/std of the residuals, after weights 1/std of the data.
+    law: ties the scalings of all points to the few unknowns of a law; None leaves each point
+    scalings of its own.
     """
 
     odes: tuple[ODE, ...]
@@ -61,10 +228,29 @@ class Problem:
     free_start: bool
     n_reweights: int
     observe: Callable[[Iteration], None]
+    law: LawMap | None = None
+
+    @staticmethod
+    def of(
+        models: Sequence[SparseModel],
+        batches: Sequence[WindowBatch],
+        constraints: Sequence[Constraint | None],
+        *,
+        free_start: bool = True,
+        n_reweights: int = 0,
+        observe: Callable[[Iteration], None] = ignore,
+        device: str = "cpu",
+    ) -> RefinementProblem:
+        """Models in the scale of their windows; a constraint of None leaves all terms free."""
+        odes = [
+            ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=relations).to(device)
+            for model, batch, relations in zip(models, batches, constraints, strict=True)
+        ]
+        return RefinementProblem(tuple(odes), tuple(batches), free_start, n_reweights, observe)
 
     @cached_property
     def system(self) -> Augmented:
-        return augmented(self.odes)
+        return augment(self.odes)
 
     @cached_property
     def data(self) -> Float[np.ndarray, "points windows samples n_states"]:
@@ -74,6 +260,11 @@ class Problem:
     def n_free(self) -> int:
         """Of the model that has the most; scalings beyond a model's own move nothing."""
         return max(len(ode.free0) for ode in self.odes)
+
+    @property
+    def n_start(self) -> int:
+        """Number of unknowns in the initial state of a window."""
+        return self.data.shape[-1] if self.free_start else 0
 
     @property
     def device(self) -> torch.device:
@@ -88,6 +279,14 @@ class Problem:
     def whole(self) -> Drive:
         """Windows as batch elements, one segment per step."""
         return self._drive(one=False)
+
+    def take(self, point: int) -> RefinementProblem:
+        """One point of a problem."""
+        return replace(self, odes=(self.odes[point],), batches=(self.batches[point],))
+
+    def agree(self, values: Values, reduce: Callable[[Values], Any]) -> Values:
+        """Values by point, made one value for all where a law ties the points together."""
+        return values if self.law is None else np.full_like(values, reduce(values))
 
     def _drive(self, *, one: bool) -> Drive:
         steps = np.stack([batch.steps for batch in self.batches])
@@ -106,12 +305,12 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class RefinementFit:
     """Where a method ended, point by point, before anybody judges it.
 
     scaling: ones beyond a model's own. nodes: the fitted trajectories at the samples, in std.
     weights: last used. finished: the method's own test was met. finite: False where it never was.
-    step: the map of nodes to nodes.
+    step: the map of nodes to nodes. theta: unknowns of the law that the scalings follow, if any.
     """
 
     scaling: Float[np.ndarray, "points free"]
@@ -120,15 +319,18 @@ class Fit:
     finished: np.ndarray
     finite: np.ndarray
     step: Step = ONE_RUNGE_KUTTA
+    theta: Float[np.ndarray, " theta"] | None = None
 
 
 @runtime_checkable
 class Method(Protocol):
     """What the alternatives share: a fit of all points of a problem."""
 
-    def fit(self, problem: Problem) -> Fit: ...
+    def fit(self, problem: RefinementProblem) -> RefinementFit: ...
 
-    def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> Fit | None:
+    def finer(
+        self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray
+    ) -> RefinementFit | None:
         """Some points again with half the time step; None where the method has no way to."""
         ...
 
@@ -147,18 +349,13 @@ def residual_weights(
     return np.exp(logs - logs.mean(axis=1, keepdims=True))
 
 
-def single(problem: Problem, point: int) -> Problem:
-    """One point of a problem."""
-    return replace(problem, odes=(problem.odes[point],), batches=(problem.batches[point],))
-
-
-def joined(fits: Sequence[Fit]) -> Fit:
+def join(fits: Sequence[RefinementFit]) -> RefinementFit:
     """Fits of single points, by one step, as one."""
     n_free = max(fit.scaling.shape[1] for fit in fits)
     scaling = np.ones((len(fits), n_free))
     for fit, row in zip(fits, scaling, strict=True):
         row[: fit.scaling.shape[1]] = fit.scaling[0]
-    return Fit(
+    return RefinementFit(
         scaling=scaling,
         nodes=np.concatenate([fit.nodes for fit in fits]),
         weights=np.concatenate([fit.weights for fit in fits]),

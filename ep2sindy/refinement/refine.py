@@ -6,6 +6,7 @@ import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import cast, overload
 
 import numpy as np
 import torch
@@ -15,14 +16,28 @@ from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.judge import Verdict, closed, judge
+from ep2sindy.refinement.judge import (
+    RefinementStatus,
+    RefinementVerdict,
+    fit_and_judge,
+    integrate_windows,
+)
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.ode import ODE, held, unconstrained
-from ep2sindy.refinement.problem import Fit, Iteration, Method, Problem, recorder
-from ep2sindy.refinement.windows import WindowBatch, cut_windows, dominant_window
-from ep2sindy.runtime.progress import Advance, Progress, as_progress, counted, nothing
+from ep2sindy.refinement.ode import all_fixed, unconstrained
+from ep2sindy.refinement.problem import (
+    Iteration,
+    Method,
+    RefinementFit,
+    RefinementProblem,
+    RefinementSettings,
+    record,
+)
+from ep2sindy.refinement.windows import WindowBatch
+from ep2sindy.runtime.progress import Advance, Progress, as_progress, nothing
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
+
+SETTINGS = RefinementSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +58,7 @@ class Refinement:
     covariance_naive: Float[np.ndarray, "_ _"] | None
     loss: float
     window_loss: Float[np.ndarray, " windows"]
-    status: str
+    status: RefinementStatus
     history: tuple[Iteration, ...]
     batch: WindowBatch
     trajectories: Float[np.ndarray, "windows samples n_states"]
@@ -63,195 +78,157 @@ class Refinement:
         )
 
 
-@one_thread()
+@overload
 def refine(
     model: SparseModel,
     trajectories: Sequence[Trajectory],
+    settings: RefinementSettings = SETTINGS,
     *,
-    n_windows: int = 30,
+    n_windows: int | None = None,
     window: int | None = None,
+    periods: float | None = None,
     method: Method | None = None,
     constraint: Constraint | None = None,
-    free_start: bool = True,
-    n_reweights: int = 1,
+    free_start: bool | None = None,
+    n_reweights: int | None = None,
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
     device: str = "cpu",
     progress: Progress | bool = False,
-) -> Refinement:
+) -> Refinement: ...
+
+
+@overload
+def refine(
+    model: Sequence[SparseModel],
+    trajectories: Sequence[Sequence[Trajectory]],
+    settings: RefinementSettings = SETTINGS,
+    *,
+    points_per_batch: int = 8,
+    rng: np.random.Generator | int,
+    callback: Callable[[Iteration], None] | None = None,
+    device: str = "cpu",
+    progress: Progress | bool = False,
+) -> list[Refinement]: ...
+
+
+@one_thread()
+def refine(
+    model: SparseModel | Sequence[SparseModel],
+    trajectories: Sequence[Trajectory] | Sequence[Sequence[Trajectory]],
+    settings: RefinementSettings = SETTINGS,
+    *,
+    n_windows: int | None = None,
+    window: int | None = None,
+    periods: float | None = None,
+    method: Method | None = None,
+    constraint: Constraint | None = None,
+    free_start: bool | None = None,
+    n_reweights: int | None = None,
+    points_per_batch: int = 8,
+    rng: np.random.Generator | int,
+    callback: Callable[[Iteration], None] | None = None,
+    device: str = "cpu",
+    progress: Progress | bool = False,
+) -> Refinement | list[Refinement]:
     """Fit the free coefficients to windows spread over trajectories, by least squares.
 
-    window: samples in each; None takes one and a half periods of the dominant frequency.
-    method: None means MultipleShooting(). free_start: fit each window's initial state as well,
-    without which noise in it biases the coefficients; False starts at the data, as the thesis.
-    n_reweights: passes with each state weighted by 1/std of its residuals. progress: True shows
-    a bar; see `Progress`.
+    model: one, or a list of models of the same states, each with a list of trajectories of its
+    own; a list gives a list. n_windows to n_reweights: in place of what `settings` say; see
+    `RefinementSettings`.
+    points_per_batch: models integrated together, few enough to stay in the processor's cache; on
+    a GPU, thousands. One that has converged leaves its batch. They may differ in their terms; all
+    of a batch cost what the largest does. progress: True shows a bar; see `Progress`.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
-    terms or a constraint that leaves out one of them. A failed fit is a result: see `status`.
+    terms, a constraint that leaves out one of them, or models that differ in their variables or
+    the number of their windows. A failed fit is a result: see `status`.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     >>> refined = ep.refine(ep.discover(run).model, [run], rng=0)
     >>> str(refined.status)
     'converged'
     """
-    rng = np.random.default_rng(rng)
-    (found,) = refine_many(
-        [model],
-        [trajectories],
-        n_windows=n_windows,
-        window=dominant_window(trajectories, model.states) if window is None else window,
-        method=method,
-        constraint=constraint,
-        free_start=free_start,
-        n_reweights=n_reweights,
-        rng=rng,
-        callback=callback,
-        device=device,
-        progress=progress,
-    )
-    return found
-
-
-@one_thread()
-def refine_many(
-    models: Sequence[SparseModel],
-    trajectories: Sequence[Sequence[Trajectory]],
-    *,
-    window: int,
-    n_windows: int = 30,
-    method: Method | None = None,
-    constraint: Constraint | None = None,
-    free_start: bool = True,
-    n_reweights: int = 1,
-    points_per_batch: int = 8,
-    rng: np.random.Generator | int,
-    callback: Callable[[Iteration], None] | None = None,
-    device: str = "cpu",
-    progress: Progress | bool = False,
-) -> list[Refinement]:
-    """Refine models of the same states, each on trajectories of its own; as `refine` for the rest.
-
-    points_per_batch: points integrated together, few enough to stay in the processor's cache;
-    on a GPU, thousands. A point that has converged leaves its batch.
-    Models may differ in their terms; those of a batch all cost what the largest does.
-    Raises ValueError if the models differ in their variables or the windows in their number.
-    """
-    rng = np.random.default_rng(rng)
-    cut = partial(cut_windows, n_windows=n_windows, window=window, rng=rng)
-    found: list[Refinement] = []
+    changes = {
+        "n_windows": n_windows, "window": window, "periods": periods, "method": method,
+        "constraint": constraint, "free_start": free_start, "n_reweights": n_reweights,
+    }  # fmt: skip
+    settings = settings.override(changes)
+    models, records = _by_model(model, trajectories)
+    batches = settings.cut(models, records, np.random.default_rng(rng))
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
-        for first in range(0, len(models), points_per_batch):
-            chunk = models[first : first + points_per_batch]
-            batches = [
-                cut(data, states=model.states, inputs=model.inputs)
-                for model, data in zip(chunk, trajectories[first:], strict=False)
-            ]
-            found += _refined(
-                chunk,
-                batches,
-                method=MultipleShooting() if method is None else method,
-                constraint=constraint,
-                free_start=free_start,
-                n_reweights=n_reweights,
-                callback=callback,
-                device=device,
-                advance=advance,
-            )
-    return found
-
-
-def loss_against_window(
-    model: SparseModel,
-    trajectories: Sequence[Trajectory],
-    windows: Sequence[int],
-    *,
-    n_windows: int = 30,
-    method: Method | None = None,
-    constraint: Constraint | None = None,
-    free_start: bool = True,
-    n_reweights: int = 1,
-    rng: np.random.Generator | int,
-    progress: Progress | bool = False,
-) -> dict[int, Refinement]:
-    """Refine once per window length; the loss of each says where the model ceases to follow."""
-    rng, watch = np.random.default_rng(rng), as_progress(progress)
-    return {
-        window: refine(
-            model,
-            trajectories,
-            n_windows=n_windows,
-            window=window,
-            method=method,
-            constraint=constraint,
-            free_start=free_start,
-            n_reweights=n_reweights,
-            rng=rng,
-            progress=watch,
+        refine_chunk = partial(
+            _refine, settings=settings, callback=callback, device=device, advance=advance
         )
-        for window in counted(watch, windows, "window length")
-    }
+        refinements: list[Refinement] = []
+        for some in _chunks(len(models), points_per_batch):
+            refinements += refine_chunk(models[some], batches[some])
+    return refinements[0] if isinstance(model, SparseModel) else refinements
 
 
-def _refined(
+def _by_model(
+    model: SparseModel | Sequence[SparseModel],
+    trajectories: Sequence[Trajectory] | Sequence[Sequence[Trajectory]],
+) -> tuple[Sequence[SparseModel], Sequence[Sequence[Trajectory]]]:
+    """Models, and the trajectories of each."""
+    if isinstance(model, SparseModel):
+        return [model], [cast("Sequence[Trajectory]", trajectories)]
+    return model, cast("Sequence[Sequence[Trajectory]]", trajectories)
+
+
+def _refine(
     models: Sequence[SparseModel],
     batches: Sequence[WindowBatch],
     *,
-    method: Method,
-    constraint: Constraint | None,
-    free_start: bool,
-    n_reweights: int,
+    settings: RefinementSettings,
     callback: Callable[[Iteration], None] | None,
     device: str,
     advance: Advance,
 ) -> list[Refinement]:
     """One batch of points, from windows to results."""
-    odes = [
-        ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=constraint).to(device)
-        for model, batch in zip(models, batches, strict=True)
-    ]
-    history, observe = recorder(callback, advance)
-    problem = Problem(
-        odes=tuple(odes),
-        batches=tuple(batches),
-        free_start=free_start,
-        n_reweights=n_reweights,
+    history, observe = record(callback, advance)
+    problem = RefinementProblem.of(
+        models,
+        batches,
+        [settings.constraint] * len(models),
+        free_start=settings.free_start,
+        n_reweights=settings.n_reweights,
         observe=observe,
+        device=device,
     )
-    fit, verdicts = judge(problem, method.fit(problem))
-    while coarse := [p for p, verdict in enumerate(verdicts) if verdict.status == "coarse_step"]:
-        again = method.finer(problem, fit, np.array(coarse))
-        if again is None:
-            break
-        fit, verdicts = judge(problem, again)
+    fit, verdicts = fit_and_judge(problem, settings.method or MultipleShooting())
     return [
-        _result(model, problem, fit, p, verdict, constraint or unconstrained(model), history)
+        _result(model, problem, fit, p, verdict, settings.constraint, history)
         for p, (model, verdict) in enumerate(zip(models, verdicts, strict=True))
     ]
 
 
+def _chunks(n_models: int, points_per_batch: int) -> list[slice]:
+    return [slice(k, k + points_per_batch) for k in range(0, n_models, points_per_batch)]
+
+
 def _result(
     model: SparseModel,
-    problem: Problem,
-    fit: Fit,
+    problem: RefinementProblem,
+    fit: RefinementFit,
     point: int,
-    verdict: Verdict,
-    constraint: Constraint,
+    verdict: RefinementVerdict,
+    constraint: Constraint | None,
     history: Sequence[Iteration],
 ) -> Refinement:
     """Back to SI and to the model's own order of coefficients."""
     batch, ode = problem.batches[point], problem.odes[point]
-    finite = verdict.status != "non_finite"
-    robust = naive = None
-    refined = replace(model, covariance=None)
+    relations = unconstrained(model) if constraint is None else constraint
+    finite = verdict.status is not RefinementStatus.NON_FINITE
+    refined, naive = replace(model, covariance=None), None
     if finite:
         with torch.no_grad():
             ode.scaling.copy_(torch.tensor(fit.scaling[point, : len(ode.free0)]))
             values = ode.coef.cpu().numpy()
-        refined, order = with_coef(model, constraint, values)
-        by_scaling = (constraint.C * ode.free0.cpu().numpy())[order]
+        refined, order = with_coef(model, relations, values)
+        by_scaling = (relations.C * ode.free0.cpu().numpy())[order]
         robust, naive = (
-            by_scaling @ each @ by_scaling.T
-            for each in (verdict.covariance, verdict.covariance_naive)
+            by_scaling @ covariance @ by_scaling.T
+            for covariance in (verdict.covariance, verdict.covariance_naive)
         )
         refined = replace(refined, covariance=robust)
     with np.errstate(over="ignore"):  # of a fit that blew up
@@ -283,7 +260,7 @@ def with_coef(
 
 
 @dataclass(frozen=True, eq=False)
-class Together:
+class BatchRefinement:
     """Models refined on the same windows, judged by none.
 
     finished: which met the method's own test. loss: mean square of (trajectory - data) in the
@@ -297,7 +274,7 @@ class Together:
 
 
 @one_thread()
-def refine_together(
+def refine_batch(
     models: Sequence[SparseModel],
     batch: WindowBatch,
     *,
@@ -306,38 +283,35 @@ def refine_together(
     n_reweights: int = 1,
     points_per_batch: int = 8,
     advance: Advance = nothing,
-) -> Together:
+) -> BatchRefinement:
     """Refine models of the same states on the same windows, with free starts, and judge none.
 
     constraints: one per model; None leaves all coefficients free. points_per_batch: as for
-    `refine_many`; models may differ in their terms as there. advance: told of finished models.
+    `refine`; models may differ in their terms as there. advance: told of finished models.
     Raises ValueError for a model without terms.
     """
-    found: list[SparseModel] = []
+    relations = [unconstrained(model) for model in models] if constraints is None else constraints
+    refined: list[SparseModel] = []
     finished, losses = [], []
-    for first in range(0, len(models), points_per_batch):
-        chunk = models[first : first + points_per_batch]
-        relations = (
-            [unconstrained(model) for model in chunk]
-            if constraints is None
-            else list(constraints[first : first + points_per_batch])
+    for some in _chunks(len(models), points_per_batch):
+        chunk, relations_of = models[some], relations[some]
+        problem = RefinementProblem.of(
+            chunk, [batch] * len(chunk), relations_of, n_reweights=n_reweights
         )
-        odes = [_scaled(m, batch, relation) for m, relation in zip(chunk, relations, strict=True)]
-        problem = _unobserved(odes, [batch] * len(chunk), n_reweights=n_reweights)
         fit = method.fit(problem)
         for p, (model, ode) in enumerate(zip(chunk, problem.odes, strict=True)):
             free = ode.free0.cpu().numpy() * fit.scaling[p, : len(ode.free0)]
-            refined, _ = with_coef(model, relations[p], relations[p].coef(free))
-            found.append(refined if fit.finite[p] else model)
+            moved, _ = with_coef(model, relations_of[p], relations_of[p].coef(free))
+            refined.append(moved if fit.finite[p] else model)
         finished.append(fit.finished & fit.finite)
         with np.errstate(over="ignore", invalid="ignore"):
             loss = np.square(fit.nodes - problem.data).mean(axis=(1, 2, 3))
         losses.append(np.where(fit.finite, loss, np.inf))
         advance(len(chunk))
-    return Together(found, np.concatenate(finished), np.concatenate(losses))
+    return BatchRefinement(refined, np.concatenate(finished), np.concatenate(losses))
 
 
-def follow_together(
+def smooth_batch(
     models: Sequence[SparseModel],
     batch: WindowBatch,
     *,
@@ -348,45 +322,22 @@ def follow_together(
     """Trajectories that follow the windows best: starts fitted, coefficients held.
 
     In units of the batch's scale; NaN in windows where a model blows up. points_per_batch: as
-    for `refine_many`; models may differ in their terms as there. advance: told of those followed.
+    for `refine`; models may differ in their terms as there. advance: told of those followed.
     Raises ValueError for a model without terms.
     """
-    # Every window is a point of its own: one that blows up stops no other.
-    windows = [
-        replace(
-            batch,
-            steps=batch.steps[[w]],
-            data=batch.data[[w]],
-            inputs=batch.inputs[[w]],
-            trajectory=batch.trajectory[[w]],
-            start=batch.start[[w]],
+    windows = batch.split()
+    paths = []
+    for some in _chunks(len(models), points_per_batch):
+        chunk = models[some]
+        by_model = RefinementProblem.of(
+            chunk, [batch] * len(chunk), [all_fixed(model) for model in chunk]
         )
-        for w in range(len(batch.start))
-    ]
-    found = []
-    for first in range(0, len(models), points_per_batch):
-        chunk = models[first : first + points_per_batch]
-        odes = [_scaled(model, batch, held(model)) for model in chunk]
-        problem = _unobserved(
-            [ode for ode in odes for _ in windows], windows * len(chunk), n_reweights=0
+        # Every window is a point of its own: one that blows up stops no other.
+        problem = replace(
+            by_model,
+            odes=tuple(ode for ode in by_model.odes for _ in windows),
+            batches=tuple(windows * len(chunk)),
         )
-        found.append(closed(problem, method.fit(problem)))
+        paths.append(integrate_windows(problem, method.fit(problem)))
         advance(len(chunk))
-    return np.concatenate(found).reshape(len(models), *batch.data.shape)
-
-
-def _scaled(model: SparseModel, batch: WindowBatch, relations: Constraint) -> ODE:
-    return ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=relations)
-
-
-def _unobserved(
-    odes: Sequence[ODE], batches: Sequence[WindowBatch], *, n_reweights: int
-) -> Problem:
-    """With free starts, and nobody watching."""
-    return Problem(
-        odes=tuple(odes),
-        batches=tuple(batches),
-        free_start=True,
-        n_reweights=n_reweights,
-        observe=lambda iteration: None,
-    )
+    return np.concatenate(paths).reshape(len(models), *batch.data.shape)

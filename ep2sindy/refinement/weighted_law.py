@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.scales import column_norms, zero_to_one
-from ep2sindy.data.trajectory import read_only
+from ep2sindy.runtime.arrays import read_only
 
 # Directions of a basis or of all information below this share of the strongest count as absent.
 RANK = 1e-10

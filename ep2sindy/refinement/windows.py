@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
+from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
 
 PERIODS = 1.5  # of the dominant frequency in a window, where nobody says otherwise
 
@@ -56,6 +56,20 @@ class WindowBatch:
         covered = window + np.where(apart, window, np.minimum(gaps, window)).sum()
         return float(window * len(order) / covered)
 
+    def split(self) -> list[WindowBatch]:
+        """Every window as a batch of its own, in the same scale."""
+        return [
+            replace(
+                self,
+                steps=self.steps[[w]],
+                data=self.data[[w]],
+                inputs=self.inputs[[w]],
+                trajectory=self.trajectory[[w]],
+                start=self.start[[w]],
+            )
+            for w in range(len(self.start))
+        ]
+
 
 def cut_windows(
     trajectories: Sequence[Trajectory],
@@ -72,7 +86,9 @@ def cut_windows(
     samples, or a missing variable.
     """
     rng = np.random.default_rng(rng)
-    _check(trajectories, n_windows, window)
+    _check_trajectories(trajectories)
+    check_windows(n_windows, window)
+    _check_room(trajectories, window)
     values = [trajectory.columns([*states, *inputs]) for trajectory in trajectories]
     joined = np.concatenate(values)
     n = len(states)
@@ -96,18 +112,23 @@ def cut_windows(
     )
 
 
-def dominant_window(trajectories: Sequence[Trajectory], states: Sequence[str]) -> int:
-    """One and a half periods of the dominant frequency, in samples, as the data allow.
+def dominant_window(
+    trajectories: Sequence[Trajectory], states: Sequence[str], *, periods: float = PERIODS
+) -> int:
+    """So many periods of the dominant frequency, in samples, as the data allow.
 
     The frequency is that of the state whose peak holds the largest share of its power, the
     median over trajectories. At most half of the longest trajectory.
+    Raises ValueError for no trajectory.
     """
+    _check_trajectories(trajectories)
     samples = []
     for each in trajectories:
         columns = each.columns(states).T
         sharpest = columns[int(np.argmax([_peak_share(each.t, column) for column in columns]))]
         frequency = dominant_frequency(each.t, sharpest)
-        samples += [PERIODS / (frequency * each.dt_s)] if frequency > 0.0 else []
+        if frequency > 0.0:
+            samples.append(steps_in(periods, frequency_Hz=frequency, dt_s=each.dt_s))
     longest = max(each.n_samples for each in trajectories)
     wanted = np.median(samples) if samples else longest / 2
     return int(np.clip(round(float(wanted)), min(10, longest), max(longest // 2, 10)))
@@ -120,14 +141,21 @@ def _peak_share(t: np.ndarray, x: np.ndarray) -> float:
     return float(power[max(k - 1, 0) : k + 2].sum() / max(power.sum(), 1e-300))
 
 
-def _check(trajectories: Sequence[Trajectory], n_windows: int, window: int) -> None:
-    if not trajectories:
-        raise ValueError("refinement needs at least one trajectory: none came")
-    if n_windows < 1 or window < MIN_SAMPLES:
+def check_windows(n_windows: int, window: int | None) -> None:
+    """Raise ValueError for no window, or for one of too few samples; None is a length unknown."""
+    if n_windows < 1 or (window is not None and window < MIN_SAMPLES):
         raise ValueError(
             f"at least one window of {MIN_SAMPLES} samples is needed: n_windows={n_windows}, "
             f"window={window}"
         )
+
+
+def _check_trajectories(trajectories: Sequence[Trajectory]) -> None:
+    if not trajectories:
+        raise ValueError("refinement needs at least one trajectory: none came")
+
+
+def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
     longest = max(each.n_samples for each in trajectories)
     if window > longest:
         raise ValueError(

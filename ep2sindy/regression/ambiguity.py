@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.library.library import Library
 from ep2sindy.regression.gram_fits import independent_terms
 from ep2sindy.regression.rows import RegressionRows
 
@@ -46,8 +47,8 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
     Simpler is of lower degree, or earlier in the library.
     """
     xx = problem.train_gram.xx[0]
-    usable = _distinct(problem, xx)
-    for j, parts in _combinations(problem, xx):
+    usable = _distinct(problem.library, xx)
+    for j, parts in _combinations(problem.library, problem.train_theta, xx):
         usable[j] = len(parts) > MOST_PARTS
     return usable
 
@@ -70,15 +71,13 @@ def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     return (Ambiguity((), message, True),)
 
 
-def _simplest_first(problem: RegressionRows) -> Int[np.ndarray, " terms"]:
-    return np.argsort(problem.library.degrees, kind="stable")
+def _simplest_first(library: Library) -> Int[np.ndarray, " terms"]:
+    return np.argsort(library.degrees, kind="stable")
 
 
-def _distinct(
-    problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]
-) -> Bool[np.ndarray, " terms"]:
+def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and do not repeat a simpler one."""
-    order = _simplest_first(problem)
+    order = _simplest_first(library)
     distinct = np.diag(xx) > 0.0
     repeats = np.triu(np.abs(xx[np.ix_(order, order)]) > 1.0 - SAME, k=1)
     for first, second in order[np.argwhere(repeats)]:
@@ -88,22 +87,33 @@ def _distinct(
 
 def ambiguities(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     """Everything that keeps terms from being told apart, over the training rows."""
-    xx = problem.train_gram.xx[0]
-    return (*_zero(problem, xx), *_alike(problem, xx), *_dependent(problem, xx))
+    return find_ambiguities(problem.library, problem.train_theta, problem.train_gram.xx[0])
 
 
-def _zero(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def find_ambiguities(
+    library: Library,
+    theta: Float[np.ndarray, "rows terms"],
+    xx: Float[np.ndarray, "terms terms"],
+) -> tuple[Ambiguity, ...]:
+    """Everything that keeps terms from being told apart.
+
+    theta: of the library's terms, columns of unit norm, or of zeros. xx: its Gram matrix.
+    """
+    return (*_zero(library, xx), *_alike(library, xx), *_dependent(library, theta, xx))
+
+
+def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     return [
         Ambiguity((name,), f"{name!r} is zero on every row and is left out", True)
-        for name, square in zip(problem.term_names, np.diag(xx), strict=True)
+        for name, square in zip(library.names, np.diag(xx), strict=True)
         if square == 0.0
     ]
 
 
-def _alike(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
     """Pairs of terms that are proportional, the simpler one first; what is left out only once."""
-    names, order = problem.term_names, _simplest_first(problem)
-    kept = _distinct(problem, xx)
+    names, order = library.names, _simplest_first(library)
+    kept = _distinct(library, xx)
     cosines = np.abs(xx[np.ix_(order, order)])
     found = []
     for i, j in order[np.argwhere(np.triu(cosines > 1.0 - ALIKE, k=1))]:
@@ -122,11 +132,15 @@ def _alike(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) -> lis
     return found
 
 
-def _dependent(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def _dependent(
+    library: Library,
+    theta: Float[np.ndarray, "rows terms"],
+    xx: Float[np.ndarray, "terms terms"],
+) -> list[Ambiguity]:
     """Each term that is a combination of simpler ones, with the terms that make it up."""
-    names = problem.term_names
+    names = library.names
     found = []
-    for j, columns in _combinations(problem, xx):
+    for j, columns in _combinations(library, theta, xx):
         parts = [names[i] for i in columns]
         left_out = " and is left out" if len(parts) <= MOST_PARTS else ""
         message = f"{names[j]!r} is a linear combination of {parts} on every row{left_out}"
@@ -135,11 +149,13 @@ def _dependent(problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]) ->
 
 
 def _combinations(
-    problem: RegressionRows, xx: Float[np.ndarray, "terms terms"]
+    library: Library,
+    theta: Float[np.ndarray, "rows terms"],
+    xx: Float[np.ndarray, "terms terms"],
 ) -> list[tuple[int, list[int]]]:
     """Distinct terms that depend on simpler ones, each with those that it is made of."""
-    order = _simplest_first(problem)
-    columns = order[_distinct(problem, xx)[order]]
+    order = _simplest_first(library)
+    columns = order[_distinct(library, xx)[order]]
     independent = independent_terms(xx[np.ix_(columns, columns)])
     found = []
     for rank in np.flatnonzero(~independent):
@@ -147,7 +163,6 @@ def _combinations(
         weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
         if (np.abs(weights) > 1e-6).sum() > MOST_PARTS:
             # A Gram matrix has lost half the digits: by rows, many parts may turn out few.
-            rows = problem.train_theta
-            weights = np.linalg.lstsq(rows[:, basis], rows[:, columns[rank]], rcond=None)[0]
+            weights = np.linalg.lstsq(theta[:, basis], theta[:, columns[rank]], rcond=None)[0]
         found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found

@@ -12,8 +12,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.runtime.arrays import read_only
+from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
 
 ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the cache
@@ -56,8 +58,9 @@ class RegressionRows:
     theta: (rows, terms). target: (rows, equations).
     groups: (rows,), rows that share samples share a number, and stay together in a split or a
     bootstrap. test: (rows,), true for held-out rows.
-    trajectories: what the rows were made from, for judges that integrate. noisy: where the noise
-    of the samples can be followed into the training rows, how; then there is one equation.
+    trajectories: what the rows were made from; draws of neighbours never cross from one to the
+    next. noisy: where the noise of the samples can be followed into the training rows, how; then
+    there is one equation.
     Raises ValueError for values that are not finite or fewer training rows than terms.
     """
 
@@ -204,7 +207,13 @@ def _column_norms(values: np.ndarray) -> np.ndarray:
 
 @runtime_checkable
 class Formulation(Protocol):
-    """Turns trajectories into regressions: one, or one per equation where rows differ."""
+    """Turns trajectories into regressions: one, or one per equation where rows differ.
+
+    smoother: of the samples' derivative, if any; figures of derivatives take it too.
+    """
+
+    @property
+    def smoother(self) -> Smoother | None: ...
 
     def assemble(
         self,

@@ -16,7 +16,7 @@ EDGE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class WindowRows:
     """Test functions phi on stretches of one trajectory, ordered by their first sample.
 
     mean: (windows, samples), sparse; mean @ values is the integral of phi * values over that of
@@ -46,7 +46,7 @@ class WindowFunctions(Protocol):
         x: Float[np.ndarray, " samples"],
         *,
         rng: np.random.Generator,
-    ) -> Windows: ...
+    ) -> WindowRows: ...
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Boxes:
         x: Float[np.ndarray, " samples"],
         *,
         rng: np.random.Generator,
-    ) -> Windows:
+    ) -> WindowRows:
         """Raises ValueError for windows longer than the trajectory."""
         _check_width(self.n_points, len(t), "n_points")
         first = np.sort(rng.integers(len(t) - self.n_points + 1, size=self.n_windows))
@@ -89,7 +89,7 @@ class Boxes:
         length_s = (t[last] - t[first])[:, None]
         ends = np.stack([first, last], axis=1)
         difference = np.tile([-1.0, 1.0], (self.n_windows, 1)) / length_s
-        return Windows(_rows(inside, mean / length_s, len(t)), _rows(ends, difference, len(t)))
+        return WindowRows(_rows(inside, mean / length_s, len(t)), _rows(ends, difference, len(t)))
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Bumps:
         x: Float[np.ndarray, " samples"],
         *,
         rng: np.random.Generator,
-    ) -> Windows:
+    ) -> WindowRows:
         """Unequal steps are interpolated on to an even grid, by weights that the rows take over.
 
         Then there is one window about a sample at most: more would depend on each other.
@@ -143,9 +143,9 @@ class Bumps:
         mean, slope = windows.mean[kept] @ lines, windows.slope[kept] @ lines
         mean.sort_indices()
         slope.sort_indices()
-        return Windows(mean, slope)
+        return WindowRows(mean, slope)
 
-    def _even_windows(self, x: np.ndarray, dt_s: float) -> Windows:
+    def _even_windows(self, x: np.ndarray, dt_s: float) -> WindowRows:
         half_width = self._half_width(x, dt_s)
         _check_width(2 * half_width + 1, len(x), "half_width_s")
         power = bump_power(half_width)
@@ -156,7 +156,7 @@ class Bumps:
         fall /= fall @ s * half_width * dt_s
         first = np.arange(0, len(x) - 2 * half_width, max(1, half_width // self.overlap))
         inside = first[:, None] + np.arange(2 * half_width + 1)
-        return Windows(
+        return WindowRows(
             mean=_rows(inside, np.broadcast_to(phi / phi.sum(), inside.shape), len(x)),
             slope=_rows(inside, np.broadcast_to(fall, inside.shape), len(x)),
         )

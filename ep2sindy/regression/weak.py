@@ -20,7 +20,7 @@ from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
-from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, Windows
+from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, WindowRows
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 from ep2sindy.signals.smoothers import Smoother
@@ -78,17 +78,17 @@ class Weak:
         check_agreement(trajectories, library.variables)
         check_domain(trajectories, library)
         pieces = [piece for run in trajectories for piece in _pieces(run)]
-        runs = [self._sampled(piece, library, rng) for piece in pieces]
+        runs = [self._sample(piece, library, rng) for piece in pieces]
         states = range(len(runs[0].windows))
         return tuple(self._problem(k, runs, library, trajectories) for k in states)
 
-    def _sampled(self, run: Trajectory, library: Library, rng: np.random.Generator) -> _Sampled:
+    def _sample(self, run: Trajectory, library: Library, rng: np.random.Generator) -> _Sampled:
         windows = [self.test_functions.windows(run.t, x, rng=rng) for x in run.states.T]
         longest = max(int((w.last - w.first).max()) + 1 for w in windows)
         n_segments = int(np.clip(run.n_samples // (2 * longest), 1, MAX_SEGMENTS))
         segment = np.arange(run.n_samples) * n_segments // run.n_samples
         names = tuple(dict.fromkeys([*library.variables, *run.state_names]))
-        at_hand, estimate = self._smoothed(run, names, library)
+        at_hand, estimate = self._smooth(run, names, library)
         with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
             terms = library.evaluate(at_hand[:, : len(library.variables)])
         return _Sampled(
@@ -101,7 +101,7 @@ class Weak:
             held_out=self.split.held_out(n_segments, rng)[segment],
         )
 
-    def _smoothed(
+    def _smooth(
         self, run: Trajectory, names: Sequence[str], library: Library
     ) -> tuple[np.ndarray, KalmanEstimate | None]:
         """Samples for the library, and what the Kalman smoother says of them, where asked."""
@@ -135,7 +135,7 @@ class Weak:
         name = runs[0].run.state_names[state]
         parts = [run.rows(state) for run in runs]
         test = np.concatenate([part.test for part in parts])
-        mean, slope = _stacked(p.mean for p in parts), _stacked(p.slope for p in parts)
+        mean, slope = _stack(p.mean for p in parts), _stack(p.slope for p in parts)
         n_segments = np.cumsum([0, *(run.segment[-1] + 1 for run in runs)])
         return RegressionRows(
             theta=mean @ np.concatenate([run.terms for run in runs]),
@@ -165,7 +165,7 @@ class _Sampled:
     names: tuple[str, ...]
     terms: Float[np.ndarray, "samples terms"]
     estimate: KalmanEstimate | None
-    windows: Sequence[Windows]
+    windows: Sequence[WindowRows]
     segment: Int[np.ndarray, " samples"]
     held_out: Bool[np.ndarray, " samples"]
 
@@ -200,7 +200,7 @@ def _pieces(run: Trajectory) -> list[Trajectory]:
     return [run] if parts == [(0, run.n_samples)] else [run.window(*part) for part in parts]
 
 
-def _stacked(blocks: Iterable[csr_array]) -> csr_array:
+def _stack(blocks: Iterable[csr_array]) -> csr_array:
     """Windows of all trajectories, over the samples of all trajectories."""
     return block_diag(list(blocks), format="csr")
 
@@ -252,9 +252,9 @@ class WeightedWeak:
     ) -> tuple[RegressionRows, ...]:
         """One regression per state, as `Weak.assemble` gives it, with white rows."""
         problems = self.weak.assemble(trajectories, library, rng=rng)
-        return tuple(self._weighted(problem) for problem in problems)
+        return tuple(self._weigh(problem) for problem in problems)
 
-    def _weighted(self, problem: RegressionRows) -> RegressionRows:
+    def _weigh(self, problem: RegressionRows) -> RegressionRows:
         if problem.test.any():
             raise ValueError(
                 "weighted rows cannot be held out: set weak.split.test_fraction to 0, or use Weak"

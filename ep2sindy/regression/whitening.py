@@ -85,8 +85,8 @@ def _following(
 
     limit: the misfit that a whole step may reach.
     """
-    coef = rows.fitted(terms)
-    x = kept_inside(problem.library, rows.corrected(coef), rows.x)
+    coef = rows.fit(terms)
+    x = kept_inside(problem.library, rows.correct(coef), rows.x)
     whole = _Linearised.at(problem, x, coef)
     if whole.misfit <= limit:
         return whole
@@ -163,7 +163,7 @@ class _Linearised:
         residual = self.target - self.drifted @ self.coef
         return float(residual @ residual + 2.0 * np.log(self.factor[0]).sum())
 
-    def fitted(self, terms: Bool[np.ndarray, " terms"]) -> Float[np.ndarray, " terms"]:
+    def fit(self, terms: Bool[np.ndarray, " terms"]) -> Float[np.ndarray, " terms"]:
         """Coefficients of the chosen terms; the rows at x are instruments for the noisy ones."""
         coef = np.zeros(len(terms))
         theta, drifted = self.theta[:, terms], self.drifted[:, terms]
@@ -175,9 +175,7 @@ class _Linearised:
         )
         return coef
 
-    def corrected(
-        self, coef: Float[np.ndarray, " terms"]
-    ) -> Float[np.ndarray, "samples variables"]:
+    def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "samples variables"]:
         """The samples less their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
         noise = np.stack([m.T @ weighted for m in self.noise], axis=1)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
@@ -18,6 +19,9 @@ with away_from(SETTINGS):
     from numba.core import config, event
 config._config_fname = ""  # looked for again whenever something is compiled
 
+THIS = Path(__file__)
+IMPORT = re.compile(r"^from (ep2sindy(?:\.\w+)+) import", re.MULTILINE)
+
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."
 
 
@@ -25,8 +29,9 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     """`numba.njit` with its cache on; as `@compiled` or `@compiled(inline="always")`.
 
     Other threads go on meanwhile: a worker in a long call still sees that its run was killed.
-    What a kernel calls is compiled into it, so a change in any kernel of its folder, or in the
-    columns that they share, compiles it anew: numba itself looks at the kernel's own file alone.
+    What a kernel calls is compiled into it, and so are constants: a change in any file of its
+    folder, or in one that kernels there import names from, compiles it anew. Numba itself looks at
+    the kernel's own file alone.
     """
     if function is None:
         return lambda each: compiled(each, **options)
@@ -41,9 +46,22 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 
 def sources() -> list[Path]:
-    """Files that define kernels, and this one, which says how they are compiled."""
-    kernels = (path for path in PACKAGE.rglob("*.py") if path.stem.endswith(("kernels", "_fits")))
-    return [*sorted(kernels), Path(__file__)]
+    """Files that define kernels, those whose names they import, and this one, which says how they
+    are compiled."""
+    kernels = _kernels_in(PACKAGE)
+    return [*sorted({*kernels, *_imported(kernels)} - {THIS}), THIS]
+
+
+def _kernels_in(folder: Path) -> list[Path]:
+    """Files that define kernels, below a folder."""
+    return [path for path in folder.rglob("*.py") if path.stem.endswith(("kernels", "_fits"))]
+
+
+def _imported(files: Iterable[Path]) -> set[Path]:
+    """Files of the package that these import names from, by their texts."""
+    names = {name for path in files for name in IMPORT.findall(path.read_text("utf-8"))}
+    places = {PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names}
+    return {place for place in places if place.is_file()}
 
 
 def kept_in() -> Path:
@@ -72,8 +90,8 @@ def _kept_if_room(save: Callable, *compiled: Any) -> None:
 @cache
 def _stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
     """Names, dates and sizes of all that is compiled in a folder, and of what says how."""
-    sources = [*sorted(folder.glob("*.py")), *sorted(folder.parent.glob("closures.py"))]
-    stats = [(source.name, source.stat()) for source in [*sources, Path(__file__)]]
+    files = {*folder.glob("*.py"), *_imported(_kernels_in(folder)), THIS}
+    stats = [(file.name, file.stat()) for file in sorted(files)]
     return tuple((name, stat.st_mtime, stat.st_size) for name, stat in stats)
 
 

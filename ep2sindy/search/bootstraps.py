@@ -114,7 +114,7 @@ class Resamples:
     counted: bool
     largest: int
 
-    def searched(
+    def search(
         self, search: Search, equation: int, advance: Advance = nothing
     ) -> list[Bool[np.ndarray, "_ terms"]]:
         """What a search proposes in every draw, as far as the rows can bear it."""
@@ -133,7 +133,7 @@ class Resamples:
     ) -> Float[np.ndarray, "draws terms"]:
         """Each draw's own best support of this support's size, fitted to the draw.
 
-        found: as `searched` gives it; where a draw has none of that size, the support itself
+        found: as `search` gives it; where a draw has none of that size, the support itself
         serves, as far as its terms are at hand. In units of the problem's scaled columns.
         """
         coef = np.empty(self.at_hand.shape)
@@ -148,7 +148,7 @@ class Resamples:
         return coef
 
 
-def resamples(
+def draw_resamples(
     problem: RegressionRows, bootstraps: Bootstraps, *, rng: np.random.Generator
 ) -> Resamples:
     """Draw bootstraps of the training rows, once for all equations.
@@ -184,14 +184,12 @@ def pooled_supports(
     rng: np.random.Generator,
 ) -> tuple[Supports, ...]:
     """Search every bootstrap of the training rows; one `Supports` per equation."""
-    draws = resamples(problem, bootstraps, rng=rng)
-    return tuple(pooled(draws, k, draws.searched(search, k)) for k in range(len(draws.equations)))
+    draws = draw_resamples(problem, bootstraps, rng=rng)
+    return tuple(pool(draws, k, draws.search(search, k)) for k in range(len(draws.equations)))
 
 
-def pooled(
-    draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]
-) -> Supports:
-    """Count supports and terms over the draws, as `searched` found them."""
+def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]) -> Supports:
+    """Count supports and terms over the draws, as `search` found them."""
     n_terms = draws.kept.shape[1]
     source = np.repeat(np.arange(len(found)), [len(masks) for masks in found])
     masks = np.concatenate(found)

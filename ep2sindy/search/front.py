@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
@@ -19,17 +19,16 @@ from ep2sindy.search.bootstraps import Supports
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One support of one equation, with its least-squares fit to the training rows.
+    """One support of one equation, with its fit.
 
-    coef: (terms of the support,), in SI. r2_train, r2_test: 1 - SS_res/SS_tot with the data as
-    truth. share: share of bootstraps that found this support. inclusion: for each of its
-    terms, the share of bootstraps in which the term stood in a support of this size.
-    covariance: (support, support) of coef, in SI, where noise has been followed to it.
+    coef: (terms of the support,), in SI: of a regression least squares on the training rows, of a
+    search of trajectories the likeliest beside the other equations. r2_train, r2_test: 1 -
+    SS_res/SS_tot with the data as truth; NaN without such rows, both where there are none at all.
+    share: share of bootstraps that found this support. inclusion: for each of its terms, the share
+    of bootstraps in which the term stood in a support of this size; both NaN without bootstraps.
     deviance: -2 log likelihood of whole trajectories plus the price of the terms, beside the best
-    system's; None where rows alone were fitted. chi_squared: per row, of what the terms leave,
-    whitened by the noise that reaches the rows: 1 where the noise is all that is left; then
-    autocorrelation, of a row's residual with the next, is 0, and leaves_noise is true. None where
-    the noise of the rows is not known.
+    system's; None where rows alone were fitted. score: of the rule that selected among the
+    candidates of its front, least selected; NaN before.
     """
 
     equation: str
@@ -39,11 +38,8 @@ class Candidate:
     r2_test: float
     share: float
     inclusion: Float[np.ndarray, " support"]
-    covariance: Float[np.ndarray, "support support"] | None = None
     deviance: float | None = None
-    chi_squared: float | None = None
-    autocorrelation: float | None = None
-    leaves_noise: bool | None = None
+    score: float = float("nan")
 
     @property
     def n_terms(self) -> int:
@@ -52,6 +48,11 @@ class Candidate:
     @property
     def coef_by_term(self) -> dict[str, float]:
         return dict(zip(self.terms, self.coef.tolist(), strict=True))
+
+    @property
+    def r2(self) -> float:
+        """On held-out rows, or on the training rows where none are held out."""
+        return self.r2_train if np.isnan(self.r2_test) else self.r2_test
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,20 +72,46 @@ class ParetoFront:
     """The best candidates of every size, the empty model first.
 
     From `pareto_front` they are sorted by size, and within a size by error: the first of each
-    size is the front proper, whose error falls, any others are runners-up. A joint search ranks
-    by all of its points: at one of them errors may rise. problem: the rows they were fitted to.
-    cloud: all supports that these were taken from; None where a front was not made of any.
+    size is the front proper, whose error falls, any others are runners-up. A shared search ranks
+    by all of its points: at one of them errors may rise. problem: the rows they were fitted to;
+    None of a search of trajectories, which has none. cloud: all supports that these were taken
+    from; None where a front was not made of any.
     """
 
     equation: str
     candidates: Sequence[Candidate]
-    problem: RegressionRows = field(repr=False)
+    problem: RegressionRows | None = field(default=None, repr=False)
     cloud: Cloud | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", tuple(self.candidates))
         assert self.candidates
         assert self.candidates[0].n_terms == 0
+
+    @property
+    def rows(self) -> RegressionRows:
+        """The rows of a regression. Raises ValueError where there are none."""
+        if self.problem is None:
+            raise ValueError(
+                f"rows are needed to judge the candidates of {self.equation!r}, and a search of "
+                "trajectories has none: take a regression, such as Regression(WeightedWeak())"
+            )
+        return self.problem
+
+    @property
+    def held_out(self) -> bool:
+        """Whether some rows were held out from the fits."""
+        return any(not np.isnan(candidate.r2_test) for candidate in self.candidates)
+
+    @property
+    def scores(self) -> Float[np.ndarray, " candidates"]:
+        """Of the rule that selected among them, the lowest selected."""
+        return np.array([candidate.score for candidate in self.candidates])
+
+    def with_scores(self, scores: Float[np.ndarray, " candidates"]) -> ParetoFront:
+        """The same candidates, with what a rule says of them."""
+        pairs = zip(self.candidates, scores.tolist(), strict=True)
+        return replace(self, candidates=[replace(each, score=score) for each, score in pairs])
 
     @property
     def errors(self) -> Float[np.ndarray, " candidates"]:
@@ -102,27 +129,34 @@ class ParetoFront:
 
     def __repr__(self) -> str:
         rows = [
-            [str(c.n_terms), f"{_score(c):.6f}", equation_text(self.equation, c.coef_by_term)]
-            for c in self.candidates
+            [str(c.n_terms), text, equation_text(self.equation, c.coef_by_term)]
+            for c, text in zip(self.candidates, self._figures, strict=True)
         ]
         head = f"ParetoFront of {self.equation}, {len(rows)} candidates"
-        return one_screen([head, *text_table(["terms", "R2", "equation"], rows)])
+        return one_screen([head, *text_table(["terms", self._figure, "equation"], rows)])
 
     def _repr_html_(self) -> str:
         rows = [
-            [str(c.n_terms), f"{_score(c):.6f}", equation_html(self.equation, c.coef_by_term)]
-            for c in self.candidates
+            [str(c.n_terms), text, equation_html(self.equation, c.coef_by_term)]
+            for c, text in zip(self.candidates, self._figures, strict=True)
         ]
-        return html_table(["terms", "R2", "equation"], rows)
+        return html_table(["terms", self._figure, "equation"], rows)
+
+    @property
+    def _figure(self) -> str:
+        """What is told of every candidate."""
+        return "R2" if self.problem is not None else "deviance"
+
+    @property
+    def _figures(self) -> list[str]:
+        if self.problem is not None:
+            return [f"{c.r2:.6f}" for c in self.candidates]
+        return ["" if c.deviance is None else f"{c.deviance:.6g}" for c in self.candidates]
 
 
 def errors_of(candidates: Sequence[Candidate]) -> Float[np.ndarray, " candidates"]:
     """1 - R2 on held-out rows, or on the training rows where none are held out."""
-    return np.array([1.0 - _score(candidate) for candidate in candidates])
-
-
-def _score(candidate: Candidate) -> float:
-    return candidate.r2_train if np.isnan(candidate.r2_test) else candidate.r2_test
+    return np.array([1.0 - candidate.r2 for candidate in candidates])
 
 
 def fit_support(problem: RegressionRows, equation: str, terms: Sequence[str]) -> Candidate:
@@ -158,7 +192,7 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
     n_terms = len(problem.library)
     equation = problem.equations.index(supports.equation)
     sizes = supports.masks.sum(axis=1)
-    explained = _explained(problem, equation, supports.masks)
+    explained = _explain(problem, equation, supports.masks)
     best = _best_of_each_size(sizes, explained, depth)
     empty = np.zeros((1, n_terms), dtype=np.bool_)
     chosen = Supports(
@@ -170,7 +204,7 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
     candidates = _candidates(problem, chosen)
     order = front_order(
         np.array([c.n_terms for c in candidates]),
-        np.array([-_score(c) for c in candidates]),
+        np.array([-c.r2 for c in candidates]),
         depth=depth,
     )
     cloud = _cloud(problem, equation, sizes, explained)
@@ -214,7 +248,7 @@ def _candidates(problem: RegressionRows, supports: Supports) -> list[Candidate]:
     ]
 
 
-def _explained(
+def _explain(
     problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
 ) -> Float[np.ndarray, " supports"]:
     """By how much each support lowers the target's squares on the rows that judge.

@@ -150,7 +150,7 @@ def _sweep(source, target, j, size):
 
 
 @compiled
-def _joined(total, residual, rounding, n_problems):
+def _join(total, residual, rounding, n_problems):
     """Carry the product of residuals on by one: as a logarithm, or plainly if it is the only."""
     return residual if n_problems == 1 else total + np.log(max(residual, rounding))
 
@@ -166,7 +166,7 @@ def _least_residual(matrices, first, size, smallest, scratch):
         for j in range(first, size - 1):
             if scratch[j, j] > smallest[p, j]:
                 _sweep(scratch, scratch, j, size)
-        total = _joined(total, scratch[size - 1, size - 1], smallest[p, size - 1], len(matrices))
+        total = _join(total, scratch[size - 1, size - 1], smallest[p, size - 1], len(matrices))
     return total
 
 
@@ -276,7 +276,7 @@ def _search(levels, smallest, best, best_masks):
             if pivot > smallest[p, j]:
                 left -= levels[level, p, j, n_terms] ** 2 / pivot
                 adds = True
-            residual = _joined(residual, left, smallest[p, n_terms], n_problems)
+            residual = _join(residual, left, smallest[p, n_terms], n_problems)
         if not adds:
             continue
         chosen[level] = j

@@ -80,7 +80,7 @@ class EBIC:
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
         found = []
         for front in fronts:
-            library = front.problem.library
+            library = front.rows.library
 
             def penalty(candidate: Candidate, n_rows: float, library: Library = library) -> float:
                 ways = log_supports(library, candidate.terms)
@@ -108,7 +108,7 @@ def _criterion(
     The weights depend on the model: those of the leading candidate serve all, in rounds, until
     the leader stays.
     """
-    problem = front.problem
+    problem = front.rows
     n_rows = len(problem.train_rows)
     n_effective = float(n_rows if coarsening is None else n_rows / (1.0 + n_rows / coarsening))
     penalties = np.array([penalty(c, n_effective) for c in front.candidates])
@@ -147,7 +147,7 @@ def _fits(
 class Evidence:
     """The candidate under which the trajectories are most likely, its terms' prices paid.
 
-    What a `Joint` search weighs its own candidates by; fronts of other searches have none.
+    What a `TrajectorySearch` weighs its own candidates by; fronts of regressions have none.
     """
 
     label: ClassVar[str] = "deviance"
@@ -156,8 +156,8 @@ class Evidence:
         for front in fronts:
             if any(candidate.deviance is None for candidate in front.candidates):
                 raise ValueError(
-                    "Evidence weighs what a joint search found: these fronts come from rows; set "
-                    "search=Joint() (search=joint), or select by EBIC"
+                    "Evidence weighs what a search of trajectories found: these fronts come from "
+                    "rows; take TrajectorySearch() (search=trajectory), or select by EBIC"
                 )
         return [
             np.array([candidate.deviance for candidate in front.candidates], dtype=np.float64)
@@ -208,5 +208,5 @@ class Knee:
 
 def _norm_of_sizes(front: ParetoFront, n_norm: str) -> float:
     if n_norm == "library":
-        return float(len(front.problem.library))
+        return float(len(front.rows.library))
     return float(front.sizes.max()) + 1.0

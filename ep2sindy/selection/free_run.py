@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.constraints.relations import Relation
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.likeness import FreeRunBounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.refinement.refine import refine_together
+from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.refined import RefinedScore
@@ -35,9 +37,10 @@ from ep2sindy.selection.systems import (
     budget,
     folds_of,
     records_of,
-    system_of,
+    systems_of,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.spectrum import samples_in, steps_in
 
 LEAST_WINDOWS = 30  # that the winner is refined on
 
@@ -124,28 +127,32 @@ class FreeRunScore:
         if not 0.0 < self.margin <= 1.0:
             raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
+    def scores(
+        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
+    ) -> list[Float[np.ndarray, " _candidates"]]:
         """Those of `decide`."""
-        return list(self.decide(fronts).scores)
+        return list(self.decide(fronts, library, runs).scores)
 
     def decide(
         self,
         fronts: Sequence[ParetoFront],
+        library: Library,
+        runs: Sequence[Trajectory],
         relations: Sequence[Relation] = (),
         *,
         progress: Progress = SILENT,
     ) -> Decision:
-        """Raises ValueError for rows without trajectories, a state without a front, more than
+        """Raises ValueError for no runs, a state without a front, more than
         max_combinations, or relations that no combination has the terms for.
         """
-        records = records_of(fronts)
+        records = records_of(fronts, runs)
         cycles = cycles_of(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
             rule = RefinedScore(max_combinations=self.max_combinations)
-            found = rule.decide(fronts, relations, progress=progress)
+            found = rule.decide(fronts, library, runs, relations, progress=progress)
             return replace(found, note=f"{cycles}: chosen by windows held out instead")
         places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
-        systems = [system_of(fronts, choice, relations) for choice in places]
+        systems = systems_of(fronts, places, library, runs, relations)
         trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
         winner, model, note = self._winner(records, cycles, trials, progress)
@@ -155,11 +162,9 @@ class FreeRunScore:
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
         """Samples of a window."""
-        samples = [
-            self.window_periods / (cycle.frequency_Hz * run.dt_s)
-            for run, cycle in zip(records.runs, cycles, strict=True)
-        ]
-        return round(float(np.median(samples))) + 1
+        frequency_Hz = [cycle.frequency_Hz for cycle in cycles]
+        dt_s = [run.dt_s for run in records.runs]
+        return samples_in(self.window_periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
 
     def _trials(
         self,
@@ -201,7 +206,7 @@ class FreeRunScore:
         )
         method, together = budget(batch)
         with progress.stage(len(systems), "system", "refined without a fold") as advance:
-            refined = refine_together(
+            refined = refine_batch(
                 [system.model for system in systems],
                 batch,
                 method=method,
@@ -339,7 +344,7 @@ def paths_over(
     centre, spread = joined.mean(axis=0), joined.std(axis=0)
     for part in held:
         run, x, cycle = records.runs[part.run], records.smoothed[part.run], cycles[part.run]
-        per_period = 1.0 / (cycle.frequency_Hz * run.dt_s)
+        per_period = steps_in(1.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
         first, n_samples = part.start, part.stop - part.start
         if not ensemble.inputs:
             n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))

@@ -11,9 +11,10 @@ from jaxtyping import Float, Int
 
 from ep2sindy.constraints.relations import Constraint, Relation
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.refine import follow_together, refine_together
+from ep2sindy.refinement.refine import refine_batch, smooth_batch
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
 from ep2sindy.search.front import ParetoFront
@@ -26,7 +27,7 @@ from ep2sindy.selection.rule import (
     joint_scores,
     smallest,
 )
-from ep2sindy.selection.systems import budget, records_of, system_of
+from ep2sindy.selection.systems import Records, System, budget, records_of, systems_of
 
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
 LEAST_PAIRS = 3
@@ -79,17 +80,22 @@ class RefinedScore:
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}: {getattr(self, name)} came")
 
-    def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        """Raises ValueError for rows without trajectories, a state without a front, more than
+    def scores(
+        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
+    ) -> list[Float[np.ndarray, " _candidates"]]:
+        """Raises ValueError for no runs, a state without a front, more than
         max_combinations, or records too short for two windows.
         """
         places = combinations(fronts, self.max_combinations)
-        errors, limit = self._judged(fronts, places, (), SILENT)
+        systems = systems_of(fronts, places, library, runs)
+        errors, limit = self._judge(systems, records_of(fronts, runs), SILENT)
         return joint_scores(fronts, places, errors, limit=limit)
 
     def decide(
         self,
         fronts: Sequence[ParetoFront],
+        library: Library,
+        runs: Sequence[Trajectory],
         relations: Sequence[Relation] = (),
         *,
         progress: Progress = SILENT,
@@ -99,27 +105,22 @@ class RefinedScore:
         Raises ValueError for relations that no combination has the terms for, too.
         """
         places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
-        errors, limit = self._judged(fronts, places, relations, progress)
+        records = records_of(fronts, runs)
+        systems = systems_of(fronts, places, library, runs, relations)
+        errors, limit = self._judge(systems, records, progress)
         winner = smallest(fronts, places, errors, limit=limit)
         scores = joint_scores(fronts, places, errors, limit=limit, winner=winner)
-        system = system_of(fronts, places[winner], relations)
         with progress.stage(None, "", "the best system refined on all data"):
-            found = system.refined_on_all(records_of(fronts).runs)
+            found = systems[winner].refined_on_all(runs)
         return Decision(scores, found, self.label)
 
-    def _judged(
-        self,
-        fronts: Sequence[ParetoFront],
-        places: Int[np.ndarray, "combinations fronts"],
-        relations: Sequence[Relation],
-        progress: Progress,
+    def _judge(
+        self, systems: Sequence[System], records: Records, progress: Progress
     ) -> tuple[Float[np.ndarray, " combinations"], float]:
         """Error of every combination on windows it was not refined on, and the limit."""
-        records = records_of(fronts)
-        systems = [system_of(fronts, choice, relations) for choice in places]
         coef = np.stack([system.model.coef for system in systems], axis=2)
-        states = [front.equation for front in fronts]
-        ensemble = Ensemble(fronts[0].problem.library, states, coef)
+        model = systems[0].model
+        ensemble = Ensemble(model.library, model.states, coef)
         constraints = [system.constraint for system in systems]
         spread = np.concatenate(records.smoothed).std(axis=0)
         folds = self._folds(records.runs, ensemble)
@@ -212,7 +213,7 @@ def _refined(
     if not order.size:
         return ensemble
     method, together = budget(batch)
-    found = refine_together(
+    found = refine_batch(
         _models(ensemble, order),
         batch,
         method=method,
@@ -243,7 +244,7 @@ def _residuals(
     order = _by_size(ensemble)
     if order.size:
         method, together = budget(batch)
-        paths = follow_together(
+        paths = smooth_batch(
             _models(ensemble, order),
             batch,
             method=method,

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.constraints.relations import Relation, binding
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.search.front import Candidate, ParetoFront
@@ -56,20 +58,42 @@ class Decision:
 
 
 @runtime_checkable
-class SystemSelection(Selection, Protocol):
+class SystemSelection(Protocol):
     """A rule that judges combinations of candidates, one per equation, and refines the winner.
 
-    relations: between coefficients; they hold in every system that is judged. progress: told of
-    the systems that are tried.
+    library: of the candidates' terms. runs: that systems are judged by. relations: between
+    coefficients; they hold in every system that is judged. progress: told of the systems that are
+    tried. label: what the score is called in tables.
     """
+
+    @property
+    def label(self) -> str: ...
+
+    def scores(
+        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
+    ) -> list[Float[np.ndarray, " _candidates"]]: ...
 
     def decide(
         self,
         fronts: Sequence[ParetoFront],
+        library: Library,
+        runs: Sequence[Trajectory],
         relations: Sequence[Relation] = (),
         *,
         progress: Progress = SILENT,
     ) -> Decision: ...
+
+
+def score_candidates(
+    rule: Selection | SystemSelection,
+    fronts: Sequence[ParetoFront],
+    library: Library,
+    runs: Sequence[Trajectory],
+) -> list[Float[np.ndarray, " _candidates"]]:
+    """Scores by a rule of either kind: of candidates one by one, or of whole systems of them."""
+    if isinstance(rule, SystemSelection):
+        return rule.scores(fronts, library, runs)
+    return rule.scores(fronts)
 
 
 def combinations(

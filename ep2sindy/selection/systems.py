@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.constraints.relations import Constraint, Relation, binding, constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
@@ -62,19 +63,32 @@ class System:
         return found.model
 
 
-def system_of(
+def systems_of(
+    fronts: Sequence[ParetoFront],
+    places: Int[np.ndarray, "combinations fronts"],
+    library: Library,
+    runs: Sequence[Trajectory],
+    relations: Sequence[Relation] = (),
+) -> list[System]:
+    """Every combination as a system, in the units of the runs."""
+    units = runs[0].units if runs else {}
+    return [_system(fronts, choice, library, units, relations) for choice in places]
+
+
+def _system(
     fronts: Sequence[ParetoFront],
     choice: Int[np.ndarray, " fronts"],
-    relations: Sequence[Relation] = (),
+    library: Library,
+    units: Mapping[str, str],
+    relations: Sequence[Relation],
 ) -> System:
     """A combination: free coefficients from the candidates, the others as the relations say."""
-    problem, states = fronts[0].problem, [front.equation for front in fronts]
+    states = [front.equation for front in fronts]
     chosen = [front.candidates[k] for front, k in zip(fronts, choice, strict=True)]
-    coef = coef_matrix(problem.library, [candidate.coef_by_term for candidate in chosen])
-    units = problem.trajectories[0].units if problem.trajectories else {}
-    model = SparseModel(problem.library, states, coef, units)
+    coef = coef_matrix(library, [candidate.coef_by_term for candidate in chosen])
+    model = SparseModel(library, states, coef, units)
     support = support_of(fronts, choice)
-    held = constraint(problem.library, support, binding(relations, support) or ())
+    held = constraint(library, support, binding(relations, support) or ())
     places = [(model.library.index(term), states.index(state)) for state, term in held.coefficients]
     free = np.array([coef[places[k]] for k in held.free])
     return System(with_coef(model, held, held.coef(free))[0], held)
@@ -98,17 +112,13 @@ class Records:
     smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
 
 
-def records_of(fronts: Sequence[ParetoFront]) -> Records:
-    """What stands behind the rows, states in the order of the fronts.
+def records_of(fronts: Sequence[ParetoFront], runs: Sequence[Trajectory]) -> Records:
+    """The runs that systems are judged by, states in the order of the fronts.
 
-    Raises ValueError for rows without trajectories or a state without a front.
+    Raises ValueError for no runs, or a state without a front.
     """
-    runs = fronts[0].problem.trajectories
     if not runs:
-        raise ValueError(
-            "to integrate, the rows must know their trajectories: none came with the regression; "
-            "pass them as Regression(trajectories=...)"
-        )
+        raise ValueError("to integrate, trajectories are needed: none came; pass them as runs")
     equations = [front.equation for front in fronts]
     if sorted(equations) != sorted(runs[0].state_names):
         raise ValueError(

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float
 from scipy import fft
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.data.trajectory import read_only
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
 
 LEAST_PERIODS = 3.0  # of a record that can be said to repeat

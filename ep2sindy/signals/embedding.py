@@ -83,8 +83,8 @@ class LogRate:
             raise ValueError(
                 f"a growth rate needs a positive signal: {x} falls to {signal.x.min():.4g} "
                 f"{signal.unit}, {share:.2g} % of its samples are zero or less, and noise does not "
-                "explain it; take its derivative instead (embedding=rate, ep.Rate()), or an offset "
-                "out of it"
+                "explain it; take its derivative instead (embedding=rate, ep.signals.Rate()), "
+                "or an offset out of it"
             )
         found = LogSmoother(_finest_s(signal, self.harmonics)).estimate(signal.t, signal.x)
         states = np.column_stack([found.smoothed, found.rate])

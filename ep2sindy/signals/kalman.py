@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.scales import zero_to_one
-from ep2sindy.data.trajectory import check_time, read_only
+from ep2sindy.data.trajectory import check_time
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.kernels import likelihood, smoothed
 
 # From a memory of some 200 samples to interpolation.

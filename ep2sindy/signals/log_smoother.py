@@ -10,7 +10,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.linalg import cholesky_banded, solveh_banded
 from scipy.optimize import minimize_scalar
 
-from ep2sindy.data.trajectory import check_time, read_only
+from ep2sindy.data.trajectory import check_time
+from ep2sindy.runtime.arrays import read_only
 
 # Of process to measurement noise, with the mean step as the unit of time and the signal's mean as
 # that of the signal: from a memory of some 30 samples to interpolation.
@@ -204,5 +205,5 @@ def _check(t: np.ndarray, x: np.ndarray) -> None:
     if not x.mean() > 0.0:
         raise ValueError(
             f"a signal must be positive for its logarithm to be taken: its mean is {x.mean():.3g}; "
-            "take its derivative instead (ep.Rate)"
+            "take its derivative instead (ep.signals.Rate)"
         )

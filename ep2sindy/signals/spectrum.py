@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy import fft
@@ -52,6 +54,20 @@ def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
     pure tone the error is below 2 % of a bin. Zero for a signal that does not change.
     """
     return peak(*power_spectrum(t, x))
+
+
+def steps_in(
+    periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
+) -> float:
+    """Number of time steps that so many periods take, not rounded; the median over records."""
+    return float(np.median(periods / (np.asarray(frequency_Hz) * np.asarray(dt_s))))
+
+
+def samples_in(
+    periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
+) -> int:
+    """Number of samples from the first to the last of so many periods; the median over records."""
+    return round(steps_in(periods, frequency_Hz=frequency_Hz, dt_s=dt_s)) + 1
 
 
 def peak(frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"]) -> float:

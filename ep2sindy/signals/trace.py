@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
 from ep2sindy.signals.spectrum import dominant_frequency
 
@@ -72,7 +73,7 @@ def from_one_signal(
     Raises ValueError for a signal that does not oscillate, under six periods, or a wrong setting.
 
     >>> t = np.linspace(0.0, 1e-3, 2001)
-    >>> ep.trace(ep.Trajectory(t, 3.0 + np.sin(6e4 * t)[:, None], ["I_d"])).is_positive
+    >>> ep.signals.from_one_signal(ep.Trajectory(t, 3 + np.sin(6e4*t)[:, None], ["I"])).is_positive
     True
     """
     name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal
@@ -138,7 +139,7 @@ def _cycle(t: np.ndarray, x: np.ndarray, name: str) -> Cycle:
         raise ValueError(
             f"a trace must oscillate: no period explains a quarter of the variance of {name} over "
             f"its {duration_s:.4g} s (strongest line: {rough / duration_s:.4g} Hz); crop "
-            f"transients, prepare it with ep2sindy.low_pass, or take another signal{remedy}"
+            f"transients, prepare it with ep2sindy.prepare.low_pass, or take another signal{remedy}"
         )
     return cycle
 

@@ -19,7 +19,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Finding, Recipe
+from ep2sindy.discovery.method import DiscoveryMethod, Finding
 from ep2sindy.figures.identified import (
     COUNTS,
     MERITS,
@@ -44,8 +44,8 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.studies.study import Count, Deferred, Levels, Names
-from ep2sindy.synthetic.draws import DRAWS, check_systems, realization
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.draws import DRAWS, check_systems, realization
+from ep2sindy.systems.systems import System
 
 FIGURE = (
     "Realizations in which all true equations are among the candidates (left), and are the ones "
@@ -73,7 +73,7 @@ TITLES = {
 
 @runtime_checkable
 class Variant(Protocol):
-    """A complete method: trajectories and a library in, supports out; a `Recipe` is one."""
+    """A complete method: trajectories and a library in, supports out; a `Regression` is one."""
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
@@ -231,7 +231,7 @@ def first_realizations(
 
     Others offer supports alone.
     """
-    recipes = [(name, each) for name, each in variants.items() if isinstance(each, Recipe)]
+    recipes = [(name, each) for name, each in variants.items() if isinstance(each, DiscoveryMethod)]
     if not recipes:
         return None
     name, recipe = recipes[-1]

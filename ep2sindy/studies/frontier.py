@@ -21,7 +21,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.benchmark import Variant, built_variants, merits
 from ep2sindy.studies.study import Deferred, Names, Positives
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.systems import System
 
 TITLE = "Lowest sampling rate (Hz) from which on all rates identify the system, by duration"
 FIGURE = (

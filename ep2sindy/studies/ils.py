@@ -14,7 +14,7 @@ import pandas as pd
 
 from ep2sindy.constraints.relations import Constraint, constraint
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.windows import loss_against_window_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.free_run import FreeRun, free_run
@@ -23,8 +23,7 @@ from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.progress import SILENT, Progress, counted
-from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.runtime.progress import Progress, counted
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import (
     COMPARED,
@@ -114,23 +113,23 @@ class Study:
             "ils_constrained": (judged["constrained"].model, tied),
             "living": (lives, own),
         }
-        again = {
-            name: partial(self._refined, model, each, train, held, progress=run.watch)
-            for name, (model, each) in starts.items()
-        }
+        again = {name: self._refinement(*start, train, window) for name, start in starts.items()}
         for name, (_, each) in counted(run.watch, starts.items(), "refinement"):
             watch = watcher(run.board.scalars, name, each)
-            judged[name] = again[name](window, rng=next(streams), watch=watch)
+            refinement = partial(again[name], callback=watch, progress=run.watch)
+            judged[name] = refine_and_judge(refinement, held, rng=next(streams))
         by_window = {
             name: {
-                length: again[name](length, rng=stream)
+                length: refine_and_judge(
+                    partial(again[name], window=length, progress=run.watch), held, rng=stream
+                )
                 for length in counted(run.watch, self.windows, "window length", name)
             }
             for name, stream in zip(("ils", "ils_constrained"), sweep_rng.spawn(2), strict=True)
         }
         draws = {
             name: [
-                free_run(self._refinement(*starts[name], train, window, rng=each).model, held)
+                free_run(again[name](rng=each).model, held)
                 for each in counted(run.watch, stream.spawn(self.n_draws), "draw", name)
             ]
             for name, stream in zip(starts, draws_rng.spawn(3), strict=True)
@@ -141,9 +140,9 @@ class Study:
         self, train: Trajectory, *, rng: np.random.Generator, progress: Progress
     ) -> SparseModel:
         """The model that lives on its own, in the library of degree 2."""
-        recipe = Recipe(self.formulation, bootstraps=Bootstraps(n=0))
+        rows = Regression(self.formulation)
         library = polynomial(train.state_names, degree=2)
-        return self.living.found(train, library, recipe, rng=rng, progress=progress).model
+        return self.living.found(train, library, rows, rng=rng, progress=progress).model
 
     def _check_windows(self, train: Trajectory) -> None:
         """Raise ValueError for windows that the fitted part of the data cannot hold."""
@@ -156,48 +155,15 @@ class Study:
                         f"the data, {train.n_samples} samples: {length} came"
                     )
 
-    def _refined(
-        self,
-        start: SparseModel,
-        constraint: Constraint,
-        train: Trajectory,
-        held: Trajectory,
-        window: int | None,
-        *,
-        rng: np.random.Generator,
-        watch: Callable[[Iteration], None] | None = None,
-        progress: Progress = SILENT,
-    ) -> Judged:
-        begun = process_time()
-        found = self._refinement(
-            start, constraint, train, window, rng=rng, watch=watch, progress=progress
-        )
-        cpu_s = process_time() - begun
-        return judge(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
-
     def _refinement(
-        self,
-        start: SparseModel,
-        constraint: Constraint,
-        train: Trajectory,
-        window: int | None,
-        *,
-        rng: np.random.Generator,
-        watch: Callable[[Iteration], None] | None = None,
-        progress: Progress = SILENT,
-    ) -> Refinement:
+        self, start: SparseModel, relations: Constraint, train: Trajectory, window: int | None
+    ) -> Callable[..., Refinement]:
+        """The refinement of a start, which waits for its rng and whatever else differs."""
+        from ep2sindy.refinement.problem import RefinementSettings
         from ep2sindy.refinement.refine import refine  # PyTorch takes seconds to load
 
-        return refine(
-            start,
-            [train],
-            n_windows=self.n_windows,
-            window=window,
-            constraint=constraint,
-            rng=rng,
-            callback=watch,
-            progress=progress,
-        )
+        settings = RefinementSettings(self.n_windows, window, constraint=relations)
+        return partial(refine, start, [train], settings)
 
     def _outcome(
         self,
@@ -229,6 +195,15 @@ class Study:
             more_sections=[spread_section({LABELS[name]: runs for name, runs in draws.items()})],
             more_figures={"loss_against_window": Captioned(draw, CAPTION)},
         )
+
+
+def refine_and_judge(
+    refinement: Callable[..., Refinement], held: Trajectory, *, rng: np.random.Generator
+) -> Judged:
+    begun = process_time()
+    found = refinement(rng=rng)
+    cpu_s = process_time() - begun
+    return judge(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
 
 
 def window_table(

@@ -14,17 +14,21 @@ import xarray as xr
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, counted
+from ep2sindy.search.bootstraps import Bootstraps
+from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
+from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import first_and_last
 from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
@@ -81,19 +85,19 @@ class LibraryCase:
             function_degree=self.function_degree,
         )
 
-    def recipe(self, recipe: Recipe) -> Recipe:
+    def recipe(self, recipe: AnyMethod) -> AnyMethod:
         """The recipe that all libraries share, with this one's norm where the rule has one."""
-        if self.n_norm is None or not hasattr(recipe.selection, "n_norm"):
+        if self.n_norm is None or not isinstance(recipe.selection, Knee):
             return recipe
-        rule: Any = recipe.selection
-        return replace(recipe, selection=replace(rule, n_norm=self.n_norm))
+        return replace(recipe, selection=replace(recipe.selection, n_norm=self.n_norm))
 
 
 @dataclass(frozen=True)
 class Study:
     """Discover a model with every library, integrate it from the first sample, compare.
 
-    rollout_s: how far to integrate; None, or more than there is, means to the data's end.
+    formulation, bootstraps: of rows, also where the recipe searches trajectories. rollout_s: how
+    far to integrate; None, or more than there is, means to the data's end.
     thesis: by library, published equations: state -> term -> SI coefficient; where the library
     has the terms, and the data can tell them from others, they are fitted as well. living: how
     libraries without inputs are searched for a model that lives; None leaves that out. held_out:
@@ -102,7 +106,9 @@ class Study:
     """
 
     source: Source
-    recipe: Recipe
+    recipe: AnyMethod
+    formulation: Formulation
+    bootstraps: Bootstraps
     libraries: Mapping[str, LibraryCase]
     rollout_s: PositiveOrAll
     figures: PlotRange
@@ -136,14 +142,14 @@ class Study:
             if result.discovery.misfit:
                 run.warn(f"{name}: {result.discovery.misfit}")
         files = [str(field.attrs.get("file", "")) for field in opened]
-        return Outcome(data, results, self.figures, files)
+        return Outcome(data, results, self.figures, self.formulation.smoother, files)
 
     def _result(
         self,
         runs: Sequence[Trajectory],
         name: str,
         library: Library,
-        recipe: Recipe,
+        recipe: AnyMethod,
         length_m: float | None,
         *,
         rng: np.random.Generator,
@@ -159,12 +165,13 @@ class Study:
         data, n_samples = first
         found = discover(list(runs), library, recipe, seed=rng, progress=progress)
         published = self.thesis.get(name, {})
-        refitted = refit(found, published)
+        rows = Regression(self.formulation, bootstraps=self.bootstraps)
+        refitted = refit(found, published, rows, runs, rng)
         lives = roles = None
         if self.living is not None and not found.model.inputs:
             parts = first_and_last(data, self.held_out)
             lives = living_model(
-                *parts, library, recipe, self.living, found.model, rng=rng, progress=progress
+                *parts, library, rows, self.living, found.model, rng=rng, progress=progress
             )
             if self.compared is not None:
                 roles = term_roles(
@@ -226,11 +233,15 @@ def _registered(text: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What every library found in the same data; files: of all records, data being the first."""
+    """What every library found in the same data; files: of all records, data being the first.
+
+    smoother: of the data's derivative.
+    """
 
     data: Trajectory
     results: Mapping[str, LibraryResult]
     shown: PlotRange
+    smoother: Smoother | None
     files: Sequence[str] = ()
 
     @property
@@ -280,8 +291,7 @@ class Outcome:
         return ResultTable(runs, RECORDS)
 
     def figures(self) -> dict[str, Captioned]:
-        formulation = next(iter(self.results.values())).recipe.formulation
-        drawn = run_figures(FIGURES, self.data, self.selected, self.shown, formulation=formulation)
+        drawn = run_figures(FIGURES, self.data, self.selected, self.shown, smoother=self.smoother)
         if self.published:
             drawn["trajectories_thesis"] = trajectories(
                 self.data, self.published, self.shown, THESIS

@@ -11,17 +11,19 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import assemble_model
+from ep2sindy.discovery.choice import LeftOver, NoiseTest
 from ep2sindy.discovery.discover import Discovery
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
 from ep2sindy.model.free_run import FreeRun, free_run
+from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
-from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.search.front import Candidate, ParetoFront, fit_support
 from ep2sindy.selection.rule import selected
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.term_roles import Roles
@@ -57,7 +59,7 @@ class LibraryResult:
     selected model over the records beside the first.
     """
 
-    recipe: Recipe
+    recipe: AnyMethod
     discovery: Discovery
     selected: FreeRun
     given: Mapping[str, Mapping[str, float]]
@@ -75,15 +77,17 @@ class LibraryResult:
     def front_tables(self, name: str) -> dict[str, pd.DataFrame]:
         """The fronts as in the thesis's Tables I-III, and terms that the data cannot tell apart."""
         found = self.discovery
-        metrics = candidate_metrics(self.label)
-        fronts = [
-            ResultTable(candidate_rows(found, state), metrics).csv() for state in found.fronts
-        ]
+        fronts = [self._front_table(front) for front in found.fronts.values()]
         ambiguities = [(a.exact, " ".join(a.terms), a.message) for a in found.ambiguities]
         return {
             f"front_{name}": pd.concat(fronts),
             f"ambiguities_{name}": pd.DataFrame(ambiguities, columns=["exact", "terms", "message"]),
         }
+
+    def _front_table(self, front: ParetoFront) -> pd.DataFrame:
+        table = ResultTable(candidate_rows(front), candidate_metrics(self.label)).csv()
+        without = ["r2_test", "r2_train"] if front.problem is None else []
+        return table.drop(columns=without)  # a search of trajectories has no rows
 
     def sections(self, name: str, data: Trajectory) -> list[Section]:
         found = [_candidates_section(name, self, data.clock)]
@@ -112,12 +116,16 @@ class LibraryResult:
 
 @dataclass(frozen=True, eq=False)
 class CandidateRow:
-    """A candidate of a front; terms: as the model has them, which may be weighted otherwise."""
+    """A candidate of a front.
+
+    terms: as the model has them, which may be weighted otherwise. left: of the noise, by the terms
+    of the model; None where that is not known.
+    """
 
     candidate: Candidate
-    score: float
     is_selected: bool
     terms: Mapping[str, float]
+    left: LeftOver | None = None
 
 
 TRAJECTORY: Metrics[FreeRun] = [
@@ -138,9 +146,11 @@ def candidate_metrics(label: str) -> Metrics[CandidateRow]:
         Metric("n_terms", lambda row: row.candidate.n_terms, View.ALL, "terms", "{}"),
         Metric("r2_test", lambda row: row.candidate.r2_test, View.ALL, "R2 test", "{:.3f}"),
         Metric("r2_train", lambda row: row.candidate.r2_train, View.SHOWN, "R2 train", "{:.3f}"),
-        Metric(label, lambda row: row.score, View.ALL, label, "{:.3f}"),
-        Metric("chi_squared", lambda row: row.candidate.chi_squared, View.JSON),
-        Metric("residual_autocorrelation", lambda row: row.candidate.autocorrelation, View.JSON),
+        Metric(label, lambda row: row.candidate.score, View.ALL, label, "{:.3f}"),
+        Metric("chi_squared", lambda row: row.left and row.left.chi_squared, View.JSON),
+        Metric(
+            "residual_autocorrelation", lambda row: row.left and row.left.autocorrelation, View.JSON
+        ),
         Metric("share", lambda row: row.candidate.share, View.SHOWN, format="{:.2f}"),
         Metric("inclusion", lambda row: _inclusion(row.candidate), View.JSON),
         Metric("selected", lambda row: row.is_selected, View.CSV),
@@ -152,31 +162,45 @@ def _inclusion(chosen: Candidate) -> dict[str, float]:
     return dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True))
 
 
-def candidate_rows(found: Discovery, state: str) -> list[CandidateRow]:
-    front, scores = found.fronts[state], found.scores[state]
-    chosen = selected(front, scores)
-    return [
-        CandidateRow(each, float(score), each is chosen, each.coef_by_term)
-        for each, score in zip(front.candidates, scores, strict=True)
-    ]
+def candidate_rows(front: ParetoFront) -> list[CandidateRow]:
+    chosen = selected(front, front.scores)
+    return [CandidateRow(each, each is chosen, each.coef_by_term) for each in front.candidates]
 
 
 def _chosen(result: LibraryResult, state: str) -> CandidateRow:
     found = result.discovery
-    least = float(found.scores[state].min())
-    return CandidateRow(found.chosen[state], least, True, found.model.terms(state))
+    chosen = selected(found.fronts[state], found.scores[state])
+    return CandidateRow(chosen, True, found.model.terms(state), found.noise_test.left.get(state))
 
 
-def refit(found: Discovery, published: Mapping[str, Mapping[str, float]]) -> dict[str, Candidate]:
+def refit(
+    found: Discovery,
+    published: Mapping[str, Mapping[str, float]],
+    rows: Regression,
+    runs: Sequence[Trajectory],
+    rng: np.random.Generator,
+) -> dict[str, Candidate]:
     """Published terms fitted to our rows, where the data can tell them from others."""
     fits = {}
+    problems = _rows_by_state(found, rows, runs, rng) if published else {}
     for state, terms in published.items():
         if state in found.fronts:
-            problem = found.fronts[state].problem
+            problem = problems[state]
             at_hand = set(compress(problem.term_names, usable_terms(problem)))
             if set(terms) <= at_hand:
                 fits[state] = fit_support(problem, state, list(terms))
     return fits
+
+
+def _rows_by_state(
+    found: Discovery, rows: Regression, runs: Sequence[Trajectory], rng: np.random.Generator
+) -> dict[str, RegressionRows]:
+    """By state the rows that were searched; of a search of trajectories, rows for a fit."""
+    fronts = found.fronts.values()
+    if known := {front.equation: front.problem for front in fronts if front.problem is not None}:
+        return known
+    problems = rows.formulation.assemble(runs, found.model.library, rng=rng)
+    return {state: problem for problem in problems for state in problem.equations}
 
 
 def run_refitted(
@@ -184,9 +208,11 @@ def run_refitted(
 ) -> FreeRun | None:
     if set(refitted) != set(data.state_names):
         return None
-    model = assemble_model(
-        found.model.library,
-        [refitted[state] for state in data.state_names],
+    coef = [refitted[state].coef_by_term for state in data.state_names]
+    model = SparseModel(
+        library=found.model.library,
+        states=data.state_names,
+        coef=coef_matrix(found.model.library, coef),
         units=data.units,
         provenance={**found.model.provenance, "search": "published terms, refitted"},
     )
@@ -210,18 +236,18 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
         )
     for state in found.fronts:
         blocks.append(readable_front(result, state, clock))
-        blocks += [Text(each) for each in left_over(found.chosen[state])]
+        blocks += [Text(each) for each in left_over(state, found.noise_test)]
     blocks.append(Text(column_note(result.label), page_only=True))
     return Section(f"{name}: candidates", [*blocks, Picture(f"front_{name}")])
 
 
-def left_over(chosen: Candidate) -> list[str]:
+def left_over(state: str, test: NoiseTest) -> list[str]:
     """A line on what the selected terms leave of the rows, where their noise is known."""
-    if chosen.chi_squared is None or chosen.autocorrelation is None:
+    if (left := test.left.get(state)) is None:
         return []
     return [
-        f"left over of {chosen.equation}': {chosen.chi_squared:.3g} times the noise, "
-        f"autocorrelation {chosen.autocorrelation:.2f} (1 and 0 where noise alone is left)"
+        f"left over of {state}': {left.chi_squared:.3g} times the noise, "
+        f"autocorrelation {left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
     ]
 
 
@@ -232,9 +258,8 @@ def candidate_text(candidate: Candidate) -> str:
 
 def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
     """Candidates, the selected one bold; below them the last fit, and what was published."""
-    found = result.discovery
-    rows = candidate_rows(found, state)
-    held_out = bool(found.fronts[state].problem.test.any())
+    found, front = result.discovery, result.discovery.fronts[state]
+    rows, held_out = candidate_rows(front), front.held_out
     header, other = ("R2 test", "R2 train") if held_out else ("R2 train", "R2 test")
 
     def equation(terms: Mapping[str, float], lead: str = "", mark: str = "") -> Equation:
@@ -246,8 +271,6 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
 
     metrics = [*candidate_metrics(result.label), Metric("model", marked, View.SCREEN)]
     table = ResultTable(rows, metrics).screen().drop(columns=other)
-    if (table["share"] == "-").all():  # of a search without bootstraps
-        del table["share"]
     more: list[dict[str, Any]] = []
     terms = found.model.terms(state)
     if terms not in [row.terms for row in rows if row.is_selected]:
@@ -258,9 +281,13 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
         more.append({"model": equation(result.given[state], "thesis")})
         fit = equation(here.coef_by_term, "its terms here")
         more.append({"terms": str(here.n_terms), header: r2, "model": fit})
+    table = pd.concat([table, pd.DataFrame(more)], ignore_index=True).fillna("")
+    for column in (header, "share"):  # of a search without rows, or without bootstraps
+        if table[column].isin(["-", ""]).all():
+            del table[column]
     unit = clock.rate_unit(found.model.units[state])
     return Table(
-        pd.concat([table, pd.DataFrame(more)], ignore_index=True).fillna(""),
+        table,
         title=f"candidates for {state}' [{unit}]",
         bold=[k for k, row in enumerate(rows) if row.is_selected],
         italic=range(n_own, len(rows) + len(more)),
@@ -270,7 +297,8 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
 def column_note(label: str) -> str:
     """What the columns of the fronts say."""
     rule = RULES.get(label, f"{label}: the score of the selection, least selected")
-    return f"{rule}. {COLUMNS}"
+    # Candidates that are weighed by trajectories have neither rows nor bootstraps.
+    return f"{rule}." if label == "deviance" else f"{rule}. {COLUMNS}"
 
 
 def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[str, Any]:

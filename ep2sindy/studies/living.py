@@ -15,7 +15,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import Regression
 from ep2sindy.figures import living as figures
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library
@@ -31,6 +31,7 @@ from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.spectrum import samples_in
 from ep2sindy.studies.study import Count
 from ep2sindy.studies.views import (
     coefficients,
@@ -69,19 +70,22 @@ class LivingSearch:
         self,
         train: Trajectory,
         library: Library,
-        recipe: Recipe,
+        rows: Regression,
         *,
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> Discovery:
-        """What it finds in a record, with the recipe's formulation and bootstraps."""
-        own = replace(recipe, search=self.search, depth=self.depth, selection=self.selection)
+        """What it finds in a record, by the formulation and bootstraps of `rows`."""
+        own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         return discover(train, library, own, seed=rng, progress=progress)
 
     @property
     def bounds(self) -> FreeRunBounds:
         """What its rule calls living."""
-        return getattr(self.selection, "bounds", FreeRunBounds())
+        from ep2sindy.selection.free_run import FreeRunScore  # torch, for those alone who search
+
+        rule = self.selection
+        return rule.bounds if isinstance(rule, FreeRunScore) else FreeRunBounds()
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +292,7 @@ def living_model(
     train: Trajectory,
     held: Trajectory,
     library: Library,
-    recipe: Recipe,
+    rows: Regression,
     settings: LivingSearch,
     selected: SparseModel,
     *,
@@ -299,7 +303,7 @@ def living_model(
 
     selected: the model that was selected by derivatives, to be refined for comparison.
     """
-    found = settings.found(train, library, recipe, rng=rng, progress=progress)
+    found = settings.found(train, library, rows, rng=rng, progress=progress)
     with progress.stage(None, "", "free run and limit cycle"):
         start = start_of(held, found.model)
         run = free_run(found.model, held, initial=start, bounds=settings.bounds)
@@ -330,7 +334,7 @@ def two_periods(run: Trajectory) -> int | None:
     cycle = find_cycle(run.t, run.states)
     if cycle is None or cycle.n_periods < 4.0:
         return None
-    return round(2.0 / (cycle.frequency_Hz * run.dt_s)) + 1
+    return samples_in(2.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
 
 
 def _refined(

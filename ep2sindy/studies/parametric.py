@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.constraints.relations import constraint
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.figures.trends import rows_at, trends_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
@@ -29,6 +29,7 @@ from ep2sindy.operating.point_fits import (
 from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
 from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
 from ep2sindy.operating.records import point_label
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Block, Captioned, Equation, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
@@ -131,7 +132,8 @@ class Study:
     """
 
     source: Source
-    recipe: Recipe
+    recipe: AnyMethod
+    formulation: Formulation
     parallel: Workers
     parameters: Mapping[str, str | None]
     points: Sequence[Mapping[str, Any]]
@@ -197,6 +199,7 @@ class Study:
             refining=self.refining,
             searched=self.library.library(),
             recipe=self.recipe,
+            formulation=self.formulation,
         )
 
 
@@ -470,12 +473,11 @@ def supports_table(
 
 def tied_table(joint: JointResult | None) -> pd.DataFrame:
     """What it costs to tie the coefficients of the support for all points: R2 at each of them."""
-    tied = joint.tied.equations if joint and joint.tied else {}
-    rows = [
-        (state, ", ".join(equation.terms), point, r2, equation.r2_tied[point])
-        for state, equation in tied.items()
-        for point, r2 in equation.r2_free.items()
-    ]
+    rows = []
+    if joint and joint.tied:
+        for state, test in joint.tied.tests.items():
+            terms = ", ".join(joint.tied.law.numbers[state])
+            rows += [(state, terms, p, r2, test.r2_tied[p]) for p, r2 in test.r2_free.items()]
     return pd.DataFrame(rows, columns=["state", "terms", "point", "r2_free", "r2_tied"])
 
 
@@ -570,16 +572,9 @@ def joint_summary(joint: JointResult | None) -> dict[str, Any] | None:
     """The support for all points, and its coefficients as polynomials of the parameters."""
     if joint is None:
         return None
-    tied = joint.tied and {
-        state: {
-            term: dict(zip(joint.tied.law.names, row.tolist(), strict=True))
-            for term, row in zip(equation.terms, equation.coef, strict=True)
-        }
-        for state, equation in joint.tied.equations.items()
-    }
     return {
         "terms": {state: list(terms) for state, terms in joint.found.chosen.items()},
-        "tied": tied,
+        "tied": joint.tied and joint.tied.law.numbers,
         "why_not_tied": joint.why_not_tied or None,
     }
 

@@ -17,8 +17,9 @@ import xarray as xr
 
 from ep2sindy.data.fields import SPACE
 from ep2sindy.data.netcdf import write_netcdf
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.recipe import regression_of
 from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
 from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regime_map
 from ep2sindy.library.library import Library, named_terms
@@ -30,8 +31,8 @@ from ep2sindy.runtime.files import fingerprint
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance
 from ep2sindy.studies.simulated import say_simulation
-from ep2sindy.studies.source import FieldSource, say_field
-from ep2sindy.studies.study import A_LIST, Count, Names
+from ep2sindy.studies.source import Step, open_prepared, say_field
+from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
 from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.trust.user_code import own_source
 
@@ -66,8 +67,9 @@ class Study:
     the thruster whose channel is drawn into the maps.
     """
 
-    source: FieldSource
-    recipe: Recipe
+    data: Deferred
+    prepare: Sequence[Step]
+    recipe: AnyMethod
     parallel: Workers
     states: Names
     terms: Annotated[Sequence[str | int], A_LIST]  # 1, the constant, is a number to YAML
@@ -89,11 +91,12 @@ class Study:
         return named_terms(list(used), terms)
 
     def search(self, library: Library, *, seed: int) -> PointSearch:
-        return PointSearch(self.states, library, self.recipe, self.least_variation, seed)
+        method = regression_of(self.recipe)
+        return PointSearch(self.states, library, method, self.least_variation, seed)
 
     def compute(self, run: Run) -> Outcome:
         with run.progress(None, "", "data"):
-            field = self.source.field()
+            field = open_prepared(self.data, self.prepare)
         say_simulation(run, field.attrs)
         say_field(run, field)
         lacking = [name for name in self.variables_if_present if name not in field]

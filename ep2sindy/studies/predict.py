@@ -14,17 +14,25 @@ from scipy.special import ndtri
 
 from ep2sindy.data.scales import zero_to_one
 from ep2sindy.figures.operating import (
+    cycle_line_figure,
+    cycle_map_figure,
     frequency_scale,
     laws_figure,
     left_out_figure,
-    line_figure,
-    map_figure,
 )
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.choice import Branch, How, Searched, Tried, branch_of, grouped
-from ep2sindy.operating.fit import LeftOut, Windows
+from ep2sindy.operating.choice import (
+    Branch,
+    How,
+    Searched,
+    StructureTrial,
+    find_branch,
+    group_by_cycle,
+)
+from ep2sindy.operating.fit import LeaveOneOut, Windows
+from ep2sindy.operating.law import law_basis
 from ep2sindy.operating.map import Fate, MapPoint
 from ep2sindy.operating.records import OperatingRecord, point_label, values_of
 from ep2sindy.report.document import (
@@ -135,13 +143,20 @@ class Study:
 
     def __post_init__(self) -> None:
         self._how(0)
-        given = expanded(self.points, list(self.parameters))
+        given = expand(self.points, list(self.parameters))
         sources = point_sources(self.source, self.parameters, given)
-        _check_enough([source.parameters for source in sources], min(self.degrees))
+        names = list(self.parameters)
+        # What cannot bear a law even if all points oscillate must cost no simulation.
+        law_basis(
+            polynomial(names, degree=min(self.degrees)),
+            np.array([[source.parameters[name] for name in names] for source in sources]),
+            n_spare=1,
+            remedy="give it more values, or leave it out (~parameters.{name})",
+        )
 
     def compute(self, run: Run) -> Outcome:
         how = self._how(run.seed)
-        given = expanded(self.points, list(self.parameters))
+        given = expand(self.points, list(self.parameters))
         sources = point_sources(self.source, self.parameters, given)
         with run.progress(None, "", "kernels, compiled once"):
             compile_kernels([source.source.data for source in sources])
@@ -152,12 +167,12 @@ class Study:
         found: dict[str, Branch] = {}
         reasons: dict[str, str] = {}
         everywhere = [source.parameters for source in sources]
-        groups = grouped(records)
+        groups = group_by_cycle(records)
         for name, members in groups.items():
             cycle = "" if len(groups) == 1 else f" on the {name} cycle"
             run.say(f"fitting a law to {n_points(len(members))}{cycle} ...")
             try:
-                found[name] = branch_of(
+                found[name] = find_branch(
                     name, members, everywhere, how, self.parallel, progress=run.watch
                 )
             except ValueError as error:
@@ -187,9 +202,7 @@ class Study:
         return How(library, structure, searched, self.degrees, windows, self.map_points, seed)
 
 
-def expanded(
-    blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]
-) -> list[dict[str, Any]]:
+def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
     """Every combination of the values in each block; a point that comes again comes once.
 
     That is, with the same data. 300 and 300.0 are one, in whatever order a block names parameters.
@@ -207,23 +220,6 @@ def expanded(
             same = {name: float(v) if type(v) is int else v for name, v in point.items()}
             found.setdefault(str(sorted(same.items(), key=lambda item: item[0])), point)
     return list(found.values())
-
-
-def _check_enough(points: Sequence[Mapping[str, float]], degree: int) -> None:
-    """Raise ValueError for points that bear no law even if all of them oscillate."""
-    for name in points[0]:
-        values = {point[name] for point in points}
-        if len(values) == 1:
-            raise ValueError(
-                f"points must vary in every parameter: {name} is {values.pop():g} at all "
-                f"{len(points)}; give it more values, or leave it out (~parameters.{name})"
-            )
-    functions = polynomial(list(points[0]), degree=degree)
-    if len(points) <= len(functions):
-        raise ValueError(
-            f"a law of degree {degree} has {len(functions)} functions of {list(points[0])} and "
-            f"needs more points than these, since each is left out in turn: {len(points)} came"
-        )
 
 
 def _records(
@@ -298,8 +294,8 @@ class Outcome:
             )
             found[f"laws_{name}"] = Captioned(draw, CAPTIONS["laws"])
             if branch.map:
-                drawn, caption = (map_figure, "map") if len(self.parameters) == 2 else (
-                    line_figure, "line",
+                drawn, caption = (cycle_map_figure, "map") if len(self.parameters) == 2 else (
+                    cycle_line_figure, "line",
                 )  # fmt: skip
                 draw = partial(
                     drawn, self._of("map", name), self._tables["points"], branch.law.points,
@@ -566,7 +562,7 @@ def left_out_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _left_out_row(each: LeftOut, branches: Mapping[str, Branch], own: str) -> dict[str, Any]:
+def _left_out_row(each: LeaveOneOut, branches: Mapping[str, Branch], own: str) -> dict[str, Any]:
     run, record = each.run, each.record
     f_kHz = 1e-3 * record.cycle.frequency_Hz
     label = record.label
@@ -607,7 +603,7 @@ def structures_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _tried_row(each: Tried) -> dict[str, Any]:
+def _tried_row(each: StructureTrial) -> dict[str, Any]:
     f_error = np.array([abs(one.run.f_error) for one in each.found])
     return {
         "terms": "; ".join(f"{s}: {', '.join(t)}" for s, t in each.fit.structure.items()),

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from sklearn.exceptions import ConvergenceWarning
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.recipe import Finding
+from ep2sindy.discovery.method import Finding
 from ep2sindy.library.library import Library, polynomial
 
 Candidates = dict[str, list[tuple[tuple[str, ...], float]]]

@@ -272,10 +272,10 @@ class Outcome:
         drawn = {
             "current": partial(breathing.current_figure, field, window),
             "spectrum": partial(
-                breathing.spectrum_figure, field, f_kHz=self.numbers["f_kHz"], **up_to
+                breathing.current_spectrum_figure, field, f_kHz=self.numbers["f_kHz"], **up_to
             ),
             "profiles": partial(breathing.profile_figure, field),
-            "maps": partial(breathing.map_figure, field, window),
+            "maps": partial(breathing.space_time_figure, field, window),
         }
         radial = AVERAGED if "r" in field.dims else ""
         tails = {"profiles": radial, "maps": radial}

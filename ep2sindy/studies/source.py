@@ -10,12 +10,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
 
-from ep2sindy.data.extent import in_numbers, zone_words
+from ep2sindy.data.extent import Zone, in_numbers, zone_words
 from ep2sindy.data.fields import grid_points
 from ep2sindy.data.gaps import gap_words
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
+from ep2sindy.data.zones import ZoneAverage
 from ep2sindy.library.library import Library
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
@@ -38,48 +39,38 @@ WITHOUT_BREATHING = (  # what a simulation says of itself
 )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class FieldSource:
-    """A field and the steps that prepare it."""
+def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
+    """The one record that the data are, prepared; raises ValueError for several files.
 
-    data: Deferred
-    prepare: Sequence[Step] = ()
+    Raises DivergedError for a simulation that broke before it could be studied.
+    """
+    records = _records(data)
+    if len(records) > 1:
+        raise ValueError(
+            f"this experiment takes one record: data.path names {len(records)} files; give "
+            "one, or take +exp=discover or +exp=breathing, which take several"
+        )
+    return _prepared(records[0], prepare)
 
-    def field(self) -> xr.Dataset:
-        """The one record; raises ValueError for several files.
 
-        Raises DivergedError for a simulation that broke before it could be studied.
-        """
-        records = self._records()
-        if len(records) > 1:
-            raise ValueError(
-                f"this experiment takes one record: data.path names {len(records)} files; give "
-                "one, or take +exp=discover or +exp=breathing, which take several"
-            )
-        return self._prepared(records[0])
+def _records(data: Deferred) -> list[Deferred]:
+    """One for every file that `data.path` names, or the one that the data are."""
+    path = data.settings.get("path")
+    files = [path] if path is None else files_of(path)
+    return [data] if files == [path] else [data.changed({"path": file}) for file in files]
 
-    def fields(self) -> list[xr.Dataset]:
-        """One for every file that `data.path` names, or the one that the data are."""
-        return [self._prepared(record) for record in self._records()]
 
-    def _records(self) -> list[Deferred]:
-        path = self.data.settings.get("path")
-        files = [path] if path is None else files_of(path)
-        if files == [path]:
-            return [self.data]
-        return [self.data.changed({"path": file}) for file in files]
-
-    def _prepared(self, data: Deferred) -> xr.Dataset:
-        """What the data say of themselves stays: a step's arithmetic drops it, and a run that
-        diverged would be silent."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DoubtfulUnit)  # said of the data that are used
-            field: xr.Dataset = data.build()
-        check_recorded(field)
-        said = dict(field.attrs)
-        for step in self.prepare:
-            field = step(field)
-        return field.assign_attrs(said | field.attrs)
+def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
+    """What the data say of themselves stays: a step's arithmetic drops it, and a run that
+    diverged would be silent."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulUnit)  # said of the data that are used
+        field: xr.Dataset = data.build()
+    check_recorded(field)
+    said = dict(field.attrs)
+    for step in prepare:
+        field = step(field)
+    return field.assign_attrs(said | field.attrs)
 
 
 @runtime_checkable
@@ -109,10 +100,12 @@ class Source:
         return list(self.trajectory.states)
 
     def field(self) -> xr.Dataset:
-        return FieldSource(self.data, self.prepare).field()
+        """The one record; see `open_prepared`."""
+        return open_prepared(self.data, self.prepare)
 
     def fields(self) -> list[xr.Dataset]:
-        return FieldSource(self.data, self.prepare).fields()
+        """One for every file that `data.path` names, or the one that the data are."""
+        return [_prepared(record, self.prepare) for record in _records(self.data)]
 
     def inputs(self, libraries: Iterable[Library]) -> list[str]:
         """Variables of the libraries that are neither states nor averages of products."""
@@ -129,9 +122,14 @@ class Source:
         return data
 
 
+def zone_of(source: Source) -> Zone | None:
+    """That the trajectory is averaged over; None for the whole field, and for a point of it."""
+    return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
+
+
 def zone_length_m(source: Source, field: xr.Dataset) -> float | None:
     """Of the zone that the trajectory is averaged over, along z; None for the whole axis."""
-    z: Any = in_numbers(getattr(source.trajectory, "zone", None), field).z
+    z: Any = in_numbers(zone_of(source), field).z
     return None if z is None else float(z[1] - z[0])
 
 

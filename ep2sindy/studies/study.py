@@ -45,8 +45,8 @@ class Outcome(Protocol):
 class Experiment(Protocol):
     """A frozen dataclass whose fields are the keys of the config that it takes.
 
-    A field of type Recipe, Source or FieldSource stands for the groups that it is made of:
-    formulation, search, ...; data, prepare, trajectory. Everything but the data is built before
+    A field of type AnyMethod or Source stands for the groups that it is made of: formulation,
+    search, ...; data, prepare, trajectory. Everything but the data is built before
     `compute` is called, so that a misspelt key costs no simulation.
     """
 

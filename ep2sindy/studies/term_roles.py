@@ -182,7 +182,7 @@ def _run(
 ) -> FreeRun | None:
     """These terms fitted, refined on windows of so many samples, and run; None if they cannot."""
     held_to = constraint(found.model.library, support, relations)
-    problems = list(dict.fromkeys(front.problem for front in found.fronts.values()))
+    problems = list(dict.fromkeys(front.rows for front in found.fronts.values()))
     start = constrained_fit(problems, held_to, units=train.units)
     refined = _refined(start, held_to, train, progress, window=window)
     if refined.status == "non_finite":

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ep2sindy.data.extent import Zone
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.recipe import Recipe
+from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.figures.living import (
     cycle_figure,
@@ -33,12 +34,13 @@ from ep2sindy.model.stability import LimitCycle, share_reaching
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.report.run import Run
+from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
 from ep2sindy.signals.trace import LEAST_PERIODS, Trace, from_one_signal
 from ep2sindy.studies.library_result import CandidateRow, candidate_rows
 from ep2sindy.studies.living import cycle_of, runs_from
-from ep2sindy.studies.source import Source, data_summary
+from ep2sindy.studies.source import Source, data_summary, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
 from ep2sindy.studies.views import (
     coefficients,
@@ -81,7 +83,7 @@ class Study:
     """
 
     source: Source
-    recipe: Recipe
+    recipe: AnyMethod
     signal: str
     offset: float
     embedding: str
@@ -119,8 +121,8 @@ class Study:
             return evaluate(signal, chosen, found, states, held, label=self.recipe.selection.label)
 
     def _sampled(self, run: Run) -> Trajectory:
-        zone = getattr(self.source.trajectory, "zone", None)
-        space = [axis for axis in ("z", "r") if getattr(zone, axis, None) is None]
+        zone = zone_of(self.source) or Zone()
+        space = [axis for axis, bounds in (("z", zone.z), ("r", zone.r)) if bounds is None]
         data = only(self.source.data, self.signal, self.unit, without=space)
         source = replace(self.source, data=data)
         with run.progress(None, "", "data"):
@@ -140,9 +142,13 @@ class Study:
 
     def _found(self, chosen: Chosen, states: Trajectory, run: Run) -> Discovery:
         recipe, rule = self.recipe, self.recipe.selection
-        if hasattr(rule, "judged"):  # what was measured counts, not what is made of it
-            changed: Any = rule
-            recipe = replace(recipe, selection=replace(changed, judged=(self.signal,)))
+        if isinstance(rule, SystemSelection):  # what was measured counts, not what is made of it
+            from ep2sindy.selection.free_run import (
+                FreeRunScore,  # torch, for those alone who refine
+            )
+
+            if isinstance(rule, FreeRunScore):
+                recipe = replace(recipe, selection=replace(rule, judged=(self.signal,)))
         if not chosen.embedded.terms:
             recipe = replace(recipe, depth=min(recipe.depth, DEPTH_OF_BOTH))
         return discover(
@@ -281,7 +287,7 @@ class Outcome:
         }
 
     def _front(self, state: str) -> ResultTable[CandidateRow]:
-        return ResultTable(candidate_rows(self.found, state), CANDIDATES)
+        return ResultTable(candidate_rows(self.found.fronts[state]), CANDIDATES)
 
     def figures(self) -> dict[str, Captioned]:
         held, rollout = self.measured, self.run.rollout
@@ -427,7 +433,7 @@ FREE_RUN: Metrics[Outcome] = [
 CANDIDATES: Metrics[CandidateRow] = [
     Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
     Metric("r2", lambda row: row.candidate.r2_train, View.SHOWN, "R2", "{:.3f}"),
-    Metric("score", lambda row: row.score, View.SHOWN, format="{:.3f}"),
+    Metric("score", lambda row: row.candidate.score, View.SHOWN, format="{:.3f}"),
     Metric("selected", lambda row: row.is_selected),
     Metric("text", lambda row: equation_text(row.candidate.equation, row.terms)),
     Metric("model", lambda row: _marked(row), View.SCREEN),

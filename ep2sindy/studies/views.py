@@ -16,6 +16,7 @@ from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.free_run import FreeRun
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table
+from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.studies.study import PositiveOrAll
 
 if TYPE_CHECKING:
@@ -69,12 +70,12 @@ def run_figures(
     models: Mapping[str, FreeRun],
     shown: PlotRange,
     *,
-    formulation: object = None,
+    smoother: Smoother | None = None,
     since: str = series.SINCE_START,
 ) -> dict[str, Captioned]:
     """Those of CAPTIONS that are named; phase portraits only of two states or more.
 
-    formulation: its smoother takes the data's derivative; without one there are no derivatives.
+    smoother: takes the data's derivative; without one there are no derivatives.
     since: what the times of runs are counted from.
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
@@ -90,7 +91,7 @@ def run_figures(
             series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, verdicts=verdicts
         ),
     }  # fmt: skip
-    if smoother := getattr(formulation, "smoother", None):
+    if smoother is not None:
         sides = {name: integrated.model for name, integrated in models.items()}
         drawn["derivatives"] = partial(
             series.derivative_figure, data, sides, smoother=smoother, duration_s=span

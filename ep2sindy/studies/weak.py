@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import assemble_model, reweighted
+from ep2sindy.discovery.choice import EquationFit, assemble_model, reweight
 from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
@@ -25,7 +25,7 @@ from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, 
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import SILENT, Progress, counted
-from ep2sindy.search.front import Candidate, fit_support
+from ep2sindy.search.front import fit_support
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import Terms, equation_texts, terms_of
 from ep2sindy.studies.source import Source, data_summary
@@ -204,7 +204,7 @@ def fitted_terms(
     setting: Setting,
     *,
     rng: np.random.Generator,
-) -> dict[str, tuple[Candidate, RegressionRows]]:
+) -> dict[str, tuple[EquationFit, RegressionRows]]:
     """Fit given terms, state by state, and keep the rows that they were fitted to.
 
     Raises ValueError as the form's `assemble` and `fit_support` do.
@@ -213,10 +213,9 @@ def fitted_terms(
     found = {}
     for problem in problems:
         for state in problem.equations:
-            candidate = fit_support(problem, state, terms[state])
-            if setting.weighted:
-                candidate = reweighted(problem, candidate)
-            found[state] = (candidate, problem)
+            plain = fit_support(problem, state, terms[state])
+            fit = EquationFit(state, plain.terms, plain.coef)
+            found[state] = (reweight(problem, plain) if setting.weighted else fit, problem)
     return found
 
 
@@ -247,7 +246,7 @@ def fit_settings(
         found = fitted_terms([run], library, terms, setting, rng=stream)
         model = assemble_model(
             library,
-            [candidate for candidate, _ in found.values()],
+            [fit for fit, _ in found.values()],
             units=run.units,
             provenance={"formulation": repr(setting.formulation), "trajectories": run.label},
         )
@@ -275,10 +274,10 @@ def _half_widths(
     }
 
 
-def _r2_own_rows(candidate: Candidate, problem: RegressionRows) -> float:
-    columns = [problem.library.index(name) for name in candidate.terms]
-    prediction = candidate.coef[None] @ problem.theta[:, columns].T
-    truth = problem.target[:, problem.equations.index(candidate.equation)]
+def _r2_own_rows(fit: EquationFit, problem: RegressionRows) -> float:
+    columns = [problem.library.index(name) for name in fit.terms]
+    prediction = fit.coef[None] @ problem.theta[:, columns].T
+    truth = problem.target[:, problem.equations.index(fit.equation)]
     return float(r2(truth=truth, prediction=prediction)[0])
 
 
@@ -309,8 +308,8 @@ class Outcome:
 
     def figures(self) -> dict[str, Captioned]:
         models = {name: fitted.integrated for name, fitted in self.labelled.items()}
-        shown, formulation = self.study.figures, self.study.formulation
-        return run_figures(FIGURES, self.data, models, shown, formulation=formulation)
+        shown, smoother = self.study.figures, self.study.formulation.smoother
+        return run_figures(FIGURES, self.data, models, shown, smoother=smoother)
 
     def sections(self) -> list[Section]:
         published = [

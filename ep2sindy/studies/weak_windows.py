@@ -25,7 +25,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Positive
 from ep2sindy.studies.weak import Setting, check_windows, fitted_terms, settings_of
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.systems import System
 
 FIGURE = (
     "||beta - beta_true|| / ||beta_true|| over all equations against noise: a panel per window "

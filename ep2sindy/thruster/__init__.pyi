@@ -3,14 +3,12 @@ from ep2sindy.thruster.parameters import Thruster as Thruster  # for configs
 from ep2sindy.thruster.parameters import OperatingPoint as OperatingPoint  # for configs
 from ep2sindy.thruster.parameters import OPERATING_POINTS as OPERATING_POINTS
 from ep2sindy.thruster.axial.simulate import simulate as simulate  # for configs
-from ep2sindy.thruster.cache import simulate_cached as simulate_cached  # for configs
 from ep2sindy.thruster.axial.starts import ColdStart as ColdStart  # for configs
 from ep2sindy.thruster.axial.starts import GuessedStart as GuessedStart  # for configs
 from ep2sindy.thruster.axial.starts import Restart as Restart  # for configs
 from ep2sindy.thruster.axial.starts import SoftStart as SoftStart  # for configs
 from ep2sindy.thruster.axial.balance import zone_balance as zone_balance
 from ep2sindy.thruster.plane.simulate import simulate_2d as simulate_2d  # for configs
-from ep2sindy.thruster.plane.cache import simulate_2d_cached as simulate_2d_cached  # for configs
 from ep2sindy.thruster.plane.simulate import THRUSTER_2D as THRUSTER_2D
 from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D as OPERATING_POINT_2D
 from ep2sindy.thruster.propellant_files import propellant as propellant  # for configs
@@ -30,12 +28,10 @@ from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport  
 from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall  # for configs
 from ep2sindy.thruster.walls import SheathWall as SheathWall  # for configs
 from ep2sindy.thruster.walls import wall_material as wall_material  # for configs
-from ep2sindy.thruster.anode import AnodeSheath as AnodeSheath  # for configs
-from ep2sindy.thruster.anode import FixedAnode as FixedAnode  # for configs
+from ep2sindy.thruster.walls import AnodeSheath as AnodeSheath  # for configs
+from ep2sindy.thruster.walls import FixedAnode as FixedAnode  # for configs
 from ep2sindy.thruster.hallthruster_input import HallThrusterInput as HallThrusterInput
 from ep2sindy.thruster.hallthruster_input import read_hallthruster_input as read_hallthruster_input
 from ep2sindy.thruster.hallthruster_run import (
     simulate_hallthruster_input as simulate_hallthruster_input,
 )  # for configs
-from ep2sindy.thruster.landmark import LANDMARK_POINT as LANDMARK_POINT
-from ep2sindy.thruster.landmark import landmark_thruster as landmark_thruster  # for configs

@@ -4,70 +4,34 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
 import xarray as xr
 from tqdm import tqdm
 
 from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.runtime.files import fingerprint, sweep, writing
-from ep2sindy.runtime.progress import Progress
 from ep2sindy.runtime.screen import in_line, on_screen
-from ep2sindy.thruster.axial.model import CFL
-from ep2sindy.thruster.axial.settings import Settings, to_json
-from ep2sindy.thruster.axial.simulate import as_start, simulate_as
-from ep2sindy.thruster.axial.starts import Start
-from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.trust.checksum import verified, with_checksum
 
 
-def simulate_cached(
-    thruster: Thruster,
-    operating_point: OperatingPoint,
-    *,
-    cache: str | Path,
-    duration_s: float = 18e-3,
-    warm_up_s: float = 2e-3,
-    sample_s: float = 1.5e-6,
-    averaged: bool = True,
-    n_cells: int = 100,
-    stretch: float = 2.0,
-    reconstruct: bool = True,
-    cfl: float = CFL,
-    coldest_T_e_eV: float = 0.0,
-    initial: Start | xr.Dataset | str | Path | None = None,
-    progress: Progress | bool = True,
+def read_or_run(
+    cache: str | Path | None, name: str, parameters: dict[str, Any], run: Callable[[], xr.Dataset]
 ) -> xr.Dataset:
-    """Read this simulation from the folder `cache`, or run it once and keep it there.
-
-    Arguments are those of `simulate`. The file name holds a hash of all parameters and of this
-    package's source text, so a changed formula is never answered from an old file. Both ways
-    return the same values. A file that cannot be read is reported, recomputed and replaced.
-    Results appear under their final name only once complete. Raises OSError if the folder cannot
-    be written.
-    """
-    start = as_start(initial)
-    settings = Settings(
-        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,
-        coldest_T_e_eV,
-    )  # fmt: skip
-    parameters = {
-        "thruster": thruster, "operating_point": operating_point, "settings": settings,
-        "initial": start.label,
-    }  # fmt: skip
-    return kept(
-        Path(cache) / f"thruster_{operating_point.label}",
-        to_json(parameters),
-        partial(simulate_as, settings, thruster, operating_point, start, progress=progress),
-    )
+    """What `run` returns, from the folder `cache` where one is named; see `kept`."""
+    return run() if cache is None else kept(Path(cache) / name, to_json(parameters), run)
 
 
 def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
     """What `run` returns, read from the file that is named by a stem and a hash, or run and kept.
 
-    The file says what it was made of and holds a checksum; one that does not fit is run again.
+    The hash is of all parameters and of this package's source text, so a changed formula is never
+    answered from an old file. Both ways return the same values. The file says what it was made of
+    and holds a checksum; one that does not fit, or cannot be read, is reported, recomputed and
+    replaced. Results appear under their final name only once complete.
     Raises OSError if the folder cannot be written, before anything runs.
     """
     key = fingerprint(parameters, sources=Path(__file__).parent)

@@ -12,14 +12,191 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import xarray as xr
+
 from ep2sindy.runtime.files import read_json
-from ep2sindy.thruster.anode import AnodeSheath, FixedAnode
+from ep2sindy.runtime.progress import Progress
+from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.constants import K_BOLTZMANN
-from ep2sindy.thruster.hallthruster_models import conduction_of, field_of, transport_of, wall_of
-from ep2sindy.thruster.hallthruster_nodes import Node
+from ep2sindy.thruster.magnetic_field import MagneticFieldTable, read_magnetic_field
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellant_files import propellant
 from ep2sindy.thruster.propellants import PropellantTable
+from ep2sindy.thruster.transport import (
+    AnomalousTransport,
+    GaussianTransport,
+    MultiLogTransport,
+    Transport,
+)
+from ep2sindy.thruster.walls import (
+    AnodeSheath,
+    ExponentialWall,
+    FixedAnode,
+    SheathWall,
+    Wall,
+    wall_material,
+)
+
+NEEDED: Any = object()
+
+
+class Node:
+    """A mapping and its place in the file. `end()` refuses the keys that nobody took."""
+
+    def __init__(self, values: Any, place: str) -> None:
+        if not isinstance(values, Mapping):
+            raise ValueError(f"{place} must be a mapping: {values!r} came")
+        self.place = place
+        self._left = dict(values)
+
+    def take(self, key: str, default: Any = NEEDED) -> Any:
+        """The value of a key, or the default; raises ValueError if it is needed and not there."""
+        if key in self._left:
+            return self._left.pop(key)
+        if default is NEEDED:
+            raise ValueError(f"{self.place} must have the key {key!r}: it is not there")
+        return default
+
+    def number(self, key: str, default: Any = NEEDED) -> float:
+        """A number."""
+        value = self.take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{self.place}.{key} must be a number: {value!r} came")
+        return float(value)
+
+    def node(self, key: str, default: Any = NEEDED) -> Node:
+        """A mapping below this one."""
+        return Node(self.take(key, default), f"{self.place}.{key}")
+
+    def at_rest(self, values: Mapping[str, Any]) -> None:
+        """Take keys that may be there at one value alone."""
+        for key, value in values.items():
+            if (came := self.take(key, value)) != value:
+                raise ValueError(
+                    f"{self.place}.{key} is not supported here but at {value!r}: {came!r} came"
+                )
+
+    def idle(self, *keys: str) -> None:
+        """Take keys that change nothing here."""
+        for key in keys:
+            self.take(key, None)
+
+    def end(self) -> None:
+        """Raise ValueError for the keys that are left."""
+        if self._left:
+            raise ValueError(f"{self.place} has keys that are not supported: {sorted(self._left)}")
+
+
+MATERIALS = {
+    "BNSiO2": "BN-SiO2",
+    "BoronNitride": "BN",
+    "Alumina": "alumina",
+    "SiliconCarbide": "SiC",
+    "SiliconDioxide": "SiO2",
+}
+
+
+def field_of(node: Node, length: float, folder: Path, scale: float) -> MagneticFieldTable:
+    """The points in the file itself, or those of the file that it names, in m and T."""
+    name, z, B = node.take("file", ""), node.take("z", []), node.take("B", [])
+    node.end()
+    if len(z) and len(B):
+        return MagneticFieldTable(
+            tuple((np.array(z) - length).tolist()), tuple((scale * np.array(B)).tolist())
+        )
+    places = (folder / name, Path.cwd() / name)
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        raise ValueError(
+            f"{node.place}.file must be there: {name!r} is neither in {folder.absolute()} nor in "
+            f"{Path.cwd()}"
+        )
+    return read_magnetic_field(found, exit_m=length, z_unit="m", B_unit="T", scale=scale)
+
+
+def transport_of(node: Node, length: float, transition: float) -> Transport:
+    """Bohm-like models; positions are counted from the anode there, from the exit here."""
+    kind = node.take("type")
+    if kind == "TwoZoneBohm":
+        c = node.take("coeffs", None) or (
+            node.number("c1", 1 / 160),
+            node.number("c2", 1 / 16),
+        )
+        model: Transport = AnomalousTransport(float(c[0]), float(c[1]), transition)
+    elif kind == "Bohm":
+        c_everywhere = node.number("c")
+        model = AnomalousTransport(c_everywhere, c_everywhere, 0.0)
+    elif kind == "GaussianBohm":
+        model = GaussianTransport(
+            c_far=node.number("hall_max"),
+            trough=node.number("hall_min"),
+            center=node.number("center") - length,
+            width=node.number("width"),
+        )
+    elif kind == "MultiLogBohm":
+        z = np.array(node.take("zs"), dtype=float) - length
+        model = MultiLogTransport(tuple(z.tolist()), tuple(map(float, node.take("cs"))))
+    else:
+        raise ValueError(
+            f"{node.place}.type must be TwoZoneBohm, Bohm, GaussianBohm or MultiLogBohm: {kind!r} "
+            "is not supported here"
+        )
+    node.end()
+    return model
+
+
+def wall_of(node: Node, *, transition: float, plume_power: float, ion_losses: bool) -> Wall:
+    """Their one loss_scale acts on electrons and, with ion_wall_losses, on ions."""
+    kind = node.take("type")
+    if kind == "NoWallLosses":
+        node.end()
+        return SheathWall(electron_scale=0.0, ion_scale=0.0)
+    if kind == "ConstantSheathPotential":
+        if ion_losses:
+            raise ValueError("config.ion_wall_losses needs a WallSheath here")
+        wall: Wall = ExponentialWall(
+            (node.number("inner_loss_coeff"), node.number("outer_loss_coeff")),
+            sheath_V=node.number("sheath_potential", 20.0),
+            transition=transition,
+        )
+    elif kind == "WallSheath":
+        material: Any = node.take("material", "BNSiO2")
+        scale = node.number("loss_scale", 1.0)
+        if material not in MATERIALS:
+            raise ValueError(
+                f"{node.place}.material must be one of {list(MATERIALS)}: {material!r} came"
+            )
+        wall = wall_material(
+            MATERIALS[material],
+            electron_scale=scale,
+            ion_scale=scale if ion_losses else 0.0,
+            plume_collisions=0.0,
+            plume_power=plume_power,
+            transition=transition,
+        )
+    else:
+        raise ValueError(
+            f"{node.place}.type must be WallSheath, ConstantSheathPotential or NoWallLosses: "
+            f"{kind!r} is not supported here"
+        )
+    node.end()
+    return wall
+
+
+def conduction_of(node: Node) -> tuple[float, float]:
+    """Factor and weight of Coulomb collisions of `Thruster`, which takes the gradient of T_e.
+
+    Mitchner & Kruger, Partially Ionized Gases (1973), p. 94: 2.4/(1 + nu_ei/(sqrt(2) nu));
+    Braginskii: 4.66 for one charge; both times 1.5, since theirs multiply the gradient of 1.5 T_e.
+    """
+    kind = node.take("type")
+    node.end()
+    known = {"Mitchner": (1.5 * 2.4, 2.0**-0.5), "Braginskii": (1.5 * 4.66, 0.0)}
+    if kind not in known:
+        raise ValueError(f"{node.place}.type must be one of {list(known)}: {kind!r} came")
+    return known[kind]
+
 
 GASES = {"Xenon": "xenon", "Krypton": "krypton", "Argon": "argon"}
 GASES |= {"Xe": "xenon", "Kr": "krypton", "Ar": "argon"}
@@ -259,3 +436,40 @@ def _run(simulation: Node, reconstruct: bool, floor: float) -> RunSettings:
     )
     simulation.end()
     return settings
+
+
+def simulate_hallthruster_input(
+    path: str | Path,
+    *,
+    cache: str | Path | None = None,
+    duration_s: float | None = None,
+    warm_up_s: float = 0.0,
+    sample_s: float | None = None,
+    n_cells: int | None = None,
+    progress: Progress | bool = True,
+) -> xr.Dataset:
+    """Run the thruster of an input file by this package's own simulator, or read the kept run.
+
+    What is None is as the file says: its duration, its frames, its cells.
+    Raises ValueError for what the file asks for and this simulator has not; see
+    `read_hallthruster_input`.
+    """
+    given = read_hallthruster_input(path)
+    if n_cells is None and not given.run.even_grid:
+        raise ValueError(
+            f"{path}: simulation.grid must be an EvenGrid here; n_cells={given.run.n_cells} takes "
+            "one of as many cells"
+        )
+    return simulate(
+        given.thruster,
+        given.operating_point,
+        cache=cache,
+        duration_s=given.run.duration_s if duration_s is None else duration_s,
+        warm_up_s=warm_up_s,
+        sample_s=given.run.sample_s if sample_s is None else sample_s,
+        n_cells=given.run.n_cells if n_cells is None else n_cells,
+        stretch=1.0,  # their EvenGrid
+        reconstruct=given.run.reconstruct,
+        coldest_T_e_eV=given.run.coldest_T_e_eV,
+        progress=progress,
+    )

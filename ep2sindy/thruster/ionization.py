@@ -20,7 +20,7 @@ def ionization_rate(
     """Add R_ion in m^3/s, the ionization rate coefficient of a gas, from T_e_eV.
 
     gas: xenon, by the fits of `ep2sindy.thruster.propellants`; krypton or argon, by the tables of
-    `ep2sindy.propellant`, linear between their rows.
+    `ep2sindy.thruster.propellant`, linear between their rows.
     table: CSV file of T_e in eV (increasing) and rate in m^3/s of any gas, instead, linear between
     its rows; any further columns and lines of text are left out.
     Raises ValueError if the field has R_ion already or no T_e_eV, or if T_e_eV leaves a table,

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ep2sindy.thruster.anode import Anode, FixedAnode
 from ep2sindy.thruster.checks import check_not_negative, check_positive
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
 from ep2sindy.thruster.propellants import Propellant, XenonFits, named
 from ep2sindy.thruster.transport import AnomalousTransport, Transport
-from ep2sindy.thruster.walls import SheathWall, Wall
+from ep2sindy.thruster.walls import Anode, FixedAnode, SheathWall, Wall
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class Thruster:
         if self.charge_states > self.propellant.charge_states:
             raise ValueError(
                 "charge_states 2 needs rates of the second charge, which the propellant "
-                f"{named(self.propellant)} has not; take ep2sindy.propellant(name='xenon')"
+                f"{named(self.propellant)} has not; take ep2sindy.thruster.propellant(name='xenon')"
             )
         if self.propellant.range_eV is None:
             return

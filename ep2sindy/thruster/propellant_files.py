@@ -43,7 +43,7 @@ def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     if name not in MASSES:
         raise ValueError(
             f"there are the propellants {[*sorted(MASSES), 'xenon_5eV']}: {name!r} came; a table "
-            "of your own is read by ep2sindy.read_propellant"
+            "of your own is read by ep2sindy.thruster.read_propellant"
         )
     return _table(
         GASES / f"{name}.csv", name, MASSES[name], ENERGIES[name], coulomb_weight=coulomb_weight

@@ -53,6 +53,17 @@ def diagnose(field: xr.Dataset, *, diverged: bool) -> dict[str, Any]:
     }
 
 
+def outcome(field: xr.Dataset, point: OperatingPoint, *, diverged: bool) -> dict[str, Any]:
+    """What `diagnose` says, and `performance` of the mean thrust, current and voltage."""
+    found = diagnose(field, diverged=diverged)
+    if field.sizes["time"]:
+        mean = {name: float(field[name].mean()) for name in ("I_d", "V_d", "thrust")}
+        found |= performance(
+            point, thrust_N=mean["thrust"], current_A=mean["I_d"], voltage_V=mean["V_d"]
+        )
+    return found
+
+
 def performance(
     point: OperatingPoint, *, thrust_N: float, current_A: float, voltage_V: float
 ) -> dict[str, float]:

@@ -24,7 +24,7 @@ TOY = f"""{HEAD}defaults:
 experiment: discover
 study: libraries
 data: {{path: a.csv}}
-trajectory: {{_target_: ep2sindy.ZoneAverage, states: [x, y]}}
+trajectory: {{_target_: ep2sindy.data.ZoneAverage, states: [x, y]}}
 libraries:
   model: {{variables: [x, y], degree: 1, products: [], functions: [], function_degree: 1}}
 rollout_s: null
@@ -58,14 +58,14 @@ def _called() -> dict[str, Case]:
         "of a name put together": "prepare: [{_target_: '${a}.${b}'}]\na: os\nb: abort",
         "in the data": f"data: {EVIL}",
         "in an unused key": f"nobody_reads: {EVIL}",
-        "by _args_": f"prepare: [{{_target_: ep2sindy.crop, _args_: ['{RUNS}']}}]",
-        "by _partial_": "prepare: [{_target_: ep2sindy.crop, _partial_: true}]",
-        "by _convert_": "prepare: [{_target_: ep2sindy.crop, _convert_: all}]",
+        "by _args_": f"prepare: [{{_target_: ep2sindy.prepare.crop, _args_: ['{RUNS}']}}]",
+        "by _partial_": "prepare: [{_target_: ep2sindy.prepare.crop, _partial_: true}]",
+        "by _convert_": "prepare: [{_target_: ep2sindy.prepare.crop, _convert_: all}]",
         "of Hydra": "prepare: [{_target_: hydra.utils.instantiate, a: {_target_: os.abort}}]",
         "of an inner module": "prepare: [{_target_: ep2sindy.runtime.files.write_text}]",
         "of a writer": "prepare: [{_target_: ep2sindy.write_field, path: x.nc}]",
         "of a method": "prepare: [{_target_: ep2sindy.SparseModel.load, path: a.csv}]",
-        "of an attribute": "prepare: [{_target_: ep2sindy.crop.__globals__}]",
+        "of an attribute": "prepare: [{_target_: ep2sindy.prepare.crop.__globals__}]",
         "of a mapping": "prepare: [{_target_: {_target_: os.abort}}]",
         "of NUL": 'prepare: [{_target_: "os\\0.abort"}]',
     }
@@ -88,7 +88,7 @@ def _called() -> dict[str, Case]:
         "an attribute": "x.values",
         "a lambda": "(lambda: 1)()",
     }.items():
-        step = f'{{_target_: ep2sindy.derive, name: n, units: m, expression: "{text}"}}'
+        step = f'{{_target_: ep2sindy.prepare.derive, name: n, units: m, expression: "{text}"}}'
         found[f"expression with {what}"] = config(f"prepare: [{step}]", "")
     found["term with a call"] = config(
         f'libraries: {{model: {{products: ["{RUNS}"]}}}}', "a term is"
@@ -151,7 +151,7 @@ def _said_to_hydra() -> dict[str, Case]:
 
 def _written() -> dict[str, Case]:
     """Where a run would write."""
-    away, data = "../elsewhere", "data: {_target_: ep2sindy.simulate_cached, cache: ../elsewhere}"
+    away, data = "../elsewhere", "data: {_target_: ep2sindy.thruster.simulate, cache: ../elsewhere}"
     places = {
         "output": (f"output: {away}", "output"),
         "output by a resolver": ("output: ${oc.env:HOME}", "output"),
@@ -172,9 +172,12 @@ def _written() -> dict[str, Case]:
         "experiment as markup": ("experiment: <b>x</b>", "experiment"),
         "a library as a path": ("libraries: {../../x: {variables: [x], degree: 1}}", "libraries"),
         "a library as markup": ("libraries: {'<b>': {variables: [x], degree: 1}}", "libraries"),
-        "a server": ("parallel: {_target_: ep2sindy.Dask, address: 'tcp://h:1'}", "address"),
+        "a server": (
+            "parallel: {_target_: ep2sindy.parallel.Dask, address: 'tcp://h:1'}", "address"
+        ),
         "a server by oc.create": (
-            "parallel: '${oc.create:\"{_target_: ep2sindy.Dask, address: tcp://h.invalid:1}\"}'",
+            "parallel: '${oc.create:\"{_target_: ep2sindy.parallel.Dask, "
+            "address: tcp://h.invalid:1}\"}'",
             "address",
         ),
     }  # fmt: skip
@@ -246,12 +249,13 @@ def _read() -> dict[str, Case]:
     targets = {
         "a magnetic field": (
             "thruster.magnetic_field",
-            "{_target_: ep2sindy.read_magnetic_field, path: %s, exit_m: 0.025}",
+            "{_target_: ep2sindy.thruster.read_magnetic_field, path: %s, exit_m: 0.025}",
         ),
         "a run to go on from": ("initial", "%s"),
         "a propellant": (
             "thruster.propellant",
-            f"{{_target_: ep2sindy.read_propellant, path: %s, {gas}, second_ionization_eV: 21}}",
+            "{_target_: ep2sindy.thruster.read_propellant, path: %s, "
+            f"{gas}, second_ionization_eV: 21}}",
         ),
     }
     kinds = (("pipe.csv", piped), ("/dev/zero", None), ("a.csv", None), ("junk", _junk))
@@ -288,7 +292,8 @@ def _large() -> dict[str, Case]:
     }
     found = {
         f"large: {name}": config(
-            f'prepare: [{{_target_: ep2sindy.derive, name: n, units: "1", expression: "{text}"}}]',
+            'prepare: [{_target_: ep2sindy.prepare.derive, name: n, units: "1", '
+            f'expression: "{text}"}}]',
             "expression", may_pass=name in ("a tower", "a long sum", "a power of powers"),
         )
         for name, text in expressions.items()

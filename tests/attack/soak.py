@@ -32,15 +32,17 @@ def discover() -> None:
 
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     ep.discover(run)
-    ep.discover(run, recipe=ep.Recipe(ep.WeightedWeak(), ep.BestSubset(), ep.Bootstraps(n=2)))
+    ep.discover(
+        run, method=ep.Regression(ep.WeightedWeak(), ep.BestSubset(), bootstraps=ep.Bootstraps(n=2))
+    )
 
 
 def simulate() -> None:
     import ep2sindy as ep
 
-    ep.simulate(
-        ep.Thruster(), ep.OperatingPoint(300.0, 5.0), duration_s=2e-4, warm_up_s=0.0,
-        sample_s=1e-6, n_cells=30, progress=False,
+    ep.thruster.simulate(
+        ep.thruster.Thruster(), ep.thruster.OperatingPoint(300.0, 5.0), duration_s=2e-4,
+        warm_up_s=0.0, sample_s=1e-6, n_cells=30, progress=False,
     )  # fmt: skip
 
 
@@ -80,7 +82,7 @@ def program() -> None:
     """A whole run with its folder, figures, page and TensorBoard, pieces in two workers."""
     import ep2sindy as ep
     from ep2sindy.app.runner import run_config
-    from ep2sindy.synthetic.regions import three_regions
+    from ep2sindy.systems.regions import three_regions
     from tests.attack.runs import RUNS
     from tests.programs import composed
 

@@ -13,7 +13,13 @@ from torch import nn
 from torchdiffeq import odeint
 
 from ep2sindy.refinement.ode import ODE, Drive, RungeKutta
-from ep2sindy.refinement.problem import Fit, Iteration, Problem, joined, residual_weights, single
+from ep2sindy.refinement.problem import (
+    Iteration,
+    RefinementFit,
+    RefinementProblem,
+    join,
+    residual_weights,
+)
 
 Optimizer = Callable[[list[nn.Parameter]], torch.optim.Optimizer]
 
@@ -34,14 +40,14 @@ class GradientDescent:
     patience: int = 10
     n_substeps: int = 1
 
-    def fit(self, problem: Problem) -> Fit:
-        return joined([self._fit_point(single(problem, p), p) for p in range(len(problem.odes))])
+    def fit(self, problem: RefinementProblem) -> RefinementFit:
+        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
 
-    def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> None:
+    def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
         """Set `n_substeps` instead."""
         return
 
-    def _fit_point(self, problem: Problem, point: int) -> Fit:
+    def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
         ode, data = problem.odes[0], torch.tensor(problem.data[0], device=problem.device)
         start = nn.Parameter(data[:, 0].clone(), requires_grad=problem.free_start)
         weights, used = np.ones((1, data.shape[-1])), np.ones((1, data.shape[-1]))
@@ -62,7 +68,7 @@ class GradientDescent:
                 break
             weights = residual_weights(path[None].cpu().numpy(), problem.data)
         scaling = ode.scaling.detach().cpu().numpy()[None].copy()
-        return Fit(
+        return RefinementFit(
             scaling=scaling,
             nodes=path[None].cpu().numpy(),
             weights=used,

@@ -9,7 +9,13 @@ import torch
 
 from ep2sindy.refinement.kernels import condense, propagate, starts
 from ep2sindy.refinement.ode import ONE_RUNGE_KUTTA, Drive, Step
-from ep2sindy.refinement.problem import Fit, Iteration, Problem, residual_weights
+from ep2sindy.refinement.problem import (
+    Iteration,
+    LawMap,
+    RefinementFit,
+    RefinementProblem,
+    residual_weights,
+)
 
 # A direction of the scalings counts as absent below this share of the strongest.
 RANK = 1e-12
@@ -23,6 +29,9 @@ class MultipleShooting:
     for the scalings with each block's start eliminated by QR. A stage cuts the windows into
     blocks with starts of their own: `first_block` samples, then `growth` times as many, up to
     the whole window. A stage that fails leaves the scalings as they were.
+    Points have step lengths of their own and leave once they have converged. Points that a law
+    ties move together: a step is as long as the point that bears least lets it be, and all have
+    converged, or failed, when every one has, or any one.
     limit: largest change of a scaling per iteration, relative to it or to one.
     Converged: the relative change of every scaling is below `tolerance`, the defects too.
     Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7.
@@ -35,27 +44,30 @@ class MultipleShooting:
     max_iter: int = 50
     limit: float = 0.5
 
-    def fit(self, problem: Problem) -> Fit:
-        n_points = len(problem.data)
-        state = Fit(
-            scaling=np.ones((n_points, problem.n_free)),
+    def fit(self, problem: RefinementProblem) -> RefinementFit:
+        n_points, law = len(problem.data), problem.law
+        state = RefinementFit(
+            scaling=np.ones((n_points, problem.n_free)) if law is None else law.scaling(law.start),
             nodes=problem.data.copy(),
             weights=np.ones((n_points, problem.data.shape[-1])),
             finished=np.zeros(n_points, dtype=np.bool_),
             finite=np.ones(n_points, dtype=np.bool_),
             step=self.step,
+            theta=None if law is None else law.start,
         )
         window = problem.data.shape[2]
         for block in self.blocks(window):
             tried = self._stage(problem, state, block, tolerance=0.3, max_iter=10)
-            state = _kept(state, tried, problem.data)
+            state = _keep_finite(state, tried, problem.data)
         for _ in range(problem.n_reweights):
             tried = self._stage(problem, state, window, tolerance=1e-2, max_iter=self.max_iter)
-            state = _kept(state, tried, problem.data)
+            state = _keep_finite(state, tried, problem.data)
             state = replace(state, weights=residual_weights(state.nodes, problem.data))
         return self._stage(problem, state, window, tolerance=self.tolerance, max_iter=self.max_iter)
 
-    def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> Fit | None:
+    def finer(
+        self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray
+    ) -> RefinementFit | None:
         """Some points of a fit again from where they are, with half the time step."""
         step = fit.step.halved()
         if step is None:
@@ -80,66 +92,107 @@ class MultipleShooting:
         return blocks
 
     def _stage(
-        self, problem: Problem, state: Fit, block: int, *, tolerance: float, max_iter: int
-    ) -> Fit:
+        self,
+        problem: RefinementProblem,
+        state: RefinementFit,
+        block: int,
+        *,
+        tolerance: float,
+        max_iter: int,
+    ) -> RefinementFit:
         """Iterate at one block size; points leave once they have converged or failed."""
-        scaling, nodes = state.scaling.copy(), state.nodes.copy()
-        finished, finite = state.finished.copy(), state.finite.copy()
         for _ in range(max_iter):
-            active = np.flatnonzero(~finished & finite)
+            active = np.flatnonzero(~state.finished & state.finite)
             if not active.size:
                 break
-            maps = step_maps(problem, state.step, scaling, nodes, active)
-            change, moved = newton_step(
-                maps,
-                nodes[active],
-                problem.data[active],
-                state.weights[active],
-                block,
-                free_start=problem.free_start,
-            )
-            sound = np.isfinite(change).all(axis=1) & np.isfinite(moved).all(axis=(1, 2, 3))
-            if not sound.all():
-                finite[active[~sound]] = False
-                active, maps = active[sound], maps[sound]
-                change, moved = change[sound], moved[sound]
-                if not active.size:
-                    break
-            defect = largest_defect(maps, nodes[active], block)
-            share = step_share(
-                change, moved, scaling[active], problem.data[active], limit=self.limit
-            )
+            state = self._iterate(problem, state, active, block, tolerance)
+        return state
+
+    def _iterate(
+        self,
+        problem: RefinementProblem,
+        state: RefinementFit,
+        active: np.ndarray,
+        block: int,
+        tolerance: float,
+    ) -> RefinementFit:
+        """One Gauss-Newton step of the active points; those that fail stay where they are."""
+        theta, scaling, nodes = state.theta, state.scaling.copy(), state.nodes.copy()
+        finished, finite = state.finished.copy(), state.finite.copy()
+        maps = step_maps(problem, state.step, scaling, nodes, active)
+        unknowns, change, moved = newton_step(problem, state, maps, active, block)
+        sound = np.isfinite(change).all(axis=1) & np.isfinite(moved).all(axis=(1, 2, 3))
+        sound = problem.agree(sound, np.all)
+        if not sound.all():
+            finite[active[~sound]] = False
+            active, maps = active[sound], maps[sound]
+            change, moved = change[sound], moved[sound]
+            if not active.size:
+                return replace(state, finite=finite)
+        defect = largest_defect(maps, nodes[active], block)
+        share = step_share(change, moved, scaling[active], problem.data[active], limit=self.limit)
+        share = problem.agree(share, np.min)
+        if problem.law is None:
             scaling[active] += share[:, None] * change
-            nodes[active] += share[:, None, None, None] * moved
-            size = np.maximum(np.abs(scaling[active]), 1e-3)
-            relative = np.abs(change / size).max(axis=1, initial=0.0)
-            finished[active] = (share == 1.0) & (relative < tolerance) & (defect < tolerance)
-            for i, point in enumerate(active):
-                problem.observe(
-                    Iteration(
-                        point=int(point),
-                        block=block,
-                        loss=float(np.square(nodes[point] - problem.data[point]).mean()),
-                        scaling=scaling[point, : len(problem.odes[point].free0)].copy(),
-                        step=float(relative[i]),
-                        defect=float(defect[i]),
-                    )
-                )
-        return replace(state, scaling=scaling, nodes=nodes, finished=finished, finite=finite)
+        else:
+            theta = theta + share[0] * unknowns
+            scaling = problem.law.scaling(theta)
+        nodes[active] += share[:, None, None, None] * moved
+        size = np.maximum(np.abs(scaling[active]), 1e-3)
+        relative = np.abs(change / size).max(axis=1, initial=0.0)
+        done = (share == 1.0) & (relative < tolerance) & (defect < tolerance)
+        finished[active] = problem.agree(done, np.all)
+        tell(problem, block, scaling, nodes, active, relative=relative, defect=defect)
+        return replace(
+            state, theta=theta, scaling=scaling, nodes=nodes, finished=finished, finite=finite
+        )
 
 
-def _kept(before: Fit, after: Fit, data: np.ndarray) -> Fit:
+def _keep_finite(before: RefinementFit, after: RefinementFit, data: np.ndarray) -> RefinementFit:
     """What a stage gave where it stayed finite; elsewhere the scalings it began with."""
     lost = ~after.finite
     scaling, nodes = after.scaling.copy(), after.nodes.copy()
     scaling[lost], nodes[lost] = before.scaling[lost], data[lost]
     return replace(
-        after, scaling=scaling, nodes=nodes, finite=before.finite, finished=before.finished
+        after,
+        theta=before.theta if lost.any() else after.theta,
+        scaling=scaling,
+        nodes=nodes,
+        finite=before.finite,
+        finished=before.finished,
     )
 
 
+def tell(
+    problem: RefinementProblem,
+    block: int,
+    scaling: np.ndarray,
+    nodes: np.ndarray,
+    points: np.ndarray,
+    *,
+    relative: np.ndarray,
+    defect: np.ndarray,
+) -> None:
+    """Let whoever watches know of an iteration, point by point."""
+    for i, point in enumerate(points):
+        problem.observe(
+            Iteration(
+                point=int(point),
+                block=block,
+                loss=float(np.square(nodes[point] - problem.data[point]).mean()),
+                scaling=scaling[point, : len(problem.odes[point].free0)].copy(),
+                step=float(relative[i]),
+                defect=float(defect[i]),
+            )
+        )
+
+
 def step_maps(
-    problem: Problem, step: Step, scaling: np.ndarray, nodes: np.ndarray, points: np.ndarray
+    problem: RefinementProblem,
+    step: Step,
+    scaling: np.ndarray,
+    nodes: np.ndarray,
+    points: np.ndarray,
 ) -> np.ndarray:
     """The one-step maps of some points."""
     system, drive = problem.system, problem.one_step
@@ -151,32 +204,43 @@ def step_maps(
 
 
 def newton_step(
+    problem: RefinementProblem,
+    state: RefinementFit,
     maps: np.ndarray,
-    nodes: np.ndarray,
-    data: np.ndarray,
-    weights: np.ndarray,
+    active: np.ndarray,
     block: int,
-    *,
-    free_start: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Change of the scalings (points, free) and of the nodes, by linear least squares.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Change of the unknowns, of the scalings (points, free) and of the nodes, by least squares.
 
+    The unknowns are theta where a law ties the points, else the scalings.
     NaN at points whose tangents overflow.
     """
-    n = nodes.shape[-1]
-    n_start = n if free_start else 0
-    condensed = condense(maps, nodes, data, weights, block, n_start)
-    change = least_change(condensed[..., n_start:, n_start:])
-    if free_start:
-        first = starts(condensed, change, n)
+    nodes, data, n_start = state.nodes[active], problem.data[active], problem.n_start
+    condensed = condense(maps, nodes, data, state.weights[active], block, n_start)
+    unknowns = least_change(condensed[..., n_start:, n_start:], problem.law)
+    change = unknowns if problem.law is None else problem.law.scaling(unknowns)
+    if problem.free_start:
+        first = starts(condensed, change, n_start)
     else:
         first = data[:, :, ::block] - nodes[:, :, ::block]
-    return change, propagate(maps, nodes, np.ascontiguousarray(first), change, block)
+    return unknowns, change, propagate(maps, nodes, np.ascontiguousarray(first), change, block)
 
 
-def least_change(triangles: np.ndarray) -> np.ndarray:
-    """Scalings that minimise the condensed residuals of all blocks, (points, free), or NaN."""
-    return least_squares(triangles[..., :-1, :].reshape(len(triangles), -1, triangles.shape[-1]))
+def least_change(triangles: np.ndarray, law: LawMap | None = None) -> np.ndarray:
+    """Unknowns that minimise the condensed residuals of all blocks, or NaN.
+
+    triangles: (points, windows, blocks, size, size), by scaling. Without a law the unknowns are
+    the scalings, (points, free), each point by itself. With one they are theta, of all points:
+    H = sum_p spread_p^T R_p^T R_p spread_p, by QR of each R_p and then of all.
+    """
+    size = triangles.shape[-1]
+    rows = triangles[..., :-1, :].reshape(len(triangles), -1, size)
+    if law is None:
+        return least_squares(rows)
+    if not np.isfinite(rows).all():
+        return np.full(law.n_theta, np.nan)
+    joined: np.ndarray = np.linalg.qr(rows, mode="r")  # type: ignore[assignment]
+    return least_squares(law.rows(joined[:, None]).reshape(1, -1, law.n_theta + 1))[0]
 
 
 def least_squares(rows: np.ndarray) -> np.ndarray:

@@ -9,7 +9,13 @@ import numpy as np
 from scipy.integrate import odeint as lsoda
 from scipy.optimize import minimize
 
-from ep2sindy.refinement.problem import Fit, Iteration, Problem, joined, residual_weights, single
+from ep2sindy.refinement.problem import (
+    Iteration,
+    RefinementFit,
+    RefinementProblem,
+    join,
+    residual_weights,
+)
 
 CUBIC = np.arange(3, -1, -1)  # powers, as a window batch stores them
 
@@ -25,19 +31,19 @@ class NelderMead:
     tolerance: float = 1e-6
     max_iter: int = 2000
 
-    def fit(self, problem: Problem) -> Fit:
+    def fit(self, problem: RefinementProblem) -> RefinementFit:
         if problem.free_start:
             raise ValueError(
                 "NelderMead cannot fit initial states: pass free_start=False, or use "
                 "MultipleShooting"
             )
-        return joined([self._fit_point(single(problem, p), p) for p in range(len(problem.odes))])
+        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
 
-    def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> None:
+    def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
         """odeint chooses its own steps."""
         return
 
-    def _fit_point(self, problem: Problem, point: int) -> Fit:
+    def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
         data, n_free = problem.data[0], problem.n_free
         weights, used = np.ones((1, data.shape[-1])), np.ones((1, data.shape[-1]))
         scaling, finished = np.ones(n_free), False
@@ -57,7 +63,7 @@ class NelderMead:
             scaling, finished = found.x, bool(found.success)
             path = window_paths(problem, scaling)
             weights = residual_weights(path[None], problem.data)
-        return Fit(
+        return RefinementFit(
             scaling=scaling[None],
             nodes=path[None],
             weights=used,
@@ -66,7 +72,7 @@ class NelderMead:
         )
 
 
-def window_paths(problem: Problem, scaling: np.ndarray) -> np.ndarray:
+def window_paths(problem: RefinementProblem, scaling: np.ndarray) -> np.ndarray:
     """Trajectories by scipy's odeint, window after window, from the data: NaN where it fails."""
     ode, batch = problem.odes[0], problem.batches[0]
     basis, offset = (part.detach().cpu().numpy() for part in ode.linear_parts())
@@ -92,12 +98,12 @@ def window_paths(problem: Problem, scaling: np.ndarray) -> np.ndarray:
     return path
 
 
-def _weighted_loss(problem: Problem, weights: np.ndarray, scaling: np.ndarray) -> float:
+def _weighted_loss(problem: RefinementProblem, weights: np.ndarray, scaling: np.ndarray) -> float:
     loss = np.square(weights * (window_paths(problem, scaling) - problem.data[0])).mean()
     return float(loss) if np.isfinite(loss) else np.inf
 
 
-def _observe(problem: Problem, point: int, scaling: np.ndarray) -> None:
+def _observe(problem: RefinementProblem, point: int, scaling: np.ndarray) -> None:
     loss = _weighted_loss(problem, np.ones(problem.data.shape[-1]), scaling)
     window = problem.data.shape[2]
     problem.observe(Iteration(point, window, loss, scaling.copy(), 0.0, 0.0))

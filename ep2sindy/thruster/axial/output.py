@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.state_kernels import Model
 from ep2sindy.thruster.constants import E_CHARGE
+from ep2sindy.thruster.recording import as_dataset, notes
 
 FIELDS = {  # variable -> place among the cell sums, unit, long name
     "n_i": (recorded.N_I, "m^-3", "ion density"),
@@ -89,7 +90,7 @@ def series_of(
     }
 
 
-def as_dataset(
+def labelled(
     fields: Mapping[str, tuple[Float[np.ndarray, "samples cells"], str, str]],
     series: Mapping[str, Float[np.ndarray, " samples"]],
     end: Mapping[str, tuple[Float[np.ndarray, " cells"], str]],
@@ -100,25 +101,14 @@ def as_dataset(
     """Label the recorded arrays with dimensions, units and names."""
     data: dict[str, Any] = {}
     for name, (values, unit, text) in fields.items():
-        notes = {"units": unit, "long_name": text}
+        data[name] = (("time", "z"), values, notes(unit, text))
         if name in PRODUCTS and (name != "ionization" or "n_i2" not in fields):
-            notes["average_of"] = PRODUCTS[name]
-        data[name] = (("time", "z"), values, notes)
+            data[name][-1]["average_of"] = PRODUCTS[name]
     for name, column in series.items():
-        unit, text = SERIES[name]
-        data[name] = (("time",), column, {"units": unit, "long_name": text})
+        data[name] = (("time",), column, notes(*SERIES[name]))
     for name, (profile, unit) in end.items():
-        data[name] = (("z",), profile, {"units": unit, "long_name": "at the end, for a restart"})
-    data["dz"] = (("z",), np.diff(faces), {"units": "m", "long_name": "length of the cell"})
+        data[name] = (("z",), profile, notes(unit, "at the end, for a restart"))
+    data["dz"] = (("z",), np.diff(faces), notes("m", "length of the cell"))
     n_samples = len(next(iter(series.values())))
-    notes = {"units": "s", "long_name": "time after the warm-up"}
-    coords = {
-        # "s" is a unit here, not a calendar: decode with decode_times=False
-        "time": ("time", sample_s * np.arange(n_samples), notes),
-        "z": (
-            "z",
-            0.5 * (faces[1:] + faces[:-1]),
-            {"units": "m", "long_name": "axial distance from the anode"},
-        ),
-    }
-    return xr.Dataset(data, coords=coords)
+    centres = 0.5 * (faces[1:] + faces[:-1])
+    return as_dataset(data, sample_s=sample_s, n_samples=n_samples, z=centres)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,11 @@ from jaxtyping import Float
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial import kernels
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
-from ep2sindy.thruster.axial.grid import cell_faces
-from ep2sindy.thruster.axial.model import CFL, build_model, lengths_and_centres
+from ep2sindy.thruster.axial.model import CFL, build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.output import (
     POWERS,
-    as_dataset,
     field_columns,
+    labelled,
     series_of,
 )
 from ep2sindy.thruster.axial.settings import Settings, to_json
@@ -38,11 +38,11 @@ from ep2sindy.thruster.axial.state_kernels import (
     Model,
     State,
 )
+from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import uncovered
-from ep2sindy.thruster.verdict import diagnose, performance
-
-CHUNK_ROWS = 50  # samples between two words on the progress
+from ep2sindy.thruster.recording import CHUNK_ROWS, March, record_samples, warm_up
+from ep2sindy.thruster.verdict import outcome
 
 
 def simulate(
@@ -59,6 +59,7 @@ def simulate(
     cfl: float = CFL,
     coldest_T_e_eV: float = 0.0,
     initial: Start | xr.Dataset | str | Path | None = None,
+    cache: str | Path | None = None,
     progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point and record it at equal steps after a warm-up.
@@ -69,7 +70,9 @@ def simulate(
     reconstruct: van Leer's slopes, or first-order fluxes. coldest_T_e_eV: T_e is held above it,
     as HallThruster.jl does at 1.5 eV; the energy balance then misses what that adds. initial:
     `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of another run: its Dataset or
-    NetCDF file.
+    NetCDF file. cache: a folder that this simulation is read from, or run once and kept in. The
+    name of its file holds a hash of all parameters and of this package's source text, so a
+    changed formula is never answered from an old file; both ways return the same values.
 
     Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
     (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the
@@ -77,19 +80,27 @@ def simulate(
     see `judge_status`), `cycle`, `f_kHz`, mean and standard deviation of I_d, thrust, specific
     impulse and efficiency, and `mass_balance` and `energy_balance` (out plus stored over in).
     A diverged run ends at its last finite sample and says so; it is not an error.
-    Raises ValueError for settings that cannot be run.
+    Raises ValueError for settings that cannot be run, OSError for a cache that cannot be written.
 
-    >>> field = ep.simulate(
-    ...     ep.Thruster(), ep.OPERATING_POINTS[3], duration_s=5e-5, warm_up_s=0.0, progress=False
+    >>> point = ep.thruster.OPERATING_POINTS[3]
+    >>> field = ep.thruster.simulate(
+    ...     ep.thruster.Thruster(), point, duration_s=5e-5, warm_up_s=0.0, progress=False
     ... )
     >>> field["n_i"].dims
     ('time', 'z')
     """
     settings = Settings(
-        duration_s, warm_up_s, sample_s, averaged, n_cells, stretch, reconstruct, cfl,
-        coldest_T_e_eV,
+        duration_s, warm_up_s, sample_s, averaged,
+        n_cells, stretch, reconstruct, cfl, coldest_T_e_eV,
     )  # fmt: skip
-    return simulate_as(settings, thruster, operating_point, as_start(initial), progress=progress)
+    start = as_start(initial)
+    simulation = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
+    parameters = _parameters(settings, thruster, operating_point) | {"initial": start.label}
+    return read_or_run(cache, f"thruster_{operating_point.label}", parameters, simulation)
+
+
+def _parameters(settings: Settings, thruster: Thruster, point: OperatingPoint) -> dict[str, Any]:
+    return {"thruster": thruster, "operating_point": point, "settings": settings}
 
 
 def simulate_as(
@@ -101,7 +112,7 @@ def simulate_as(
     progress: Progress | bool,
 ) -> xr.Dataset:
     """`simulate`, with its settings as one value."""
-    parameters = to_json({"thruster": thruster, "operating_point": point, "settings": settings})
+    parameters = to_json(_parameters(settings, thruster, point))
     faces = cell_faces(thruster, settings.n_cells, settings.stretch)
     model = build_model(
         thruster, point, faces, cfl=settings.cfl, reconstruct=settings.reconstruct,
@@ -152,19 +163,18 @@ def sample_counts(beginning: Beginning, settings: Settings) -> tuple[int, int, i
 def run(model: Model, beginning: Beginning, settings: Settings, advance: Advance) -> Record:
     """Hold, warm up and record; a run that breaks ends with its last whole sample."""
     state = beginning.state
-    charges, size = state.n_i.shape
-    n_fields = len(CELL_SUMS) + PER_CHARGE * (charges - 1)
+    n_fields = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1)
     quiet = model
     if beginning.resistance is not None:
         quiet = model._replace(resistance=beginning.resistance)
     n_hold, n_warm_up, n_samples = sample_counts(beginning, settings)
     whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
-        whole = whole and _pass(each, state, settings, n_rows, n_fields, advance)
+        march = _march(each, state, settings, *_room(n_fields, CHUNK_ROWS, state))
+        whole = whole and warm_up(march, n_rows, advance) is None
     before, state.hottest_eV[0] = stored_energy(state, model), 0.0
-    fields = np.empty((n_fields, n_samples if whole else 0, size - 2), np.float32)
-    series = np.empty((fields.shape[1], len(SERIES_SUMS)))
-    filled = _fill(model, state, settings, fields, series, advance)
+    fields, series = _room(n_fields, n_samples if whole else 0, state)
+    filled = record_samples(_march(model, state, settings, fields, series), len(series), advance)
     return Record(
         fields[:, :filled],
         series[:filled],
@@ -181,40 +191,24 @@ def first_fields(state: State, model: Model) -> bool:
     return electron_step(state, model, 0.0, rows, work)
 
 
-def _pass(
-    model: Model, state: State, settings: Settings, n_rows: int, n_fields: int, advance: Advance
-) -> bool:
-    """Advance by n_rows samples without keeping them; False where the run breaks."""
-    fields = np.empty((n_fields, CHUNK_ROWS, state.n_n.size - 2), np.float32)
-    series = np.empty((CHUNK_ROWS, len(SERIES_SUMS)))
-    while n_rows > 0:
-        n = min(n_rows, CHUNK_ROWS)
-        if _fill(model, state, settings, fields[:, :n], series[:n], advance) < n:
-            return False
-        n_rows -= n
-    return True
+def _march(
+    model: Model, state: State, settings: Settings, fields: np.ndarray, series: np.ndarray
+) -> March:
+    """How samples of a run get into the rows of these arrays."""
+
+    def march(rows: slice) -> int:
+        sample_s, averaged = settings.sample_s, settings.averaged
+        return kernels.advance(state, model, sample_s, averaged, fields[:, rows], series[rows])
+
+    return march
 
 
-def _fill(
-    model: Model,
-    state: State,
-    settings: Settings,
-    fields: Float[np.ndarray, "sums samples cells"],
-    series: Float[np.ndarray, "samples series"],
-    advance: Advance,
-) -> int:
-    """Advance and record until the arrays are full or the run breaks; how many samples it took."""
-    filled = 0
-    while filled < len(series):
-        part = slice(filled, filled + CHUNK_ROWS)
-        done = kernels.advance(
-            state, model, settings.sample_s, settings.averaged, fields[:, part], series[part]
-        )
-        filled += done
-        advance(done)
-        if done < len(series[part]):
-            break
-    return filled
+def _room(
+    n_fields: int, n_rows: int, state: State
+) -> tuple[Float[np.ndarray, "sums samples cells"], Float[np.ndarray, "samples series"]]:
+    """Arrays for the fields and series of so many samples."""
+    fields = np.empty((n_fields, n_rows, state.n_n.size - 2), np.float32)
+    return fields, np.empty((n_rows, len(SERIES_SUMS)))
 
 
 def _dataset(
@@ -230,7 +224,7 @@ def _dataset(
     }
     series = series_of(record.series, model, voltage=point.voltage, sample_s=settings.sample_s)
     end = end_of(record.state)
-    return as_dataset(fields, series, end, sample_s=settings.sample_s, faces=faces)
+    return labelled(fields, series, end, sample_s=settings.sample_s, faces=faces)
 
 
 def _attributes(
@@ -242,13 +236,9 @@ def _attributes(
     sample_s: float,
 ) -> dict[str, Any]:
     """Verdict, performance, balances, and what a restart needs beside the profiles."""
-    attributes = diagnose(field, diverged=record.diverged)
+    attributes = outcome(field, point, diverged=record.diverged)
     if field.sizes["time"]:
-        mean = {name: float(field[name].mean()) for name in ("I_d", "V_d", "thrust", "I_wall")}
-        attributes |= performance(
-            point, thrust_N=mean["thrust"], current_A=mean["I_d"], voltage_V=mean["V_d"]
-        )
-        attributes["I_wall_mean"] = mean["I_wall"]
+        attributes["I_wall_mean"] = float(field["I_wall"].mean())
         seconds = sample_s * field.sizes["time"]
         attributes["energy_balance"] = energy_balance(field, record, seconds)
         if "dn_n_dt" in field:

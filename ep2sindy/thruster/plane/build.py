@@ -6,13 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.thruster import closures as axial
-from ep2sindy.thruster.anode import FixedAnode
 from ep2sindy.thruster.closures import TABLE_STEP_EV, closure_table
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plane import state_kernels as kernels
 from ep2sindy.thruster.plane.grid import MaskedGrid
-from ep2sindy.thruster.walls import SHEATH_DENSITY_RATIO, SheathWall
+from ep2sindy.thruster.walls import SHEATH_DENSITY_RATIO, FixedAnode, SheathWall
 
 CFL = 0.8
 NEUTRAL_DIFFUSION = 1.1  # m^2/s, radial: a mean speed of some 200 m/s over the channel's width

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,16 +13,23 @@ from jaxtyping import Float
 
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial.settings import Settings, to_json
+from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.plane.balance import diagnose
 from ep2sindy.thruster.plane.build import build_model, check_thruster, initial_state
 from ep2sindy.thruster.plane.grid import MaskedGrid
 from ep2sindy.thruster.plane.kernels import advance
 from ep2sindy.thruster.plane.state_kernels import Model, State
 from ep2sindy.thruster.propellants import XenonFits
+from ep2sindy.thruster.recording import (
+    CHUNK_ROWS,
+    March,
+    as_dataset,
+    notes,
+    record_samples,
+    warm_up,
+)
 from ep2sindy.thruster.transport import AnomalousTransport
-
-CHUNK_ROWS = 50  # samples between two words on the progress
+from ep2sindy.thruster.verdict import outcome
 
 PLANES = {  # variable -> unit, long name, in the order the compiled loop fills them
     "n_i": ("m^-3", "ion density"),
@@ -60,34 +70,51 @@ def simulate_2d(
     n_z: int = 41,
     n_r: int = 49,
     averaged: bool = True,
+    cache: str | Path | None = None,
     progress: Progress | bool = True,
 ) -> xr.Dataset:
     """Simulate one operating point in (z, r) and sample it at equal steps after a warm-up.
 
     averaged: a sample is the mean over the sampling step that ends at its time; otherwise the
-    state at that time, which aliases oscillations faster than half the sampling rate.
+    state at that time, which aliases oscillations faster than half the sampling rate. cache: as
+    for `simulate`; the defaults' file takes some 300 MB.
 
     Returns a Dataset on ("time", "z", "r"), time in s from the end of the warm-up: PLANES on all
     three (float32, NaN in the thruster's body), PROFILES in time and z, SERIES in time
     (float64). The electrons are quasi-one-dimensional, so T_e_eV and R_ion do not depend on r.
     Attributes as those of `simulate`. A diverged run ends at its last finite sample and says so.
-    Raises ValueError for settings that cannot be run.
+    Raises ValueError for settings that cannot be run, OSError for a cache that cannot be written.
     """
+    settings: dict[str, Any] = {
+        "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
+        "n_z": n_z, "n_r": n_r, "averaged": averaged,
+    }  # fmt: skip
+    run = partial(simulate_as, settings, thruster, operating_point, progress=progress)
+    parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
+    return read_or_run(cache, f"plane_{operating_point.label}", parameters, run)
+
+
+def simulate_as(
+    settings: dict[str, Any],
+    thruster: Thruster,
+    operating_point: OperatingPoint,
+    *,
+    progress: Progress | bool,
+) -> xr.Dataset:
+    """`simulate_2d`, with its settings as one value."""
+    sample_s, averaged = settings["sample_s"], settings["averaged"]
+    duration_s, warm_up_s = settings["duration_s"], settings["warm_up_s"]
     Settings(duration_s, warm_up_s, sample_s)  # checks them
     check_thruster(thruster)
-    grid = MaskedGrid(thruster, n_z, n_r)
+    grid = MaskedGrid(thruster, settings["n_z"], settings["n_r"])
     model = build_model(thruster, operating_point, grid)
     n_warm_up, n_samples = round(warm_up_s / sample_s), round(duration_s / sample_s) + 1
     watch = as_progress(progress)
     with watch.stage(n_warm_up + n_samples, "sample", operating_point.label) as told:
         rows = warmed_up_run(grid, model, n_warm_up, n_samples, sample_s, averaged, told)
-    field = as_dataset(rows, sample_s, grid)
+    field = labelled(rows, sample_s, grid)
     drop = thruster.series_resistance * field["I_d"].values
-    field["V_d"] = ("time", operating_point.voltage - drop, attributes(SERIES["V_d"]))
-    settings = {
-        "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
-        "n_z": n_z, "n_r": n_r, "averaged": averaged,
-    }  # fmt: skip
+    field["V_d"] = ("time", operating_point.voltage - drop, notes(*SERIES["V_d"]))
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
     field.attrs = {
         "title": "2-D (z, r) Hall-thruster fluid model",
@@ -106,10 +133,29 @@ class Rows:
     profiles: Float[np.ndarray, "time profiles z"]
     series: Float[np.ndarray, "time series"]
 
+    @staticmethod
+    def room(n_rows: int, grid: MaskedGrid) -> Rows:
+        """Arrays for so many samples; planes are NaN in the thruster's body."""
+        return Rows(
+            [np.full((n_rows, grid.n_z, grid.n_r), np.nan, np.float32) for _ in PLANES],
+            np.empty((n_rows, len(PROFILES), grid.n_z), np.float32),
+            np.empty((n_rows, len(SERIES) - 1)),
+        )
+
     def until(self, n_rows: int) -> Rows:
         """The first rows, as views."""
         planes = [plane[:n_rows] for plane in self.planes]
         return Rows(planes, self.profiles[:n_rows], self.series[:n_rows])
+
+    def march(self, state: State, model: Model, sample_s: float, averaged: bool) -> March:
+        """How samples of a run get into these rows."""
+
+        def march(rows: slice) -> int:
+            planes = [plane[rows] for plane in self.planes]
+            out = (*planes, self.profiles[rows], self.series[rows])
+            return advance(state, model, sample_s, averaged, *out)[0]
+
+        return march
 
 
 def warmed_up_run(
@@ -123,64 +169,38 @@ def warmed_up_run(
 ) -> Rows:
     """The samples after the warm-up; of a warm-up that diverges, its last finite ones."""
     state = initial_state(grid, model)
-    while n_warm_up:
-        n_rows = min(n_warm_up, CHUNK_ROWS)
-        rows = march(state, model, grid, n_rows, sample_s, averaged, told)
-        if len(rows.series) < n_rows:
-            return rows
-        n_warm_up -= n_rows
-    return march(state, model, grid, n_samples, sample_s, averaged, told)
+    rows = Rows.room(min(n_warm_up, CHUNK_ROWS), grid)
+    broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, told)
+    if broken is not None:
+        return rows.until(broken)
+    rows = Rows.room(n_samples, grid)
+    return rows.until(record_samples(rows.march(state, model, sample_s, averaged), n_samples, told))
 
 
-def march(
-    state: State,
-    model: Model,
-    grid: MaskedGrid,
-    n_rows: int,
-    sample_s: float,
-    averaged: bool,
-    told: Advance,
-) -> Rows:
-    """Advance `state` by n_rows samples; fewer rows come back where it diverges."""
-    rows = Rows(
-        [np.full((n_rows, grid.n_z, grid.n_r), np.nan, np.float32) for _ in PLANES],
-        np.empty((n_rows, len(PROFILES), grid.n_z), np.float32),
-        np.empty((n_rows, len(SERIES) - 1)),
-    )
-    filled = 0
-    while filled < n_rows:
-        chunk = slice(filled, min(filled + CHUNK_ROWS, n_rows))
-        planes = [plane[chunk] for plane in rows.planes]
-        done, _ = advance(
-            state, model, sample_s, averaged, *planes, rows.profiles[chunk], rows.series[chunk]
-        )
-        filled += done
-        told(done)
-        if filled < chunk.stop:
-            break
-    return rows.until(filled)
-
-
-def attributes(entry: tuple[str, str]) -> dict[str, str]:
-    """Unit and name as xarray keeps them."""
-    return {"units": entry[0], "long_name": entry[1]}
-
-
-def as_dataset(rows: Rows, sample_s: float, grid: MaskedGrid) -> xr.Dataset:
+def labelled(rows: Rows, sample_s: float, grid: MaskedGrid) -> xr.Dataset:
     """Label the sampled arrays with dimensions, units and names, without copying the planes."""
     data: dict[str, tuple] = {
-        name: (("time", "z", "r"), plane, attributes(entry))
+        name: (("time", "z", "r"), plane, notes(*entry))
         for (name, entry), plane in zip(PLANES.items(), rows.planes, strict=True)
     }
     for k, (name, entry) in enumerate(PROFILES.items()):
-        data[name] = (("time", "z"), np.ascontiguousarray(rows.profiles[:, k]), attributes(entry))
+        data[name] = (("time", "z"), np.ascontiguousarray(rows.profiles[:, k]), notes(*entry))
     for k, name in enumerate(list(SERIES)[:-1]):
-        data[name] = ("time", rows.series[:, k].copy(), attributes(SERIES[name]))
-    time = sample_s * np.arange(len(rows.series))
-    coords = {
-        "time": ("time", time, {"units": "s", "long_name": "time after the warm-up"}),
-        "z": ("z", grid.z, {"units": "m", "long_name": "axial distance from the anode"}),
-        "r": ("r", grid.r, {"units": "m", "long_name": "radius"}),
-    }
-    # "s" is a unit here, not a calendar: decode with decode_times=False
-    return xr.Dataset(data, coords=coords)
+        data[name] = (("time",), rows.series[:, k].copy(), notes(*SERIES[name]))
+    return as_dataset(data, sample_s=sample_s, n_samples=len(rows.series), z=grid.z, r=grid.r)
+
+
+def diagnose(field: xr.Dataset, point: OperatingPoint, *, diverged: bool) -> dict[str, Any]:
+    """Status, cycle, frequency, current, performance and mass balance."""
+    found = {"initial": "guessed profiles", **outcome(field, point, diverged=diverged)}
+    if field.sizes["time"] > 1:
+        found["mass_balance"] = mass_balance(field, point)
+    return found
+
+
+def mass_balance(field: xr.Dataset, point: OperatingPoint) -> float:
+    """Xenon that left plus xenon that accumulated, over xenon that entered."""
+    ends = field[["mass_out", "mass_held"]].isel(time=[0, -1])
+    left, accumulated = (float(np.diff(ends[name])[0]) for name in ("mass_out", "mass_held"))
+    entered = 1e-6 * point.mass_flow_mg_s * float(field["time"][-1] - field["time"][0])
+    return (left + accumulated) / entered

@@ -7,18 +7,23 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.breathing_family import LAW, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.law import TiedRefinement, refine_tied
+from ep2sindy.refinement.judge import fit_and_judge
+from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.refine import refine_many
+from ep2sindy.refinement.methods.nelder_mead import NelderMead
+from ep2sindy.refinement.problem import LawMap, RefinementSettings
+from ep2sindy.refinement.problem import RefinementProblem as Problem
+from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
-from ep2sindy.synthetic.family import LAW, PARAMETERS, TRUTH, realization, system_at
 
 POINTS = list(PARAMETERS)
 WINDOW, N_WINDOWS = 60, 4
+SETTINGS = RefinementSettings(n_windows=N_WINDOWS, window=WINDOW, n_reweights=0)
 BASIS = LAW.evaluate(np.array([[PARAMETERS[p][v] for v in LAW.variables] for p in POINTS]))
 TRUE_LAW = np.array([row for terms in TRUTH.values() for row in terms.values()])
 
@@ -49,8 +54,8 @@ def tied(
     data: Sequence[Sequence[Trajectory]],
     basis: np.ndarray = BASIS,
     **settings: object,
-) -> TiedRefinement:
-    return refine_tied(models, data, basis, window=WINDOW, n_windows=N_WINDOWS, rng=0, **settings)
+) -> LawRefinement:
+    return refine_law(models, data, basis, replace(SETTINGS, **settings), rng=0)
 
 
 def test_exact_data_give_the_exact_law() -> None:
@@ -69,9 +74,7 @@ def test_exact_data_give_the_exact_law() -> None:
 def test_a_saturated_basis_gives_what_separate_refinements_do() -> None:
     data = runs(0.02)
     method = MultipleShooting(tolerance=1e-9)
-    apart = refine_many(
-        near(), data, window=WINDOW, n_windows=N_WINDOWS, n_reweights=0, method=method, rng=0
-    )
+    apart = refine(near(), data, replace(SETTINGS, method=method), rng=0)
     for basis in (np.eye(6), np.random.default_rng(1).normal(size=(6, 6))):
         found = tied(near(), data, basis, method=method)
         for model, own in zip(found.models, apart, strict=True):
@@ -88,7 +91,7 @@ def test_tying_never_lowers_the_loss() -> None:
 def test_in_noise_a_tied_law_is_closer_to_the_truth_than_one_through_separate_fits() -> None:
     """One pulse leaves directions of a point free that the others fix."""
     data = runs(0.05)
-    apart = refine_many(near(), data, window=WINDOW, n_windows=N_WINDOWS, rng=0)
+    apart = refine(near(), data, replace(SETTINGS, n_reweights=1), rng=0)
     used = truths()[0].coef.T != 0.0
     own = np.array([each.model.coef.T[used] for each in apart])
     truth = np.array([each.coef.T[used] for each in truths()])
@@ -106,7 +109,8 @@ def test_intervals_hold_the_truth() -> None:
     for number in range(10):
         data = [[each.trajectory(noise=0.01, rng=6 * number + k)] for k, each in enumerate(systems)]
         # Twenty windows a point, none twice: 120 clusters for 12 coefficients.
-        found = refine_tied(truths(), data, BASIS, window=25, n_windows=20, rng=number)
+        settings = RefinementSettings(n_windows=20, window=25, n_reweights=0)
+        found = refine_law(truths(), data, BASIS, settings, rng=number)
         assert found.covariance is not None
         assert found.covariance.shape == (12, 12)
         z.append((found.law - TRUE_LAW).ravel() / np.sqrt(np.diag(found.covariance)))
@@ -213,10 +217,34 @@ def test_an_information_of_one_direction_still_gives_a_law() -> None:
     ],
 )
 def test_what_cannot_be_tied_says_why(change: Mapping[str, object], message: str) -> None:
-    settings = {"basis": BASIS, "window": WINDOW, "n_windows": N_WINDOWS, "rng": 0, **change}
-    basis = settings.pop("basis")
+    basis = change.get("basis", BASIS)
+    settings = replace(SETTINGS, window=change.get("window", WINDOW))
     with pytest.raises(ValueError, match=message):
-        refine_tied(near(), runs(), basis, **settings)
+        refine_law(near(), runs(), basis, settings, rng=0)
+
+
+def test_other_methods_know_no_law() -> None:
+    with pytest.raises(ValueError, match="a law is refined by MultipleShooting alone: NelderMead"):
+        tied(near(), runs(), method=NelderMead(), free_start=False)
+
+
+def problem_of(models: Sequence[SparseModel], data: Sequence[Sequence[Trajectory]]) -> Problem:
+    batches = SETTINGS.cut(models, data, np.random.default_rng(0))
+    return Problem.of(models, batches, [None] * len(models), n_reweights=1)
+
+
+@pytest.mark.parametrize("free_start", [True, False])
+def test_a_law_of_identities_is_no_law_to_rounding(free_start: bool) -> None:
+    """A point alone takes the same steps; points together find the same minimum of each."""
+    problem = replace(problem_of(near()[:1], runs(0.02)[:1]), free_start=free_start)
+    method = MultipleShooting()
+    free, (own,) = fit_and_judge(problem, method)
+    tied, (law,) = fit_and_judge(replace(problem, law=LawMap.identity(problem.n_free)), method)
+    assert own.status == law.status == "converged"
+    np.testing.assert_allclose(tied.scaling, free.scaling, rtol=1e-12)
+    np.testing.assert_allclose(tied.nodes, free.nodes, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(law.covariance, own.covariance, rtol=1e-9)
+    np.testing.assert_allclose(law.window_loss, own.window_loss, rtol=1e-10)
 
 
 def test_models_of_different_structure_cannot_be_tied() -> None:

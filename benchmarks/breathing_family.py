@@ -14,7 +14,7 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.synthetic.systems import System
+from ep2sindy.systems.systems import System
 
 # The thesis's six operating points (Table IV): V and mg/s.
 PARAMETERS: Mapping[str, Mapping[str, float]] = {

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.synthetic.systems import (
+from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
     lorenz,

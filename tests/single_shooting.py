@@ -10,7 +10,13 @@ from scipy.optimize import least_squares
 from torchdiffeq import odeint
 
 from ep2sindy.refinement.ode import RungeKutta
-from ep2sindy.refinement.problem import Fit, Iteration, Problem, joined, residual_weights, single
+from ep2sindy.refinement.problem import (
+    Iteration,
+    RefinementFit,
+    RefinementProblem,
+    join,
+    residual_weights,
+)
 
 
 @dataclass(frozen=True)
@@ -24,14 +30,14 @@ class SingleShooting:
     tolerance: float = 1e-10
     max_iter: int = 100
 
-    def fit(self, problem: Problem) -> Fit:
-        return joined([self._fit_point(single(problem, p), p) for p in range(len(problem.odes))])
+    def fit(self, problem: RefinementProblem) -> RefinementFit:
+        return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
 
-    def finer(self, problem: Problem, fit: Fit, points: np.ndarray) -> None:
+    def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
         """Set `n_substeps` instead."""
         return
 
-    def _fit_point(self, problem: Problem, point: int) -> Fit:
+    def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
         data = problem.data[0]
         n = data.shape[-1]
         weights = np.ones(n)
@@ -48,7 +54,7 @@ class SingleShooting:
             path = self._path(problem, unknown)
             before = weights
             weights = residual_weights(path[None, :, :, :, 0], data[None])[0]
-        return Fit(
+        return RefinementFit(
             scaling=unknown[None, : problem.n_free],
             nodes=path[None, ..., 0],
             weights=before[None] if finite else np.ones((1, n)),
@@ -58,7 +64,7 @@ class SingleShooting:
         )
 
     def _least_squares(
-        self, problem: Problem, unknown: np.ndarray, weights: np.ndarray, point: int
+        self, problem: RefinementProblem, unknown: np.ndarray, weights: np.ndarray, point: int
     ) -> tuple[np.ndarray, bool]:
         """One weighted fit: the unknowns, and whether scipy's own tests were met."""
         data, n_free = problem.data[0], problem.n_free
@@ -98,7 +104,7 @@ class SingleShooting:
         )
         return found.x, bool(found.status > 0)
 
-    def _path(self, problem: Problem, unknown: np.ndarray) -> np.ndarray:
+    def _path(self, problem: RefinementProblem, unknown: np.ndarray) -> np.ndarray:
         """(windows, samples, n_states, columns): trajectories and their derivatives."""
         system, data = problem.system, problem.data[0]
         n, n_free, n_steps = system.n_states, system.n_free, data.shape[1] - 1

@@ -10,11 +10,10 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from ep2sindy.thruster.anode import FixedAnode
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import TabulatedRates
 from ep2sindy.thruster.transport import AnomalousTransport
-from ep2sindy.thruster.walls import ExponentialWall
+from ep2sindy.thruster.walls import ExponentialWall, FixedAnode
 
 ALPHA_CHANNEL = {1: 1.0, 2: 0.5, 3: 0.4}  # energy-loss coefficient by case; 1 in the plume
 LANDMARK_POINT = OperatingPoint(300.0, 5.0, neutral_speed=150.0)

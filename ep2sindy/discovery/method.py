@@ -1,0 +1,431 @@
+"""Methods: how equations are made of runs, each in one value that every discovery takes.
+
+A `TrajectorySearch` fits states and coefficients together; a `Regression` makes rows of the runs,
+and searches these. Both make candidates of runs, choose among them and fit what they chose, by
+`identify`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool
+
+from ep2sindy.constraints.relations import Relation, complete
+from ep2sindy.data.repeats import check_repeats
+from ep2sindy.data.scales import column_norms, zero_to_one
+from ep2sindy.data.sensor import bounds_of
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import Choice, choose, choose_by_runs
+from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate
+from ep2sindy.library.library import Library
+from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
+from ep2sindy.regression.rows import Formulation
+from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
+from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
+from ep2sindy.search.searches import BestSubset, Search
+from ep2sindy.selection.criteria import EBIC, Evidence
+from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates, selected
+
+M = TypeVar("M")
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a user knows of the equations before they are searched.
+
+    relations: between coefficients. terms: by state, of an equation that is known but for its
+    coefficients; it is not searched.
+    """
+
+    relations: Sequence[Relation] = ()
+    terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def of(
+        self, equation: str, library: Library, found: Sequence[Bool[np.ndarray, "_ terms"]]
+    ) -> list[Bool[np.ndarray, "_ terms"]]:
+        """What was found for an equation in every draw, as far as it agrees with what is known.
+
+        Raises ValueError for a term that the library does not have.
+        """
+        if equation in self.terms:
+            known = np.zeros((1, len(library)), dtype=np.bool_)
+            known[0, [library.index(name) for name in self.terms[equation]]] = True
+            return [known] * len(found)
+        if not self.relations:
+            return list(found)
+        return [complete(masks, library, equation, self.relations) for masks in found]
+
+    def check(self, library: Library, states: Sequence[str]) -> None:
+        """Raise ValueError for a state or term that is not there, or an equation without terms."""
+        named = [(state, term) for r in self.relations for _, state, term in r.factors]
+        named += [(state, term) for state, terms in self.terms.items() for term in terms]
+        for state, term in named:
+            if state not in states:
+                raise ValueError(f"unknown state {state!r}; there are {list(states)}")
+            library.index(term)
+        if empty := [state for state, terms in self.terms.items() if not terms]:
+            raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedEquations:
+    """What a method makes of runs.
+
+    choice: the candidates of every equation, with their scores, and the model of those chosen.
+    ambiguities: terms that these data cannot tell apart, and rows that are few for the terms.
+    remarks: what the samples show that is not as assumed, in sentences. estimate: of states and
+    coefficients together; None of a regression.
+    """
+
+    choice: Choice
+    ambiguities: Sequence[Ambiguity]
+    remarks: Sequence[str]
+    estimate: Estimate | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Supports that a method offers, without the last fit.
+
+    kept: state -> the supports on its front. selected: state -> the support of its equation, or
+    None where the method offers candidates and leaves the choice to the user.
+    """
+
+    kept: Mapping[str, Sequence[frozenset[str]]]
+    selected: Mapping[str, frozenset[str]] | None
+
+
+@runtime_checkable
+class DiscoveryMethod(Protocol):
+    """How equations are made of runs: `TrajectorySearch`, or `Regression`.
+
+    selection: the rule that chooses among candidates. depth: candidates kept per size.
+    provenance: what a model remembers of how it was found.
+    """
+
+    @property
+    def selection(self) -> SystemSelection | Selection: ...
+
+    @property
+    def depth(self) -> int: ...
+
+    @property
+    def provenance(self) -> dict[str, str]: ...
+
+    def identify(
+        self,
+        runs: Sequence[Trajectory],
+        library: Library,
+        known: Known,
+        *,
+        rng: np.random.Generator,
+        progress: Progress = SILENT,
+    ) -> IdentifiedEquations: ...
+
+    def find(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
+    ) -> Finding: ...
+
+
+@dataclass(frozen=True)
+class TrajectorySearch:
+    """Search by the likelihood of whole trajectories, states and coefficients fitted together.
+
+    For noisy samples of all states of a system whose law the library holds: no derivative is
+    estimated, so it finds what no regression can (docs/estimation.md). White noise, or noise that
+    lasts for some samples. max_terms: of one equation. align: channels that are found to come late
+    are brought forward; else the model is said to be a misfit, with their delays.
+    selection: Evidence, or a rule that runs models, such as FreeRunScore. depth: candidates kept
+    per size, for such a rule to judge.
+    Raises ValueError for fewer than one term, or a rule that does not go with the search.
+    """
+
+    max_terms: int = 7
+    align: bool = False
+    selection: SystemSelection | Selection = field(default_factory=Evidence)
+    depth: int = 1
+
+    def __post_init__(self) -> None:
+        if self.max_terms < 1:
+            raise ValueError(f"max_terms must be at least 1: {self.max_terms} came")
+        check_kind("selection", self.selection, Selection, "ep.Evidence()")
+        if not isinstance(self.selection, Evidence | SystemSelection):
+            raise ValueError(
+                "a search of trajectories weighs models by their likelihood: selection must "
+                "be Evidence() (selection=evidence), or a rule that runs models, such as "
+                f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, "
+                "such as Regression(search=BestSubset()) (search=best_subset)"
+            )
+        _check_depth(self.depth)
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """What a model remembers of how it was found."""
+        return {"search": repr(self), "selection": repr(self.selection)}
+
+    def identify(
+        self,
+        runs: Sequence[Trajectory],
+        library: Library,
+        known: Known,
+        *,
+        rng: np.random.Generator,
+        progress: Progress = SILENT,
+    ) -> IdentifiedEquations:
+        """Estimate states and coefficients, and choose; nothing is left to chance.
+
+        Terms that cannot be told apart are those whose values at the samples are alike.
+        """
+        provenance = self.provenance | _labels(runs)
+        found = estimate(
+            runs,
+            library,
+            max_terms=self.max_terms,
+            align=self.align,
+            relations=known.relations,
+            terms=known.terms,
+            units=runs[0].units,
+            provenance=provenance,
+            progress=progress,
+        )
+        fronts = [_front(s, found.supports[s], library, self.depth) for s in found.model.states]
+        if isinstance(self.selection, SystemSelection):
+            choice = choose_by_runs(
+                fronts, self.selection, known.relations, library=library, runs=runs,
+                provenance=provenance, progress=progress,
+            )  # fmt: skip
+        else:
+            scores = self.selection.scores(fronts)
+            scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
+            best = [selected(front, front.scores) for front in scored]
+            choice = Choice(scored, best, found.model, found.note)
+        alike = _ambiguities_of_samples(runs, library)
+        return IdentifiedEquations(choice, alike, found.remarks, found)
+
+    def find(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
+    ) -> Finding:
+        """The supports alone: what a benchmark counts."""
+        found = estimate(runs, library, max_terms=self.max_terms, align=self.align)
+        states = found.model.states
+        return Finding(
+            kept={s: [frozenset(each.coef) for each in found.supports[s]] for s in states},
+            selected={s: frozenset(found.model.terms(s)) for s in states},
+        )
+
+
+def _front(
+    state: str, scored: Sequence[ScoredSupport], library: Library, depth: int
+) -> ParetoFront:
+    """The likeliest `depth` candidates of every size, the empty one first."""
+    kept = [s for k, s in enumerate(scored) if _rank(scored, k) < depth or s.deviance == 0.0]
+    if not kept or kept[0].coef:
+        kept = [ScoredSupport({}, float("inf")), *kept]
+    return ParetoFront(state, [_candidate(state, support, library) for support in kept])
+
+
+def _rank(scored: Sequence[ScoredSupport], k: int) -> int:
+    """How many of its size come before one; they are sorted."""
+    return sum(len(each.coef) == len(scored[k].coef) for each in scored[:k])
+
+
+def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidate:
+    """No rows stand behind it, and no bootstraps."""
+    terms = tuple(name for name in library.names if name in support.coef)
+    return Candidate(
+        equation=state,
+        terms=terms,
+        coef=np.array([support.coef[name] for name in terms]),
+        r2_train=float("nan"),
+        r2_test=float("nan"),
+        share=float("nan"),
+        inclusion=np.full(len(terms), np.nan),
+        deviance=support.deviance,
+    )
+
+
+def _ambiguities_of_samples(runs: Sequence[Trajectory], library: Library) -> tuple[Ambiguity, ...]:
+    """Terms whose values at the samples cannot be told apart."""
+    theta = library.evaluate(np.concatenate([run.columns(library.variables) for run in runs]))
+    theta = theta / zero_to_one(np.abs(theta).max(axis=0))  # else squares of densities overflow
+    theta = theta / column_norms(theta)
+    return find_ambiguities(library, theta, theta.T @ theta)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchedEquation:
+    """One equation of a regression after the search.
+
+    draws: the bootstraps of its rows. number: its place among the equations of those rows.
+    found: what the search proposed in every draw. supports: the same, pooled. front: their fits.
+    """
+
+    draws: Resamples
+    number: int
+    found: Sequence[Bool[np.ndarray, "_ terms"]]
+    supports: Supports
+    front: ParetoFront
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Search rows: a formulation makes them of runs, a search proposes supports in every bootstrap.
+
+    Each support is fitted to all training rows, and the best of every size make the front; the
+    rule selects one per equation. Where the noise of the samples is followed into the rows,
+    selected terms are fitted again with weights. Regression() is the best route of rows that we
+    know; the thesis's is written below.
+    depth: candidates kept per size: 3 lets a true support win that noise has put second or third.
+    Raises ValueError for what is no formulation, search, rule or bootstraps.
+
+    >>> thesis = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps())
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> list(ep.discover(run, method=thesis, seed=0).model.terms("x"))
+    ['x', 'x*y']
+    """
+
+    formulation: Formulation = field(default_factory=WeightedWeak)
+    search: Search = field(default_factory=BestSubset)
+    selection: SystemSelection | Selection = field(default_factory=EBIC)
+    bootstraps: Bootstraps = field(default_factory=lambda: Bootstraps(n=0))
+    depth: int = 1
+
+    def __post_init__(self) -> None:
+        check_kind("formulation", self.formulation, Formulation, "ep.WeightedWeak()")
+        check_kind("search", self.search, Search, "ep.BestSubset()")
+        check_kind("bootstraps", self.bootstraps, Bootstraps, "ep.Bootstraps(n=0)")
+        check_kind("selection", self.selection, Selection, "ep.EBIC()")
+        _check_depth(self.depth)
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """What a model remembers of how it was found."""
+        return {
+            "formulation": repr(self.formulation),
+            "search": repr(self.search),
+            "bootstraps": repr(self.bootstraps),
+            "selection": repr(self.selection),
+        }
+
+    def identify(
+        self,
+        runs: Sequence[Trajectory],
+        library: Library,
+        known: Known,
+        *,
+        rng: np.random.Generator,
+        progress: Progress = SILENT,
+    ) -> IdentifiedEquations:
+        """Assemble rows, search them, and choose."""
+        check_repeats(runs)
+        equations = self.search_equations(runs, library, known, rng=rng, progress=progress)
+        fronts = [equation.front for equation in equations]
+        choice = self.choose(fronts, runs, library, known.relations, progress=progress)
+        found: list[Ambiguity] = []
+        for front in fronts:
+            # Equations that are known are not searched, so few rows hold none of them down.
+            if not set(front.rows.equations) <= set(known.terms):
+                found += few_rows(front.rows)
+            found += ambiguities(front.rows)
+        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(runs))
+
+    def search_equations(
+        self,
+        runs: Sequence[Trajectory],
+        library: Library,
+        known: Known | None = None,
+        *,
+        rng: np.random.Generator | int,
+        progress: Progress = SILENT,
+    ) -> list[SearchedEquation]:
+        """Assemble the rows, search every bootstrap of them, and fit what is found."""
+        rng, known = np.random.default_rng(rng), known or Known()
+        equations = []
+        with progress.stage(None, "", "rows of the regression"):
+            problems = self.formulation.assemble(runs, library, rng=rng)
+        for problem in problems:
+            with progress.stage(None, "", "draws of rows"):
+                draws = draw_resamples(problem, self.bootstraps, rng=rng)
+            for k, equation in enumerate(problem.equations):
+                with progress.stage(len(draws.xx), "draw", f"search for {equation}'") as advance:
+                    proposed = draws.search(self.search, k, advance)
+                found = known.of(equation, library, proposed)
+                supports = pool(draws, k, found)
+                front = pareto_front(problem, supports, depth=self.depth)
+                equations.append(SearchedEquation(draws, k, found, supports, front))
+        return equations
+
+    def choose(
+        self,
+        fronts: Sequence[ParetoFront],
+        runs: Sequence[Trajectory],
+        library: Library,
+        relations: Sequence[Relation] = (),
+        *,
+        progress: Progress = SILENT,
+    ) -> Choice:
+        """Select a candidate of every front, and fit what was selected."""
+        provenance = self.provenance | _labels(runs)
+        if isinstance(self.selection, SystemSelection):
+            return choose_by_runs(
+                fronts, self.selection, relations, library=library, runs=runs,
+                provenance=provenance, progress=progress,
+            )  # fmt: skip
+        return choose(
+            fronts, self.selection, relations, units=runs[0].units, provenance=provenance,
+            progress=progress,
+        )  # fmt: skip
+
+    def find(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
+    ) -> Finding:
+        """The supports alone: what a benchmark counts."""
+        fronts = [e.front for e in self.search_equations(runs, library, rng=rng)]
+        scores = score_candidates(self.selection, fronts, library, runs)
+        chosen = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
+        return Finding(
+            kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
+            selected={c.equation: frozenset(c.terms) for c in chosen},
+        )
+
+
+AnyMethod = TrajectorySearch | Regression
+
+
+def old_name(recipe: M | None) -> M | None:
+    """What came by the argument `recipe`, with a warning that it is called method now."""
+    if recipe is not None:
+        warnings.warn(
+            "recipe=... goes with the next version: write method=...", FutureWarning, stacklevel=4
+        )
+    return recipe
+
+
+def check_kind(name: str, value: object, kind: type, example: str) -> None:
+    """Raise ValueError for a value of another kind, or a class where a value is meant."""
+    if isinstance(value, type) or not isinstance(value, kind):
+        raise ValueError(f"{name} must be a {kind.__name__}, such as {example}: {value!r} came")
+
+
+def _check_depth(depth: int) -> None:
+    if type(depth) is not int or depth < 1:
+        raise ValueError(f"depth must be a whole number, one or more: {depth!r} came")
+
+
+def _labels(runs: Sequence[Trajectory]) -> dict[str, str]:
+    return {"trajectories": ", ".join(run.label for run in runs)}
+
+
+def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
+    """What is said of clipped or rounded samples where rows are regressed on them."""
+    found = [bounds_of(run.states, run.state_names) for run in runs]
+    words = dict.fromkeys(each for bounds in found if bounds for each in bounds.words)
+    way_out = "rows take them for values; TrajectorySearch() reads them as limits"
+    return tuple(f"{each}: {way_out}" for each in words)

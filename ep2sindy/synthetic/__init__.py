@@ -1,1 +1,0 @@
-"""Synthetic data: systems whose equations are known, to be found again."""

@@ -1,0 +1,57 @@
+"""How many files of the package a call enters: what a reader has to open to follow it."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+import pandas as pd
+
+import ep2sindy as ep
+
+PACKAGE = str(Path(ep.__file__).parent)
+
+
+def files_entered(call: Callable[[], object]) -> set[str]:
+    """Paths below ep2sindy/ of all Python functions that a call enters."""
+    entered: set[str] = set()
+
+    def watch(frame: FrameType, event: str, argument: object) -> None:
+        path = frame.f_code.co_filename
+        if event == "call" and path.startswith(PACKAGE):
+            entered.add(Path(path).relative_to(PACKAGE).as_posix())
+
+    before = sys.getprofile()
+    sys.setprofile(watch)
+    try:
+        call()
+    finally:
+        sys.setprofile(before)
+    return entered
+
+
+def test_a_discovery_by_the_default_enters_no_room_of_rows_but_to_compare_terms() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0).window(0, 300)
+    table = pd.DataFrame({"t": run.t, **dict(zip(run.state_names, run.states.T, strict=True))})
+    ep.discover(table)  # imports, and kernels that are compiled
+    entered = files_entered(lambda: ep.discover(table))
+    rows = {name for name in entered if name.startswith("regression/")}
+    assert rows == {"regression/ambiguity.py", "regression/gram_fits.py"}
+    assert len(entered) <= 36, sorted(entered)  # 53 with rows
+
+
+def test_a_refinement_is_followed_through_few_files() -> None:
+    prey = ep.lotka_volterra()
+    run = prey.trajectory(noise=0.02, rng=0)
+    ep.refine(prey.model, [run], window=30, n_windows=4, rng=0)  # imports, and compiles
+    entered = files_entered(lambda: ep.refine(prey.model, [run], window=30, n_windows=4, rng=0))
+    assert {path for path in entered if path.startswith("refinement/")} == {
+        "refinement/judge.py",
+        "refinement/kernels.py",
+        "refinement/methods/multiple_shooting.py",
+        "refinement/ode.py",
+        "refinement/problem.py",
+        "refinement/refine.py",
+        "refinement/windows.py",
+    }
+    assert len(entered) <= 17, sorted(entered)
