@@ -14,7 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import LeftOver, NoiseTest
 from ep2sindy.discovery.discover import Discovery
 from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
 from ep2sindy.model.free_run import FreeRun, free_run
@@ -77,15 +77,17 @@ class LibraryResult:
     def front_tables(self, name: str) -> dict[str, pd.DataFrame]:
         """The fronts as in the thesis's Tables I-III, and terms that the data cannot tell apart."""
         found = self.discovery
-        fronts = [
-            ResultTable(candidate_rows(front), _columns(self.label, front)).csv()
-            for front in found.fronts.values()
-        ]
+        fronts = [self._front_table(front) for front in found.fronts.values()]
         ambiguities = [(a.exact, " ".join(a.terms), a.message) for a in found.ambiguities]
         return {
             f"front_{name}": pd.concat(fronts),
             f"ambiguities_{name}": pd.DataFrame(ambiguities, columns=["exact", "terms", "message"]),
         }
+
+    def _front_table(self, front: ParetoFront) -> pd.DataFrame:
+        table = ResultTable(candidate_rows(front), candidate_metrics(self.label)).csv()
+        without = ["r2_test", "r2_train"] if front.problem is None else []
+        return table.drop(columns=without)  # a search of trajectories has no rows
 
     def sections(self, name: str, data: Trajectory) -> list[Section]:
         found = [_candidates_section(name, self, data.clock)]
@@ -95,24 +97,25 @@ class LibraryResult:
 
     def summary(self) -> dict[str, Any]:
         states, estimate = self.discovery.fronts, self.discovery.estimate
+        metrics = candidate_metrics(self.label)
         return {
-            "equations": {s: facts(_chosen(self, s), _equation(self.label)) for s in states},
+            "equations": {s: facts(_chosen(self, s), metrics) for s in states},
             "trajectory": facts(self.selected, TRAJECTORY),
             "thesis_terms": self.published and _published_summary(self.published, self.refitted),
             "living": self.living and self.living.summary(),
             "roles": self.roles and self.roles.summary(),
-        } | ({"estimate": estimate_summary(estimate)} if estimate else {})
+        } | ({"estimate": facts(estimate, ESTIMATE)} if estimate else {})
 
     def headline(self, name: str) -> dict[str, float]:
         chosen = {f"{name}/{state}": _chosen(self, state) for state in self.discovery.chosen}
         return (
             ResultTable({name: self.selected}, TRAJECTORY).headline()
-            | ResultTable(chosen, _equation(self.label)).headline()
+            | ResultTable(chosen, candidate_metrics(self.label)).headline()
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class CandidateRow:
     """A candidate of a front.
 
     terms: as the model has them, which may be weighted otherwise. left: of the noise, by the terms
@@ -135,36 +138,22 @@ TRAJECTORY: Metrics[FreeRun] = [
 ]  # fmt: skip
 
 
-def _columns(label: str, front: ParetoFront) -> Metrics[Row]:
-    """Of a table of candidates; label: what their scores are called."""
-    r2: Metrics[Row] = [
-        Metric("r2_test", lambda row: row.candidate.r2_test),
-        Metric("r2_train", lambda row: row.candidate.r2_train),
-    ]
+def candidate_metrics(label: str) -> Metrics[CandidateRow]:
+    """Columns of a front, and what is said of the selected one; label: what scores are called."""
     return [
-        Metric("equation", lambda row: row.candidate.equation),
-        Metric("n_terms", lambda row: row.candidate.n_terms),
-        *([] if front.problem is None else r2),  # a search of trajectories has no rows
-        Metric(label, lambda row: row.candidate.score),
-        Metric("share", lambda row: row.candidate.share),
-        Metric("selected", lambda row: row.is_selected),
-        Metric("text", lambda row: candidate_text(row.candidate)),
-    ]
-
-
-def _equation(label: str) -> Metrics[Row]:
-    """Of the selected candidate."""
-    compared = View.JSON | View.HEADLINE
-    return [
-        Metric("terms", lambda row: row.terms),
-        Metric("r2_test", lambda row: row.candidate.r2_test, compared),
-        Metric("n_terms", lambda row: row.candidate.n_terms, compared),
-        Metric("r2_train", lambda row: row.candidate.r2_train),
-        Metric(label, lambda row: row.candidate.score, compared),
-        Metric("chi_squared", lambda row: row.left and row.left.chi_squared),
-        Metric("residual_autocorrelation", lambda row: row.left and row.left.autocorrelation),
-        Metric("share", lambda row: row.candidate.share),
-        Metric("inclusion", lambda row: _inclusion(row.candidate)),
+        Metric("equation", lambda row: row.candidate.equation, View.CSV),
+        Metric("terms", lambda row: row.terms, View.JSON),
+        Metric("n_terms", lambda row: row.candidate.n_terms, View.ALL, "terms", "{}"),
+        Metric("r2_test", lambda row: row.candidate.r2_test, View.ALL, "R2 test", "{:.3f}"),
+        Metric("r2_train", lambda row: row.candidate.r2_train, View.SHOWN, "R2 train", "{:.3f}"),
+        Metric(label, lambda row: row.candidate.score, View.ALL, label, "{:.3f}"),
+        Metric("chi_squared", lambda row: row.left and row.left.chi_squared, View.JSON),
+        Metric(
+            "residual_autocorrelation", lambda row: row.left and row.left.autocorrelation, View.JSON
+        ),
+        Metric("share", lambda row: row.candidate.share, View.SHOWN, format="{:.2f}"),
+        Metric("inclusion", lambda row: _inclusion(row.candidate), View.JSON),
+        Metric("selected", lambda row: row.is_selected, View.CSV),
         Metric("text", lambda row: equation_text(row.candidate.equation, row.terms)),
     ]
 
@@ -173,15 +162,15 @@ def _inclusion(chosen: Candidate) -> dict[str, float]:
     return dict(zip(chosen.terms, chosen.inclusion.tolist(), strict=True))
 
 
-def candidate_rows(front: ParetoFront) -> list[Row]:
+def candidate_rows(front: ParetoFront) -> list[CandidateRow]:
     chosen = selected(front, front.scores)
-    return [Row(each, each is chosen, each.coef_by_term) for each in front.candidates]
+    return [CandidateRow(each, each is chosen, each.coef_by_term) for each in front.candidates]
 
 
-def _chosen(result: LibraryResult, state: str) -> Row:
+def _chosen(result: LibraryResult, state: str) -> CandidateRow:
     found = result.discovery
     chosen = selected(found.fronts[state], found.scores[state])
-    return Row(chosen, True, found.model.terms(state), found.noise_test.left.get(state))
+    return CandidateRow(chosen, True, found.model.terms(state), found.noise_test.left.get(state))
 
 
 def refit(
@@ -269,43 +258,40 @@ def candidate_text(candidate: Candidate) -> str:
 
 def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
     """Candidates, the selected one bold; below them the last fit, and what was published."""
-    label = result.label
-    front, scores = result.discovery.fronts[state], result.discovery.scores[state]
-    chosen, held_out = selected(front, scores), front.held_out
+    found, front = result.discovery, result.discovery.fronts[state]
+    rows, held_out = candidate_rows(front), front.held_out
+    header, other = ("R2 test", "R2 train") if held_out else ("R2 train", "R2 test")
 
     def equation(terms: Mapping[str, float], lead: str = "", mark: str = "") -> Equation:
         shown = {name: clock.seconds * coef for name, coef in terms.items()}
         return Equation(state, shown, lead=lead, mark=mark)
 
-    rows: list[tuple[str, str, str, str, Equation]] = []
-    for each, score in zip(front.candidates, scores, strict=True):
-        r2 = each.r2_test if held_out else each.r2_train
-        mark = "  <- selected" if each is chosen else ""
-        rows.append(
-            (
-                str(each.n_terms), places(r2, 3), places(score, 3), places(each.share, 2),
-                equation(each.coef_by_term, mark=mark),
-            )
-        )  # fmt: skip
-    terms = result.discovery.model.terms(state)
-    if terms != chosen.coef_by_term:
-        rows.append(("", "", "", "", equation(terms, "weighted")))
-    italic = []
-    if state in result.refitted:
-        here = result.refitted[state]
-        italic = [len(rows), len(rows) + 1]
-        rows.append(("", "", "", "", equation(result.given[state], "thesis")))
-        score = places(here.r2_test if held_out else here.r2_train, 3)
-        row = (str(here.n_terms), score, "", "", equation(here.coef_by_term, "its terms here"))
-        rows.append(row)
-    header = "R2 test" if held_out else "R2 train"
-    table = pd.DataFrame(rows, columns=["terms", header, label, "share", "model"])
+    def marked(row: CandidateRow) -> Equation:
+        return equation(row.terms, mark="  <- selected" if row.is_selected else "")
+
+    metrics = [*candidate_metrics(result.label), Metric("model", marked, View.SCREEN)]
+    table = ResultTable(rows, metrics).screen().drop(columns=other)
+    more: list[dict[str, Any]] = []
+    terms = found.model.terms(state)
+    if terms not in [row.terms for row in rows if row.is_selected]:
+        more.append({"model": equation(terms, "weighted")})
+    n_own = len(rows) + len(more)
+    if (here := result.refitted.get(state)) is not None:
+        r2 = places(here.r2_test if held_out else here.r2_train, 3)
+        more.append({"model": equation(result.given[state], "thesis")})
+        fit = equation(here.coef_by_term, "its terms here")
+        more.append({"terms": str(here.n_terms), header: r2, "model": fit})
+    table = pd.concat([table, pd.DataFrame(more)], ignore_index=True).fillna("")
     for column in (header, "share"):  # of a search without rows, or without bootstraps
         if table[column].isin(["-", ""]).all():
             del table[column]
-    unit = clock.rate_unit(result.discovery.model.units[state])
-    bold = [k for k, each in enumerate(front.candidates) if each is chosen]
-    return Table(table, title=f"candidates for {state}' [{unit}]", bold=bold, italic=italic)
+    unit = clock.rate_unit(found.model.units[state])
+    return Table(
+        table,
+        title=f"candidates for {state}' [{unit}]",
+        bold=[k for k, row in enumerate(rows) if row.is_selected],
+        italic=range(n_own, len(rows) + len(more)),
+    )
 
 
 def column_note(label: str) -> str:
@@ -332,40 +318,42 @@ def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[
 
 def estimate_section(name: str, found: Estimate, data: Trajectory) -> Section:
     """What the samples say of their noise, whether the model explains them, and what else may."""
+    rows = ResultTable([found], [*noise_sizes(data), *ESTIMATE]).screen(by_state=True)
     blocks: list[Block] = [
-        Table(noise_table(found, data), title="noise of the samples", note=NOISE),
+        Table(rows, title="noise of the samples", note=NOISE),
         Text(found.misfit or FITS, warning=bool(found.misfit)),
     ]
     if found.few:
         blocks.append(Text(found.few, warning=True))
     if found.rivals:
-        rivals = [
-            (f"{each.state}'", ", ".join(t.replace("*", " ") for t in each.terms), odds(each.odds))
-            for each in found.rivals
-        ]
-        rows = pd.DataFrame(rivals, columns=["equation", "terms", "odds against the chosen"])
-        blocks.append(Table(rows, title="other supports that may be"))
+        rivals = ResultTable(found.rivals, RIVALS).screen()
+        blocks.append(Table(rivals, title="other supports that may be"))
     elif not found.misfit:
         blocks.append(Text("No other support of an equation has odds above 1:1000."))
     return Section(f"{name}: what the samples say", blocks, level=3)
 
 
-def noise_table(found: Estimate, data: Trajectory) -> pd.DataFrame:
-    """By state: size of the noise, in SI and beside the state's spread, and what it is like."""
-    rows = []
-    for k, state in enumerate(found.model.states):
-        noise, spread = float(found.noise_std[k]), float(data.columns([state]).std())
-        rows.append(
-            {
-                "state": state,
-                "noise (std)": f"{noise:.3g} {data.units[state]}".removesuffix(" 1"),
-                "of the state's std": f"{100.0 * noise / spread:.2g} %",
-                "memory": f"{found.memory[k]:.2f}",
-                "grows": f"{100.0 * found.growth[k]:.3g} %",
-                "kurtosis": f"{found.kurtosis[k]:.3g}".replace("nan", ""),
-            }
-        )
-    return pd.DataFrame(rows)
+def noise_sizes(data: Trajectory) -> Metrics[Estimate]:
+    """The noise in SI, and beside the state's spread."""
+
+    def size(found: Estimate) -> dict[str, str]:
+        sizes = by_state(found, found.noise_std)
+        return {s: f"{v:.3g} {data.units[s]}".removesuffix(" 1") for s, v in sizes.items()}
+
+    def share(found: Estimate) -> dict[str, str]:
+        shares = {
+            s: v / data.columns([s]).std() for s, v in by_state(found, found.noise_std).items()
+        }
+        return {s: f"{100.0 * share:.2g} %" for s, share in shares.items()}
+
+    return [
+        Metric("noise (std)", size, View.SCREEN),
+        Metric("of the state's std", share, View.SCREEN),
+    ]
+
+
+def by_state(found: Estimate, values: np.ndarray) -> dict[str, float]:
+    return dict(zip(found.model.states, np.asarray(values).tolist(), strict=True))
 
 
 def odds(value: float) -> str:
@@ -373,20 +361,29 @@ def odds(value: float) -> str:
     return f"1:{1.0 / value:.3g}"
 
 
-def estimate_summary(found: Estimate) -> dict[str, Any]:
-    """What `summary.json` says, in SI."""
-    states = found.model.states
-    return {
-        "noise_std": dict(zip(states, np.asarray(found.noise_std).tolist(), strict=True)),
-        "memory": dict(zip(states, np.asarray(found.memory).tolist(), strict=True)),
-        "noise_growth": dict(zip(states, np.asarray(found.growth).tolist(), strict=True)),
-        "noise_kurtosis": dict(zip(states, np.asarray(found.kurtosis).tolist(), strict=True)),
-        "delays_s": dict(zip(states, np.asarray(found.delays_s).tolist(), strict=True)),
-        "remarks": list(found.remarks),
-        "flow_error": found.flow_error,
-        "misfit": found.misfit or None,
-        "few": found.few or None,
-        "rivals": [
-            {"state": r.state, "terms": list(r.terms), "odds": r.odds} for r in found.rivals
-        ],
-    }
+READ = View.JSON | View.SCREEN
+RIVALS: Metrics[Rival] = [
+    Metric("state", lambda rival: rival.state),
+    Metric("equation", lambda rival: f"{rival.state}'", View.SCREEN),
+    Metric("terms", lambda rival: list(rival.terms)),
+    Metric("terms", lambda rival: ", ".join(t.replace("*", " ") for t in rival.terms), View.SCREEN),
+    Metric("odds", lambda rival: rival.odds, View.SHOWN, "odds against the chosen", odds),
+]
+ESTIMATE: Metrics[Estimate] = [
+    Metric("noise_std", lambda found: by_state(found, found.noise_std)),
+    Metric("memory", lambda found: by_state(found, found.memory), READ, format="{:.2f}"),
+    Metric(
+        "noise_growth", lambda found: by_state(found, found.growth), READ, "grows",
+        lambda value: f"{100.0 * value:.3g} %",
+    ),
+    Metric(
+        "noise_kurtosis", lambda found: by_state(found, found.kurtosis), READ, "kurtosis",
+        lambda value: f"{value:.3g}".replace("nan", ""),
+    ),
+    Metric("delays_s", lambda found: by_state(found, found.delays_s)),
+    Metric("remarks", lambda found: list(found.remarks)),
+    Metric("flow_error", lambda found: found.flow_error),
+    Metric("misfit", lambda found: found.misfit or None),
+    Metric("few", lambda found: found.few or None),
+    Metric("rivals", lambda found: [facts(rival, RIVALS) for rival in found.rivals]),
+]  # fmt: skip

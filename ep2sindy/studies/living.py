@@ -5,7 +5,7 @@ With how it reads: a section, tables, figures and a summary for the studies that
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -277,13 +277,15 @@ def _paths(living: Living) -> list[Rollout]:
     """Runs from starts around the cycle's mean, in the first two states."""
     assert living.cycle is not None
     mean = living.cycle.states.mean(axis=0)
-    t = np.linspace(0.0, N_PERIODS * living.cycle.period_s, 1200)
-    found = []
-    for factors in STARTS:
-        start = mean.copy()
-        start[:2] *= factors
-        found.append(living.model.simulate(t, start, blow_up=30.0))
-    return found
+    factors = np.ones((len(STARTS), len(mean)))
+    factors[:, :2] = STARTS
+    return runs_from(mean * factors, living.model, living.cycle)
+
+
+def runs_from(starts: Iterable[np.ndarray], model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
+    """Runs over twelve periods of a cycle, from other states."""
+    t = np.linspace(0.0, N_PERIODS * cycle.period_s, 1200)
+    return [model.simulate(t, start, blow_up=30.0) for start in starts]
 
 
 def living_model(

@@ -24,7 +24,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures, places
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.files import WriteError
-from ep2sindy.runtime.parallel import Workers
+from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.spectrum import power_spectrum
 from ep2sindy.studies.simulated import (
     compile_kernels,
@@ -124,12 +124,8 @@ class Study:
         points = scan_points(self.data, self.scan or {})
         with run.progress(None, "", "kernels, compiled once"):
             compile_kernels([point.data for point in points])
-        found: dict[int, Simulated] = {}
-        with run.progress(len(points), "simulation") as came:
-            for number, result in self.parallel.run(run_point, points):
-                found[number] = result
-                came(1)
-        results = [found[number] for number in range(len(points))]
+        stage = run.progress(len(points), "simulation")
+        results: list[Simulated] = collect(self.parallel, run_point, points, stage)
         if all(each.status == FAILED for each in results):
             raise ValueError(f"a scan needs a point that can be run: {results[0].message}")
         for point, result in zip(points, results, strict=True):

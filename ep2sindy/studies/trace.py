@@ -38,8 +38,8 @@ from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
 from ep2sindy.signals.trace import LEAST_PERIODS, Trace, from_one_signal
-from ep2sindy.studies.library_result import Row, candidate_rows
-from ep2sindy.studies.living import cycle_of
+from ep2sindy.studies.library_result import CandidateRow, candidate_rows
+from ep2sindy.studies.living import cycle_of, runs_from
 from ep2sindy.studies.source import Source, data_summary, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
 from ep2sindy.studies.views import (
@@ -57,8 +57,6 @@ PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that
 DEPTH_OF_BOTH = 2
 
 LEAST_JUDGED = 4.0  # periods of the end of a record, to be held out
-
-N_PERIODS = 12.0  # of a run from another start
 
 STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distances from the cycle's middle, in those of its states
 
@@ -288,7 +286,7 @@ class Outcome:
             "coefficients": coefficients(self.models(), heading="model"),
         }
 
-    def _front(self, state: str) -> ResultTable[Row]:
+    def _front(self, state: str) -> ResultTable[CandidateRow]:
         return ResultTable(candidate_rows(self.found.fronts[state]), CANDIDATES)
 
     def figures(self) -> dict[str, Captioned]:
@@ -432,7 +430,7 @@ FREE_RUN: Metrics[Outcome] = [
     Metric("multiplier", lambda o: o.multiplier, COMPARED),
     Metric("share_reaching", lambda o: o.share, COMPARED),
 ]  # fmt: skip
-CANDIDATES: Metrics[Row] = [
+CANDIDATES: Metrics[CandidateRow] = [
     Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
     Metric("r2", lambda row: row.candidate.r2_train, View.SHOWN, "R2", "{:.3f}"),
     Metric("score", lambda row: row.candidate.score, View.SHOWN, format="{:.3f}"),
@@ -442,7 +440,7 @@ CANDIDATES: Metrics[Row] = [
 ]
 
 
-def _marked(row: Row) -> Equation:
+def _marked(row: CandidateRow) -> Equation:
     mark = "  <- selected" if row.is_selected else ""
     return Equation(row.candidate.equation, row.terms, mark=mark)
 
@@ -456,14 +454,10 @@ def _best_of_sizes(table: pd.DataFrame, most: int = 3) -> list[int]:
 def paths_off(model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
     """Runs from states off the cycle: nearer to its middle, and farther."""
     middle = cycle.states.mean(axis=0)
-    t = np.linspace(0.0, N_PERIODS * cycle.period_s, round(100 * N_PERIODS))
     places = np.arange(len(STARTS)) * len(cycle.states) // len(STARTS)
-    found = []
-    for state, factor in zip(cycle.states[places], STARTS, strict=True):
-        start = middle + factor * (state - middle)
-        start[0] = _inside(start[0], cycle.states[:, 0])
-        found.append(model.simulate(t, start, blow_up=30.0))
-    return found
+    starts = middle + np.array(STARTS)[:, None] * (cycle.states[places] - middle)
+    starts[:, 0] = [_inside(start, cycle.states[:, 0]) for start in starts[:, 0]]
+    return runs_from(starts, model, cycle)
 
 
 def _inside(value: float, states: np.ndarray) -> float:

@@ -22,7 +22,7 @@ from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
 from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import SILENT, Progress, counted
 from ep2sindy.search.front import fit_support
@@ -121,7 +121,7 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class SettingFit:
     """What one setting makes of a trajectory.
 
     r2: by state, on the setting's own rows, which differ from setting to setting.
@@ -229,7 +229,7 @@ def fit_settings(
     rollout_s: float | None,
     rng: np.random.Generator,
     progress: Progress = SILENT,
-) -> dict[str, Fitted]:
+) -> dict[str, SettingFit]:
     """Fit the same terms in every setting and integrate each model from the first sample.
 
     terms: state -> its terms. f_data_Hz: the frequency that models are held against. rollout_s:
@@ -251,7 +251,7 @@ def fit_settings(
             provenance={"formulation": repr(setting.formulation), "trajectories": run.label},
         )
         integrated = free_run(model, run, n_samples=n_samples)
-        results[name] = Fitted(
+        results[name] = SettingFit(
             setting=setting,
             r2={state: _r2_own_rows(*pair) for state, pair in found.items()},
             half_width=widths[name],
@@ -288,10 +288,10 @@ class Outcome:
     study: Study
     data: Trajectory
     f_data_Hz: float
-    fitted: Mapping[str, Fitted]
+    fitted: Mapping[str, SettingFit]
 
     @property
-    def labelled(self) -> dict[str, Fitted]:
+    def labelled(self) -> dict[str, SettingFit]:
         """By what a reader calls the settings."""
         return {_label(name, fitted): fitted for name, fitted in self.fitted.items()}
 
@@ -340,11 +340,11 @@ class Outcome:
             "settings.",
         )
 
-    def _metrics(self) -> Metrics[Fitted]:
+    def _metrics(self) -> Metrics[SettingFit]:
         """Samples, length and periods of the first state are those of one window."""
         clock, dt_s = self.data.clock, self.data.dt_s
 
-        def frequency(fitted: Fitted) -> str:
+        def frequency(fitted: SettingFit) -> str:
             text = clock.frequency_text(first_frequency_Hz(fitted))
             return f"{text} ({100 * fitted.f_error:+.0f} %)" if np.isfinite(fitted.f_error) else "-"
 
@@ -379,11 +379,11 @@ class Outcome:
         ]  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
-        metrics, dt_s = self._metrics(), self.data.dt_s
+        rows = ResultTable(self.fitted, self._metrics()).json()
         settings = {
             name: model_summary(fitted.integrated.model)
-            | _windows_summary(fitted, dt_s)
-            | facts(fitted, metrics)
+            | _windows_summary(fitted, self.data.dt_s)
+            | rows[name]
             for name, fitted in self.fitted.items()
         }
         return {"data": data_summary(self.data), "settings": settings}
@@ -393,17 +393,17 @@ class Outcome:
         return {"data/f_kHz": 1e-3 * self.f_data_Hz} | models
 
 
-def first_frequency_Hz(fitted: Fitted) -> float:
+def first_frequency_Hz(fitted: SettingFit) -> float:
     return fitted.integrated.frequency_Hz[fitted.integrated.model.states[0]]
 
 
-def _label(name: str, fitted: Fitted) -> str:
+def _label(name: str, fitted: SettingFit) -> str:
     """`70 points` for random windows; other names as words."""
     boxes = fitted.setting.boxes
     return f"{boxes.n_points} points" if boxes else name.replace("_", ", ")
 
 
-def _windows_summary(fitted: Fitted, dt_s: float) -> dict[str, Any]:
+def _windows_summary(fitted: SettingFit, dt_s: float) -> dict[str, Any]:
     """Windows of those kinds that have any, and intervals where they are known."""
     found: dict[str, Any] = {}
     if boxes := fitted.setting.boxes:
