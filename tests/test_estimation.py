@@ -493,7 +493,7 @@ def test_a_rule_of_rows_is_refused_for_trajectories(recipe: dict, message: str) 
 
 
 RULE = ep.FreeRunScore(n_folds=2)
-PUBLIC = {name: getattr(ep, name) for name in ep._MODULES if name[0].isupper()}
+PUBLIC = {name: getattr(ep, name) for name in dir(ep) if name[0].isupper()}
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from benchmarks.landmark import landmark_thruster
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.fields import check_field
 from ep2sindy.studies import pointwise
+from ep2sindy.studies.source import open_prepared
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.plane import electron_kernels as electrons
@@ -249,7 +250,9 @@ def test_the_config_names_the_set_that_the_package_takes_by_default(tmp_path):
     config = programs.composed(
         "+exp=pointwise", "data=simulation_2d", f"data.cache={tmp_path}", *small
     )
-    parameters = json.loads(study_of(pointwise.Study, config).source.field().attrs["parameters"])
+    study = study_of(pointwise.Study, config)
+    field = open_prepared(study.data, study.prepare)
+    parameters = json.loads(field.attrs["parameters"])
     for name, value in (("thruster", THRUSTER_2D), ("operating_point", OPERATING_POINT_2D)):
         assert parameters[name] == json.loads(to_json({name: value}))[name]
 
