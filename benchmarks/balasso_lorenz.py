@@ -20,12 +20,12 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.scores import r2
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.front import Candidate, fit_support, fit_supports, front_order
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, Search
 from ep2sindy.runtime.parallel import Loky
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import Candidate, fit_support, fit_supports, front_order
-from ep2sindy.search.searches import STLSQ, AdaptiveLasso, Search
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import lorenz
 

@@ -15,9 +15,8 @@ import numpy as np
 
 import ep2sindy as ep
 from benchmarks.timing import cpu_s
-from ep2sindy.model.edges import Border
 from ep2sindy.model.inputs import spline, spline_pieces
-from ep2sindy.model.solve import Products, Solved, solved
+from ep2sindy.model.solve import Border, Products, Solved, solved
 
 PERIODS, PER_PERIOD = 10, 60
 # Each system with its period in its own unit of time.

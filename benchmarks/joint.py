@@ -18,13 +18,13 @@ import pandas as pd
 from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.operating.law import fit_law
+from ep2sindy.operating.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.runtime.parallel import Loky, Workers
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 
 

@@ -31,11 +31,11 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6

@@ -15,11 +15,11 @@ from sklearn.linear_model import lasso_path
 from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import cpu_s
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import ParetoFront, pareto_front
-from ep2sindy.search.searches import AdaptiveLasso
+from ep2sindy.regression.searches import AdaptiveLasso
 from ep2sindy.systems.systems import lorenz
 
 BOOTSTRAPS = Bootstraps(n=32, n_culled=1)

@@ -15,11 +15,11 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.front import ParetoFront, pareto_front
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.parallel import Loky
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import ParetoFront, pareto_front
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore

@@ -9,7 +9,7 @@ from ep2sindy.data.open import read_field as read_field  # for configs
 from ep2sindy.data.open import write_field as write_field
 from ep2sindy.data.zones import zone_average as zone_average
 from ep2sindy.data.zones import point_samples as point_samples
-from ep2sindy.data.extent import Zone as Zone  # for configs
+from ep2sindy.data.zones import Zone as Zone  # for configs
 from ep2sindy.data.mapping import Variable as Variable  # for configs
 from ep2sindy.library.units import Clock as Clock
 
@@ -22,19 +22,19 @@ from ep2sindy.library.library import named_terms as named_terms
 from ep2sindy.discovery.discover import discover as discover
 from ep2sindy.discovery.discover import Discovery as Discovery
 from ep2sindy.discovery.recipe import Recipe as Recipe  # for configs
-from ep2sindy.discovery.shared_support import discover_jointly as discover_jointly
-from ep2sindy.discovery.shared_support import JointDiscovery as JointDiscovery
+from ep2sindy.operating.shared_support import discover_jointly as discover_jointly
+from ep2sindy.operating.shared_support import JointDiscovery as JointDiscovery
 from ep2sindy.discovery.pointwise import pointwise as pointwise
 from ep2sindy.estimation.estimate import estimate as estimate
 
 # Searches
 from ep2sindy.discovery.method import TrajectorySearch as TrajectorySearch  # for configs
 from ep2sindy.discovery.method import Regression as Regression  # for configs
-from ep2sindy.search.searches import BestSubset as BestSubset  # for configs
-from ep2sindy.search.searches import AdaptiveLasso as AdaptiveLasso  # for configs
-from ep2sindy.search.searches import STLSQ as STLSQ  # for configs
-from ep2sindy.search.bootstraps import Bootstraps as Bootstraps  # for configs
-from ep2sindy.search.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
+from ep2sindy.regression.searches import BestSubset as BestSubset  # for configs
+from ep2sindy.regression.searches import AdaptiveLasso as AdaptiveLasso  # for configs
+from ep2sindy.regression.searches import STLSQ as STLSQ  # for configs
+from ep2sindy.regression.bootstraps import Bootstraps as Bootstraps  # for configs
+from ep2sindy.regression.estimators import AdaptiveLassoRegressor as AdaptiveLassoRegressor
 
 # Regressions
 from ep2sindy.regression.differential import Differential as Differential  # for configs
@@ -69,8 +69,8 @@ from ep2sindy.refinement.refine import refine as refine
 from ep2sindy.refinement.refine import Refinement as Refinement
 from ep2sindy.refinement.problem import RefinementSettings as RefinementSettings
 from ep2sindy.refinement.correction import refine_with_correction as refine_with_correction
-from ep2sindy.constraints.relations import constraint as constraint
-from ep2sindy.constraints.relations import Constraint as Constraint
+from ep2sindy.library.relations import constraint as constraint
+from ep2sindy.library.relations import Constraint as Constraint
 
 # Systems
 from ep2sindy.systems.systems import lorenz as lorenz  # for configs

@@ -10,10 +10,10 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Finding, Regression
 from ep2sindy.figures.identified import benchmark_figure, merit_table
 from ep2sindy.library.library import Library
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
 from ep2sindy.runtime.parallel import Loky, Serial
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import STLSQ, AdaptiveLasso
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies.benchmark import Study, Variant, cells, merits
 from ep2sindy.systems.draws import realization

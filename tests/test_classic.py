@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.io import netcdf_file
 
-from ep2sindy.data.readers.classic import check_places
+from ep2sindy.data.readers.netcdf import check_places
 
 FORMS = ["NETCDF3_CLASSIC", "NETCDF3_64BIT", "NETCDF3_64BIT_DATA"]
 T, N = np.arange(20.0), 3.0 + np.arange(20.0)

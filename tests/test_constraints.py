@@ -5,23 +5,23 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ep2sindy.constraints.fit import constrained_fit
-from ep2sindy.constraints.relations import (
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.choice import reweight
+from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.library.relations import (
     Constraint,
     Relation,
     constraint,
     parse_relation,
     relations_from_matrix,
 )
-from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import reweight
-from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.front import fit_support
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
-from ep2sindy.search.front import fit_support
 from ep2sindy.systems.systems import lotka_volterra
 
 LIBRARY = polynomial(["x", "y"], degree=2)

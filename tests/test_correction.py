@@ -6,16 +6,16 @@ import pytest
 import torch
 from torch import nn
 
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, named_terms, polynomial
+from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.correction import Corrected, refine_with_correction
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.front import Candidate, pareto_front
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import Candidate, pareto_front
-from ep2sindy.search.searches import BestSubset
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.selection.rule import selected
 from ep2sindy.systems.systems import lotka_volterra

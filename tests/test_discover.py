@@ -8,10 +8,10 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.names import split_factors
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.weak import WeightedWeak
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.systems.systems import lotka_volterra

@@ -13,9 +13,9 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.judge import RefinementStatus
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.ambiguity import Ambiguity
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import BestSubset
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.systems.systems import lotka_volterra
 

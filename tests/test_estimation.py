@@ -11,13 +11,14 @@ from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
-from ep2sindy.constraints.relations import parse_relation
+from ep2sindy._stubs import dotted_names
 from ep2sindy.estimation import problem as estimation_problem
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scaled_problem
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
+from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
 
 
@@ -493,7 +494,11 @@ def test_a_rule_of_rows_is_refused_for_trajectories(recipe: dict, message: str) 
 
 
 RULE = ep.FreeRunScore(n_folds=2)
-PUBLIC = {name: getattr(ep, name) for name in dir(ep) if name[0].isupper()}
+PUBLIC = {
+    last: entry.load()
+    for name, entry in dotted_names().items()
+    if (last := name.rpartition(".")[2])[0].isupper()
+}
 
 
 @pytest.mark.parametrize(

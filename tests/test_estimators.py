@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from ep2sindy.search.estimators import AdaptiveLassoRegressor
+from ep2sindy.regression.estimators import AdaptiveLassoRegressor
 from ep2sindy.systems.systems import lorenz, lotka_volterra
 
 TRUTH = np.array([[0.0, 3.0, 0.0, -1.5, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0, 0.0, 0.7]])

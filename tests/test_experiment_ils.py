@@ -7,8 +7,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import polynomial
+from ep2sindy.library.relations import constraint
 from ep2sindy.refinement.problem import Iteration
 from ep2sindy.studies.ils import watcher
 from tests import programs

@@ -102,7 +102,7 @@ def test_bytes_are_written_whole(tmp_path: Path) -> None:
 
 
 def test_a_written_field_is_the_same_from_memory(tmp_path: Path) -> None:
-    from ep2sindy.data.netcdf import write_netcdf
+    from ep2sindy.data.fields import write_netcdf
 
     field = xr.Dataset({"n": (("time",), np.arange(5.0))}, coords={"time": np.arange(5.0)})
     packed = {"n": {"zlib": True, "complevel": 4}}

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import ep2sindy as ep
-from ep2sindy.data.domain import kept_inside
+from ep2sindy.data.given import kept_inside
 from ep2sindy.library import functions as registry
 from ep2sindy.library.equations import (
     equation_html,
@@ -21,7 +21,7 @@ from ep2sindy.library.equations import (
     sum_sympy,
 )
 from ep2sindy.library.library import Library, named_terms, polynomial
-from ep2sindy.model.edges import edges_of
+from ep2sindy.model.solve import edges_of
 from ep2sindy.refinement.refine import refine
 from ep2sindy.regression.ambiguity import ambiguities, usable_terms
 

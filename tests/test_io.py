@@ -11,13 +11,12 @@ from hydra.utils import instantiate
 from scipy.io import savemat
 
 from ep2sindy.data.conversion import conversion, same_unit
-from ep2sindy.data.extent import Zone
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.open import open_field, read_field, write_field
 from ep2sindy.data.prepare import keep_where
 from ep2sindy.data.readers.registry import READERS, reader_of
 from ep2sindy.data.readers.source import look_at
-from ep2sindy.data.zones import zone_average
+from ep2sindy.data.zones import Zone, zone_average
 
 ROOT = Path(__file__).resolve().parents[1]
 RNG = np.random.default_rng(3)

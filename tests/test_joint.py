@@ -10,16 +10,16 @@ from benchmarks.joint import find, rates, run_family
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.operating.law import fit_law
+from ep2sindy.operating.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Formulation, RegressionRows
+from ep2sindy.regression.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.search.searches import AdaptiveLasso, BestSubset, Search
 from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection
 from ep2sindy.systems.systems import lotka_volterra

@@ -25,8 +25,6 @@ ROOMS = [
     "thruster",
     "model",
     "regression",
-    "constraints",
-    "search",
     "estimation",
     "systems",
     "refinement",

@@ -6,8 +6,8 @@ import torch
 from torch import nn
 from torchdiffeq import odeint
 
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import named_terms
+from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.ode import ODE, Drive, HermiteSimpson, RungeKutta, augment
 from ep2sindy.systems.systems import lotka_volterra

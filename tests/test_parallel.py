@@ -269,7 +269,7 @@ if __name__ == "__main__":
 # For hours, in a compiled call, which is compiled before it counts.
 COMPILED = """
     import numpy as np
-    from ep2sindy.search.searches import BestSubset
+    from ep2sindy.regression.searches import BestSubset
     columns = np.random.default_rng(0).standard_normal((99, 60))
     BestSubset(max_terms=1).supports(np.eye(2), np.ones(2), 2.0)
 """

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ep2sindy.constraints.fit import constrained_fit
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.point_fits import (
     Case,
@@ -31,13 +30,14 @@ from ep2sindy.operating.quantities import (
 )
 from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
 from ep2sindy.operating.records import OperatingRecord
+from ep2sindy.regression.bootstraps import moving_block_counts
+from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Loky, Serial
-from ep2sindy.search.bootstraps import moving_block_counts
-from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.oscillation import oscillation
 from ep2sindy.signals.smoothers import NoSmoothing

@@ -3,12 +3,12 @@ import pytest
 
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.scores import r2
+from ep2sindy.regression.bootstraps import Bootstraps, Supports, pooled_supports
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.front import front_order, pareto_front
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, BestSubset, Search
 from ep2sindy.regression.splits import RandomSplit
-from ep2sindy.search.bootstraps import Bootstraps, Supports, pooled_supports
-from ep2sindy.search.front import front_order, pareto_front
-from ep2sindy.search.searches import STLSQ, AdaptiveLasso, BestSubset, Search
 from ep2sindy.systems.systems import (
     System,
     damped_oscillator,

@@ -14,12 +14,12 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.library.library import named_terms
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Dask, Loky, Serial
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import AdaptiveLasso, BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.refined import RefinedScore
 

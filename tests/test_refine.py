@@ -7,9 +7,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms
+from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting

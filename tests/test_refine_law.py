@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.breathing_family import LAW, PARAMETERS, TRUTH, realization, system_at
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
+from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.judge import fit_and_judge
 from ep2sindy.refinement.law import LawRefinement, refine_law

@@ -11,8 +11,8 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.refined import RefinedScore, _refined
 from ep2sindy.selection.rule import FLOOR, MAX_ERROR, selected

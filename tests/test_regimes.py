@@ -8,10 +8,10 @@ from sklearn.metrics import adjusted_rand_score
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.regimes import Regimes, find_regimes, group_points
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 

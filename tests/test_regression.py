@@ -6,11 +6,11 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.ambiguity import ambiguities, few_rows, largest_support, usable_terms
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
 from ep2sindy.systems.systems import lotka_volterra
 

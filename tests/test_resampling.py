@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.regression.differential import Differential
-from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
 from ep2sindy.systems.systems import lorenz
 
 

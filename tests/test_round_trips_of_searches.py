@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from sklearn.base import clone
 
 import ep2sindy as ep
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import ParetoFront, pareto_front
-from ep2sindy.search.searches import Search
+from ep2sindy.regression.searches import Search
 from ep2sindy.selection.rule import selected
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)

@@ -5,10 +5,10 @@ import pytest
 from sklearn.linear_model import Lasso, lars_path_gram
 
 from ep2sindy.library.library import named_terms
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.rows import Grams, RegressionRows
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.kernels import lasso_supports
-from ep2sindy.search.searches import STLSQ, AdaptiveLasso, BestSubset, Search
+from ep2sindy.regression.search_kernels import lasso_supports
+from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, BestSubset, Search
 
 SEARCHES = [AdaptiveLasso(), STLSQ(), BestSubset(max_terms=8)]
 

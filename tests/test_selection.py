@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
+from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.search.bootstraps import Bootstraps, pooled_supports
-from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
-from ep2sindy.search.searches import BestSubset
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
 from ep2sindy.selection.rule import Selection, selected
 from ep2sindy.systems.systems import lorenz

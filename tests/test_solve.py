@@ -10,13 +10,11 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.model import kernels
-from ep2sindy.model.edges import Border
 from ep2sindy.model.inputs import spline, spline_pieces
-from ep2sindy.model.many import DrivenWindows, Ensemble
+from ep2sindy.model.many import DrivenWindows, Ensemble, rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import _scaled_rhs
-from ep2sindy.model.runge_kutta import rk4_step
-from ep2sindy.model.solve import Products, Solved, _first_step, scheme, solved
+from ep2sindy.model.solve import Border, Products, Solved, _first_step, scheme, solved
 
 NO_BORDER = Border((), lambda _, y: y)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.search.front import Candidate, ParetoFront
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.selection.criteria import Stability
 from ep2sindy.selection.rule import selected
 

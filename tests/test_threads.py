@@ -14,9 +14,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from ep2sindy.app import main as program
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.threads import NUMBERS, one_thread
-from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.systems.systems import lotka_volterra
 

@@ -37,5 +37,5 @@ def test_every_module_is_checked_but_what_is_compiled() -> None:
 
     wrapped = [name for name in MODULES if "jaxtyping" in vars(import_module(name))]
     assert wrapped == MODULES
-    kernels = import_module("ep2sindy.search.kernels")
+    kernels = import_module("ep2sindy.regression.search_kernels")
     assert "jaxtyping" not in vars(kernels)

@@ -8,12 +8,12 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import split_factors
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
 from ep2sindy.regression.test_functions import Boxes, Bumps
 from ep2sindy.regression.weak import Weak
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.signals.smoothers import NoSmoothing
 from ep2sindy.systems.systems import (

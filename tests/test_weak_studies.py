@@ -11,13 +11,13 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.identified import frontier_figure
 from ep2sindy.figures.windows import window_error_figure
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Boxes, Bumps
 from ep2sindy.regression.weak import Weak
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies import frontier as frontiers
 from ep2sindy.studies import weak_windows

@@ -10,6 +10,7 @@ refused, since an average over a changing set of cells is no observable.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.library.units import Clock
-from ep2sindy.runtime.files import read_json
+from ep2sindy.runtime.files import read_json, write_bytes
 
 DIMS = ("time", "z", "r")
 
@@ -155,3 +156,19 @@ def cell_sizes(field: xr.Dataset, axis: str, *, axisymmetric: bool) -> Float[np.
     if axis == "r" and axisymmetric:
         return np.diff(np.maximum(edges, 0.0) ** 2) / 2
     return np.diff(edges)
+
+
+# Data sets as NetCDF files, by way of memory: HDF5 must never meet a disk that is full.
+
+
+def write_netcdf(
+    dataset: xr.Dataset, path: Path, *, encoding: Mapping[str, Mapping[str, Any]] | None = None
+) -> None:
+    """Write NetCDF under `path`, whole or not at all.
+
+    The file is made in memory, which must hold it: where HDF5 itself cannot write to the end, it
+    ends the whole program when it closes. Raises OSError, naming the file, where the disk takes it
+    not.
+    """
+    content = dataset.to_netcdf(None, engine="h5netcdf", encoding=encoding)
+    write_bytes(path, content)

@@ -76,3 +76,16 @@ def check_magnitude(values: Float[np.ndarray, "samples variables"], names: tuple
                 f"a variable must be of a size whose products are numbers, {LEAST:g} or more: "
                 f"{name!r} reaches {level:.3g}; count it in another unit"
             )
+
+
+# Sizes to divide by, so that columns of different units compare.
+
+
+def zero_to_one(sizes: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    """The same with one in place of zero: what is all zeros stays so when divided."""
+    return np.where(sizes == 0.0, 1.0, sizes)
+
+
+def column_norms(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, " columns"]:
+    """L2 norms to divide by, of values of moderate size: squares beyond 1e308 overflow."""
+    return zero_to_one(np.linalg.norm(values, axis=0))

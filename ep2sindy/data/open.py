@@ -14,9 +14,8 @@ from pathlib import Path
 import xarray as xr
 
 from ep2sindy.data.conversion import conversion, to_si
-from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside
+from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside, write_netcdf
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
-from ep2sindy.data.netcdf import write_netcdf
 from ep2sindy.data.placing import place, read_axes
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import isclose
 
 import numpy as np
 import xarray as xr
 
+from ep2sindy.data.conversion import SUFFIX_UNITS, conversion, counted_in
 from ep2sindy.data.fields import DIMS
-from ep2sindy.data.held import TEXT, Held, held_array
-from ep2sindy.data.mapping import Keys, Problems, Variable, in_file
+from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
 from ep2sindy.data.placing import fitting, time_length
 from ep2sindy.data.quantities import (
     AXES,
     QUANTITIES,
+    Quantity,
+    likely_time_unit,
     meant_by,
+    named_unit,
     step_said,
+    typical,
 )
 from ep2sindy.data.readers.source import Source
-from ep2sindy.data.unit_choice import converts, is_of, own_unit, with_time_unit, with_unit
+from ep2sindy.library.units import unit_like
 
 MOST_COLUMNS = 32  # of an array whose columns are taken as signals of their own
 
@@ -255,3 +260,139 @@ def _own_name(name: str, taken: set[str]) -> str:
     while ours in taken:
         ours += "_"
     return ours
+
+
+# The unit that an array's numbers count: stated, named, ours, or only likely.
+
+
+def is_of(unit: str, like: str) -> bool:
+    return bool(unit) and unit != "1" and unit_like(unit, like=like)
+
+
+def with_unit(ours: str, one: Held, quantity: Quantity, guesses: dict[str, str]) -> Variable:
+    """The unit that the file says, its name's ending, ours, or else the likely one."""
+    stated = one.unit if is_of(one.unit, quantity.unit) or converts(ours, one.unit) else ""
+    stated = stated or _ending(ours, one.name)
+    if not stated and not quantity.fits(one.size):
+        likely = [
+            unit for unit in quantity.others if quantity.fits(one.size, conversion(ours, unit)[0])
+        ]
+        if likely:
+            guesses[ours] = (
+                f"{ours} ({one.name!r}) is about {one.size:.2g}, as if the file counted in "
+                f"{' or '.join(likely)}, and it names no unit: give it"
+            )
+            stated = likely[0]
+    return Variable(one.name, stated or quantity.unit)
+
+
+def with_time_unit(
+    time: Variable,
+    one: Held,
+    variables: Mapping[str, Variable],
+    said_s: float | None,
+    guesses: dict[str, str],
+) -> Variable:
+    """The unit of time where the file names none: that in which its steps are those it says.
+
+    Else a plasma's record shows it in its steps. said_s: the step that a scalar such as fs says.
+    """
+    if one.unit not in ("", "1") or _ending("time", one.name) or one.step is None:
+        return time
+    for unit in ("s", *AXES["time"].others):
+        if said_s and isclose(one.step * conversion("time", unit)[0], said_s, rel_tol=1e-3):
+            return replace(time, unit=unit)
+    likely = likely_time_unit(one.step, variables)
+    if likely is None:
+        return time
+    guesses["time"] = (
+        f"time ({one.name!r}) goes in steps of {one.step:.2g}, as if the file counted in {likely}, "
+        "and it names no unit: give it"
+    )
+    return replace(time, unit=likely)
+
+
+def _ending(ours: str, name: str) -> str:
+    """The unit at the end of a name, if our name can have it."""
+    unit = named_unit(re.split(r"[/.]", name)[-1])[1]
+    return unit if unit and converts(ours, unit) else ""
+
+
+def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
+    if unit in ("", "1"):
+        return False
+    try:
+        conversion(ours, unit, is_variable=is_variable)
+    except ValueError:
+        return False
+    return True
+
+
+def own_unit(ours: str, one: Held) -> str:
+    """The unit that the file says, if numbers can be converted from it; else none."""
+    suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
+    options = (one.unit, named_unit(ours)[1] or "", *suffixes)
+    return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")
+
+
+# One array of a file as it is looked at: shape, unit, range, what is missing, and its steps.
+
+
+TEXT = "text or objects"  # what is not even tried
+
+
+@dataclass(frozen=True)
+class Held:
+    """One array of a file. unit: "" where the file says none. n_missing: NaN or infinite.
+
+    step: mean step of a vector that increases, else None. even: whether its steps are equal.
+    problem: why it cannot be used.
+    """
+
+    name: str
+    shape: tuple[int, ...] = ()
+    kind: str = ""
+    unit: str = ""
+    dims: tuple[str, ...] = ()
+    low: float = np.nan
+    high: float = np.nan
+    size: float = 0.0
+    n_missing: int = 0
+    step: float | None = None
+    even: bool = False
+    problem: str = ""
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Of its axes, without those of one point."""
+        return tuple(n for n in self.shape if n > 1)
+
+
+def held_array(source: Source, name: str) -> Held:
+    """What one array holds; reads it."""
+    try:
+        array = read_array(source, name, name)
+    except ValueError as error:
+        return Held(name, problem=_short(str(error)))
+    values = np.asarray(array.values, dtype=np.float64)
+    finite = values[np.isfinite(values)]
+    stated = counted_in(str(array.attrs.get("units", "") or source.units.get(name, "")))
+    dims = tuple(map(str, array.dims)) if source.dims_named else ()
+    step, even = _step(values.ravel()) if values.size in values.shape else (None, False)
+    return Held(
+        name, values.shape, str(array.dtype), stated, dims,
+        float(finite.min()) if finite.size else np.nan,
+        float(finite.max()) if finite.size else np.nan,
+        typical(values), int(values.size - finite.size), step, even,
+    )  # fmt: skip
+
+
+def _short(text: str) -> str:
+    return TEXT if "real numbers" in text else text
+
+
+def _step(points: np.ndarray) -> tuple[float | None, bool]:
+    steps = np.diff(points)
+    if len(steps) < 2 or not (steps > 0).all():
+        return None, False
+    return float(steps.mean()), bool(np.ptp(steps) <= 1e-3 * steps.mean())

@@ -13,18 +13,18 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from ep2sindy.constraints.fit import constrained_fit
-from ep2sindy.constraints.relations import Relation, binding, constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.regression.constrained import constrained_fit
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.rule import (
     Selection,
     SystemSelection,

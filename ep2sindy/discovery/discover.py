@@ -9,19 +9,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Relation, relations_of
 from ep2sindy.data.given import Runs, trajectories_of
 from ep2sindy.discovery.choice import NoiseTest, noise_test
 from ep2sindy.discovery.method import DiscoveryMethod, Known, TrajectorySearch, check_kind, old_name
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
-from ep2sindy.search.front import Candidate, ParetoFront
 
 MOST_NOTES = 6  # on a screen
 

@@ -15,21 +15,21 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool
 
-from ep2sindy.constraints.relations import Relation, complete
+from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.data.repeats import check_repeats
-from ep2sindy.data.scales import column_norms, zero_to_one
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import Choice, choose, choose_by_runs
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation, complete
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
+from ep2sindy.regression.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
+from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import Formulation
+from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.search.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
-from ep2sindy.search.front import Candidate, ParetoFront, pareto_front
-from ep2sindy.search.searches import BestSubset, Search
 from ep2sindy.selection.criteria import EBIC, Evidence
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates, selected
 

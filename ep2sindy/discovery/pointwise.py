@@ -17,7 +17,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression, check_kind
 from ep2sindy.library.library import Library

@@ -6,10 +6,10 @@ import warnings
 from dataclasses import fields, replace
 
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
+from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.regression.weak import WeightedWeak
-from ep2sindy.search.bootstraps import Bootstraps
-from ep2sindy.search.searches import BestSubset, Search
 from ep2sindy.selection.criteria import EBIC, Evidence
 from ep2sindy.selection.rule import Selection, SystemSelection
 

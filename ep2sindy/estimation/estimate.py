@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Relation
-from ep2sindy.data.domain import check_domain
+from ep2sindy.data.given import check_domain
 from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
@@ -28,6 +27,7 @@ from ep2sindy.estimation.solver import (
 )
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress, counted
 

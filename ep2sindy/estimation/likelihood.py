@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
 

@@ -13,12 +13,12 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.constraints.relations import Relation, constraint
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.kernels import sensitivity_stage, term_values
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation, constraint
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.trust.memory import check_memory
 

@@ -14,8 +14,8 @@ from math import inf, log
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.domain import kept_inside
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.given import kept_inside
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.lateness import (
     PAYS,
     DelayedGram,

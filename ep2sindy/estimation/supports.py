@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, unit_sizes
 from ep2sindy.estimation.problem import EstimationProblem
-from ep2sindy.search.searches import BestSubset
+from ep2sindy.regression.searches import BestSubset
 
 MOST_SWEEPS = 10  # over the equations: two or three are the rule
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ep2sindy.figures.style import COLOURS, GREY, hover_spot, legend_above, make_grid
 from ep2sindy.library.equations import latex_derivative, latex_term_name
-from ep2sindy.search.front import Candidate, Cloud, ParetoFront
+from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 from ep2sindy.selection.rule import selected
 
 # Errors below are drawn here, where a line says so: they are rounding, or zero.

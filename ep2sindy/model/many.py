@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model import kernels
-from ep2sindy.model.runge_kutta import rk4_step
 
 # Steps of the integration per sample. One would do for the truth of every noise-free system of
 # `systems`: its error stays below 1e-9 variances; the second is for sparser samples.
@@ -158,3 +157,25 @@ class Ensemble:
         for term, coef in zip(np.moveaxis(library.evaluate(values), -1, 0), coefs, strict=True):
             slope += coef[..., None] * term
         return slope
+
+
+# The classical Runge-Kutta scheme, for many states at once.
+
+
+def rk4_step(
+    slope: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    x: np.ndarray,
+    inputs: tuple[np.ndarray, np.ndarray, np.ndarray],
+    step_s: float | np.ndarray,
+) -> np.ndarray:
+    """One step of fourth order of x' = slope(x, inputs).
+
+    inputs: at the start, middle and end of the step. step_s: one, or of a shape that broadcasts.
+    Source: Hairer, Norsett & Wanner 1993, Solving Ordinary Differential Equations I, II.1.
+    """
+    start, middle, end = inputs
+    k1 = slope(x, start)
+    k2 = slope(x + 0.5 * step_s * k1, middle)
+    k3 = slope(x + 0.5 * step_s * k2, middle)
+    k4 = slope(x + step_s * k3, end)
+    return x + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)

@@ -19,8 +19,7 @@ from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.inputs import sampled
-from ep2sindy.model.rates import rates
-from ep2sindy.model.rollout import Rollout, rollout, simulate
+from ep2sindy.model.rollout import Rollout, rates, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.runtime.arrays import read_only

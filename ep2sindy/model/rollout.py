@@ -11,12 +11,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ep2sindy.data.trajectory import Trajectory, check_time
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.model.edges import Border, edges_of
 from ep2sindy.model.inputs import Drive, driven, spline, spline_pieces
-from ep2sindy.model.rates import used_terms
-from ep2sindy.model.solve import Products, Rates, solved
+from ep2sindy.model.solve import Border, Products, Rates, edges_of, solved
 
 
 @runtime_checkable
@@ -247,3 +245,28 @@ def _scaled_rhs(model: Equations, drive: Drive | None, scale: np.ndarray) -> Rat
         return terms() @ coef
 
     return rhs
+
+
+# Right-hand sides from the terms that a model has, where its library has more.
+
+
+def rates(
+    library: Library,
+    coef: Float[np.ndarray, "terms n_states"],
+    values: Float[np.ndarray, "... variables"],
+) -> Float[np.ndarray, "... n_states"]:
+    """library(values) coef; NaN outside the domain of a function that has a coefficient."""
+    used, coef = used_terms(library, coef)
+    return used.evaluate(values) @ coef
+
+
+def used_terms(
+    library: Library, coef: Float[np.ndarray, "terms n_states"]
+) -> tuple[Library, Float[np.ndarray, "_ n_states"]]:
+    """Terms with a coefficient, where there are functions: others may have no value there."""
+    used = np.flatnonzero(coef.any(axis=1))
+    if not library.functions or len(used) == len(coef):
+        return library, coef
+    if len(used):
+        return library.take(used), coef[used]
+    return polynomial(library.variables, degree=0), coef[:1]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.domain import check_domain, kept_inside
+from ep2sindy.data.given import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.rates import rates, used_terms
-from ep2sindy.model.rollout import Equations
+from ep2sindy.model.rollout import Equations, rates, used_terms
 from ep2sindy.signals.smoothers import Smoother
 
 

@@ -16,8 +16,8 @@ from ep2sindy.model.closed_orbit import (
     deviations,
     free_run,
 )
+from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.runge_kutta import rk4_step
 from ep2sindy.model.scaled import ScaledModel
 from ep2sindy.runtime.arrays import read_only
 

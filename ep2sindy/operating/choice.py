@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.discovery.method import Regression
-from ep2sindy.discovery.shared_support import discover_jointly
 from ep2sindy.library.library import Library
 from ep2sindy.operating.fit import (
     LeaveOneOut,
@@ -28,12 +27,13 @@ from ep2sindy.operating.records import (
     check_records,
     interpolation_errors,
 )
+from ep2sindy.operating.shared_support import discover_jointly
 from ep2sindy.refinement.law import LawRefinement
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.search.searches import BestSubset
 
 MOST_PARAMETERS = 2  # of a map that can be drawn
 N_TOGETHER = 24  # points of a map that are computed as one piece: the records travel with each

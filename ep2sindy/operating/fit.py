@@ -9,9 +9,8 @@ from functools import cached_property, partial
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.fit import constrained_fit
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.relations import constraint
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import FreeRunBounds, Verdict, deviation
 from ep2sindy.model.model import SparseModel
@@ -26,6 +25,7 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
+from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.runtime.parallel import Serial, Workers, collect

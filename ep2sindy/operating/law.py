@@ -16,8 +16,7 @@ from scipy.optimize import nnls
 from scipy.special import ndtri
 from scipy.stats import f as f_distribution
 
-from ep2sindy.data.scales import column_norms, zero_to_one
-from ep2sindy.discovery.shared_support import JointDiscovery, JointFront
+from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
@@ -25,11 +24,12 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, point_label
+from ep2sindy.operating.shared_support import JointDiscovery, JointFront
 from ep2sindy.refinement.weighted_law import Basis
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.files import read_json, write_text
-from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.rule import FLOOR
 
 FORMAT = "ep2sindy.OperatingLaw/1"

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 from scipy.optimize import root
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import Stability, limit_cycle
 from ep2sindy.operating.law import OperatingLaw

@@ -9,14 +9,12 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.fit import WeightedEquation, constrained_fit, weighted_equations
-from ep2sindy.constraints.relations import Constraint
-from ep2sindy.data.scales import column_norms
+from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.discovery.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.law import LawFit, fit_law
@@ -31,15 +29,17 @@ from ep2sindy.operating.quantities import (
     propagated_estimates,
 )
 from ep2sindy.operating.records import OperatingRecord, check_alike, naming
+from ep2sindy.operating.shared_support import JointDiscovery, discover_jointly
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import MIN_SAMPLES
+from ep2sindy.regression.bootstraps import Bootstraps, moving_block_counts
+from ep2sindy.regression.constrained import WeightedEquation, constrained_fit, weighted_equations
 from ep2sindy.regression.rows import Formulation, RegressionRows
+from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.search.bootstraps import Bootstraps, moving_block_counts
-from ep2sindy.search.searches import BestSubset
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency, samples_in
 

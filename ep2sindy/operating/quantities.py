@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Constraint, place_of
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, place_of
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from ep2sindy.data.scales import column_norms
+from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.quantities import PointResult

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude

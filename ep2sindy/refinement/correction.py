@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import RefinementStatus, is_flat, status_of
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent

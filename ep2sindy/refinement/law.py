@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import RefinementStatus, RefinementVerdict, fit_and_judge
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import nn
 from torchdiffeq import odeint
 
-from ep2sindy.constraints.relations import Constraint
-from ep2sindy.constraints.relations import constraint as build_constraint
 from ep2sindy.library.library import Library, library_of
+from ep2sindy.library.relations import Constraint
+from ep2sindy.library.relations import constraint as build_constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.kernels import propagate
 

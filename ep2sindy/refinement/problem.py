@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Constraint
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.ode import ODE, ONE_RUNGE_KUTTA, Augmented, Drive, Step, augment
 from ep2sindy.refinement.weighted_law import Basis

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.relations import Constraint
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import (

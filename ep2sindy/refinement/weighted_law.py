@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.scales import column_norms, zero_to_one
+from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.runtime.arrays import read_only
 
 # Directions of a basis or of all information below this share of the strongest count as absent.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
 

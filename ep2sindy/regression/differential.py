@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ep2sindy.data.domain import check_domain, kept_inside
+from ep2sindy.data.given import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import RegressionRows

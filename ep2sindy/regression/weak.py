@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import block_diag, csr_array
 
-from ep2sindy.data.domain import check_domain, kept_inside
+from ep2sindy.data.given import check_domain, kept_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import usable_terms

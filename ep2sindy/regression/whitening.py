@@ -10,8 +10,8 @@ from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csr_array
 
-from ep2sindy.data.domain import kept_inside
-from ep2sindy.data.scales import column_norms
+from ep2sindy.data.given import kept_inside
+from ep2sindy.data.numbers import column_norms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 
 # No sample is moved by more standard deviations of its noise: a wrong model would never end.

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.library.library import Library
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.search.front import Candidate, ParetoFront
 from ep2sindy.selection.rule import FLOOR
 
 # Rounds of weighting the rows by the covariance under the candidate that leads.

@@ -9,17 +9,17 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.constraints.relations import Relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.likeness import FreeRunBounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.refinement.refine import refine_batch
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress, counted
-from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import (
     FLOOR,

@@ -9,15 +9,15 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Constraint, Relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, Relation
 from ep2sindy.model.many import Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import refine_batch, smooth_batch
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
-from ep2sindy.search.front import ParetoFront
 from ep2sindy.selection.rule import (
     FLOOR,
     MAX_ERROR,

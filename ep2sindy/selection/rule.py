@@ -10,12 +10,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Relation, binding
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation, binding
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.search.front import Candidate, ParetoFront
 
 # What no noise-free fit can fall below, as a share of the target's squares: beneath it a
 # criterion would select terms that explain the discretisation.

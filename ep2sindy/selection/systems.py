@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import Constraint, Relation, binding, constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
-from ep2sindy.search.front import ParetoFront
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.selection.rule import support_of
 from ep2sindy.signals.kalman import KalmanSmoother
 

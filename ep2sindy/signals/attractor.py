@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy import fft
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
 

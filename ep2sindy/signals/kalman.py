@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.kernels import likelihood, smoothed

@@ -13,7 +13,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.signals.spectrum import peak, power_spectrum
 
 PEAK_WIDTH = 0.05  # of the frequency, or two bins if these are more, to either side of a peak

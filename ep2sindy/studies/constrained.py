@@ -8,8 +8,8 @@ from typing import Annotated
 
 import numpy as np
 
-from ep2sindy.constraints.relations import Constraint, constraint
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import counted

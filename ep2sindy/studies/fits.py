@@ -17,15 +17,15 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from ep2sindy.constraints.fit import constrained_fit
-from ep2sindy.constraints.relations import Constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.relations import Constraint
 from ep2sindy.library.terms import variables_of
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import dominant_window
+from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts

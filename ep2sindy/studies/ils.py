@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from ep2sindy.constraints.relations import Constraint, constraint
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.windows import loss_against_window_figure
 from ep2sindy.library.library import polynomial
+from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES

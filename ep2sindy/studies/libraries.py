@@ -20,12 +20,12 @@ from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, counted
-from ep2sindy.search.bootstraps import Bootstraps
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother

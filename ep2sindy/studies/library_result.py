@@ -20,10 +20,10 @@ from ep2sindy.library.units import Clock
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.ambiguity import usable_terms
+from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
-from ep2sindy.search.front import Candidate, ParetoFront, fit_support
 from ep2sindy.selection.rule import selected
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.term_roles import Roles

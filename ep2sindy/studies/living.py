@@ -24,10 +24,10 @@ from ep2sindy.model.likeness import FreeRunBounds, Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
+from ep2sindy.regression.searches import Search
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.search.searches import Search
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.kalman import KalmanSmoother

@@ -10,11 +10,11 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.constraints.relations import constraint
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.figures.trends import rows_at, trends_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.relations import constraint
 from ep2sindy.library.units import SECONDS
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.point_fits import (

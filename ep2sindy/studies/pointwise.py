@@ -15,8 +15,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from ep2sindy.data.fields import SPACE
-from ep2sindy.data.netcdf import write_netcdf
+from ep2sindy.data.fields import SPACE, write_netcdf
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
 from ep2sindy.discovery.recipe import regression_of

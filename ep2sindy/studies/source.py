@@ -11,13 +11,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import xarray as xr
 
-from ep2sindy.data.extent import Zone, in_numbers, zone_words
 from ep2sindy.data.fields import grid_points
 from ep2sindy.data.gaps import gap_words
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
-from ep2sindy.data.zones import ZoneAverage
+from ep2sindy.data.zones import Zone, ZoneAverage, in_numbers, zone_words
 from ep2sindy.library.library import Library
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run

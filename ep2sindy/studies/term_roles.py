@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.constraints.fit import constrained_fit
-from ep2sindy.constraints.relations import Constraint, Relation, constraint, parse_relation
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery
+from ep2sindy.library.relations import Constraint, Relation, constraint, parse_relation
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.likeness import FreeRunBounds
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.report.document import Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.runtime.progress import SILENT, Progress, counted

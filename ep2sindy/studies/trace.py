@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.data.extent import Zone
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.figures.fronts import front_figure

@@ -18,6 +18,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
+from ep2sindy.regression.front import fit_support
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions
 from ep2sindy.regression.weak import Weak
@@ -25,7 +26,6 @@ from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, 
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import SILENT, Progress, counted
-from ep2sindy.search.front import fit_support
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import Terms, equation_texts, terms_of
 from ep2sindy.studies.source import Source, data_summary

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from scipy.special import expit
 
 from ep2sindy.library.library import Library, named_terms
+from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import coef_matrix
-from ep2sindy.model.runge_kutta import rk4_step
 from ep2sindy.thruster.parameters import Thruster
 
 Equations = Mapping[str, Mapping[str, float]]

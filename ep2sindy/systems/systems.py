@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.edges import Border
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.model.solve import solved
+from ep2sindy.model.solve import Border, solved
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import Any
 import xarray as xr
 from tqdm import tqdm
 
-from ep2sindy.data.netcdf import write_netcdf
+from ep2sindy.data.fields import write_netcdf
 from ep2sindy.runtime.files import fingerprint, sweep, writing
 from ep2sindy.runtime.screen import in_line, on_screen
 from ep2sindy.thruster.axial.settings import to_json

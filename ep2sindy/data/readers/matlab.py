@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import xarray as xr
 
 from ep2sindy.data.readers.hdf5 import names_in_hdf5, written
 from ep2sindy.data.readers.source import Reader, Source, leaves
+from ep2sindy.trust.limits import check_declared
 
 V73 = b"MATLAB 7.3"
 
@@ -47,3 +49,23 @@ def read_matlab5(path: Path) -> Source:
 
 
 MATLAB = Reader("MATLAB (v5, v7.3)", read_matlab, first_bytes=(b"MATLAB 5.0", V73))
+
+
+# NumPy archives.
+
+
+def read_npz(path: Path) -> Source:
+    """NumPy arrays saved with `numpy.savez`; pickled objects are refused."""
+
+    def read(name: str) -> xr.DataArray:
+        with np.load(path, allow_pickle=False) as arrays:
+            return xr.DataArray(arrays[name])
+
+    with ZipFile(path) as archive:
+        for member in archive.infolist():
+            check_declared(repr(member.filename), member.file_size, path)
+    with np.load(path, allow_pickle=False) as arrays:
+        return Source(path, list(arrays), read)
+
+
+NPZ = Reader("npz", read_npz, first_bytes=(b"PK",))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Collection
 from dataclasses import replace
+from itertools import pairwise
+from math import prod
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.classic import check_places
 from ep2sindy.data.readers.hdf5 import holes_of
 from ep2sindy.data.readers.source import Reader, Source, dataset_source
 
@@ -76,3 +78,107 @@ def _without_holes(source: Source, holes: Collection[str]) -> Source:
 NETCDF = Reader(
     "NetCDF", read_netcdf, first_bytes=(b"CDF",), form="hdf5", endings=(".nc", ".nc4", ".cdf")
 )
+
+
+# Where the samples of a classic NetCDF file (CDF-1, CDF-2, CDF-5) stand, from its header.
+#
+# Source: https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html
+
+
+# Bytes of a number by its type: byte, char, short, int, float, double, ubyte to uint64.
+SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 8, 7: 1, 8: 2, 9: 4, 10: 8, 11: 8}
+
+WIDTHS = {1: (4, 4), 2: (4, 8), 5: (8, 8)}  # by version: bytes of a count, and of a place
+
+BIG_ENDIAN = {4: ">I", 8: ">Q"}
+
+
+def check_places(path: Path) -> None:
+    """Raise ValueError unless every variable has a place of its own, after the header, in the file.
+
+    Values have no checksum here, and a damaged place would read as other values.
+    """
+    with path.open("rb") as file:
+        try:
+            header = _Header(file)
+            blocks = _blocks(header)
+        except (struct.error, KeyError, IndexError, OverflowError) as error:
+            raise ValueError("its header is cut or damaged") from error
+        blocks = [(0, file.tell()), *sorted(blocks)]
+    end, size = max(stop for _, stop in blocks), path.stat().st_size
+    if size < end:
+        raise ValueError(f"its header describes {end} bytes, and it has {size}")
+    for (_, stop), (start, _) in pairwise(blocks):
+        if start < stop:
+            raise ValueError(f"its header is damaged: two of its parts claim byte {start}")
+
+
+class _Header:
+    """Reads numbers, names and lists one after the other."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        file.seek(3)
+        self.count_bytes, self.place_bytes = WIDTHS[file.read(1)[0]]
+
+    def _number(self, n_bytes: int) -> int:
+        return int(struct.unpack(BIG_ENDIAN[n_bytes], self._file.read(n_bytes))[0])
+
+    def small(self) -> int:
+        return self._number(4)
+
+    def number(self) -> int:
+        return self._number(self.count_bytes)
+
+    def place(self) -> int:
+        return self._number(self.place_bytes)
+
+    def count(self) -> int:
+        """Of a list: a tag, then how many."""
+        self.small()
+        return self.number()
+
+    def skip(self, n_bytes: int) -> None:
+        """Over some bytes, and what fills them up to four."""
+        self._file.seek(_padded(n_bytes), 1)
+
+    def attributes(self) -> None:
+        for _ in range(self.count()):
+            self.skip(self.number())
+            kind = self.small()
+            self.skip(SIZES[kind] * self.number())
+
+
+def _blocks(header: _Header) -> list[tuple[int, int]]:
+    """First byte and end of every variable; those with records, of all of these together."""
+    n_records = header.number()
+    if n_records == 256**header.count_bytes - 1:  # its writer did not know: one at least
+        n_records = 1
+    lengths = []
+    for _ in range(header.count()):
+        header.skip(header.number())
+        lengths.append(header.number())
+    header.attributes()
+    fixed: list[tuple[int, int]] = []
+    by_record: list[tuple[int, int]] = []
+    for _ in range(header.count()):
+        header.skip(header.number())
+        shape = [lengths[header.number()] for _ in range(header.number())]
+        header.attributes()
+        size = SIZES[header.small()]
+        header.number()  # its bytes, which may be too many for this number
+        begin = header.place()
+        in_records = bool(shape) and shape[0] == 0
+        (by_record if in_records else fixed).append((begin, size * prod(shape[in_records:])))
+    blocks = [(begin, begin + n_bytes) for begin, n_bytes in fixed]
+    if not by_record or not n_records:
+        return blocks
+    alone = len(by_record) == 1
+    step = sum(n if alone else _padded(n) for _, n in by_record)
+    blocks += [(begin, begin + n) for begin, n in by_record]
+    first, (last, n_last) = min(by_record)[0], max(by_record)
+    return [*blocks, (first + step, max(first + step, last + (n_records - 1) * step + n_last))]
+
+
+def _padded(n_bytes: int) -> int:
+    return -(-n_bytes // 4) * 4

@@ -8,9 +8,8 @@ from pathlib import Path
 from ep2sindy.data.readers.csv import CSV
 from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
 from ep2sindy.data.readers.hdf5 import HDF5
-from ep2sindy.data.readers.matlab import MATLAB
+from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF
-from ep2sindy.data.readers.npz import NPZ
 from ep2sindy.data.readers.source import Reader, Source, damage_named, look_at
 from ep2sindy.data.readers.zarr import ZARR
 from ep2sindy.trust.guard import look_through_first

@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ep2sindy.data.scales import zero_to_one
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.regression.gram_fits import solve_masks
-from ep2sindy.search.searches import AdaptiveLasso
+from ep2sindy.regression.searches import AdaptiveLasso
 
 
 class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):

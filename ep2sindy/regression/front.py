@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2
+from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
-from ep2sindy.search.bootstraps import Supports
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.search.kernels import adaptive_lasso_supports, best_subsets, thresholded_supports
+from ep2sindy.regression.search_kernels import (
+    adaptive_lasso_supports,
+    best_subsets,
+    thresholded_supports,
+)
 from ep2sindy.trust.memory import check_memory
 
 

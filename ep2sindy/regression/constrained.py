@@ -9,8 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.constraints.relations import ROUNDING, Constraint, place_of
-from ep2sindy.data.scales import column_norms
+from ep2sindy.data.numbers import column_norms
+from ep2sindy.library.relations import ROUNDING, Constraint, place_of
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import WhitenedRows, whitened_rows

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.regression.ambiguity import largest_support, usable_terms
 from ep2sindy.regression.gram_fits import solve_masks
 from ep2sindy.regression.rows import Grams, RegressionRows
+from ep2sindy.regression.searches import Search
 from ep2sindy.runtime.progress import Advance, nothing
-from ep2sindy.search.searches import Search
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,0 @@
-"""Constraints: relations between coefficients, and fits that keep them."""
