@@ -126,8 +126,11 @@ def _load_old(module: str, name: str) -> Any:
     old = f"{module}.{name}"
     new = new_name(old)
     if new is None:
-        text = gone_text(old) or f"module {module!r} has no attribute {name!r}; {_near(old)}"
-        raise AttributeError(text, name=name, obj=sys.modules[module])
+        raise AttributeError(
+            f"module {module!r} has no attribute {name!r}; {gone_text(old) or _near(old)}",
+            name=name,
+            obj=sys.modules[module],
+        )
     warn(moved_text(old), FutureWarning, stacklevel=3)
     return dotted_names()[new].load()
 

@@ -76,7 +76,7 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
     ("room", "name", "said"),
     [
         ("ep2sindy", "Eebic", r"no attribute 'Eebic'; see dir\(ep2sindy\)"),
-        ("ep2sindy", "Trajectry", r"see dir\(ep2sindy\); near it is ep2sindy.Trajectory$"),
+        ("ep2sindy", "Trajectry", r"see dir\(ep2sindy\); near it are ep2sindy.Trajectory, "),
         ("ep2sindy.thruster", "crop", r"see dir\(ep2sindy.thruster\); near it is .*prepare.crop$"),
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],

@@ -206,13 +206,12 @@ def test_files_and_functions_stay_short() -> None:
 # Values that are not ours, by module: of these it may be asked what they have.
 FOREIGN = {
     "app.build": "a callable of a user's own, which may be compiled and have no name",
-    "app.defaults": "the package as a module, for the name of a class of any origin",
     "app.runner": "a module of a user's own, which may be a package of experiments",
-    "machine.compilation": "kernels of numba, which has no public way to its cache",
-    "machine.files": "an error of any kind, which may say what the system said",
-    "machine.interruption": "os and signal, which have less on Windows",
-    "machine.own": "whatever a user marked for configs",
-    "studies.simulate_scan": "what a data group gave, which may be no xarray.Dataset",
+    "runtime.compilation": "kernels of numba, which has no public way to its cache",
+    "runtime.files": "an error of any kind, which may say what the system said",
+    "trust.interruption": "os and signal, which have less on Windows",
+    "trust.user_code": "whatever a user marked for configs",
+    "studies.simulate": "what a data group gave, which may be no xarray.Dataset",
 }
 
 

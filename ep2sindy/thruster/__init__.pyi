@@ -32,6 +32,6 @@ from ep2sindy.thruster.walls import AnodeSheath as AnodeSheath  # for configs
 from ep2sindy.thruster.walls import FixedAnode as FixedAnode  # for configs
 from ep2sindy.thruster.hallthruster_input import HallThrusterInput as HallThrusterInput
 from ep2sindy.thruster.hallthruster_input import read_hallthruster_input as read_hallthruster_input
-from ep2sindy.thruster.hallthruster_run import (
+from ep2sindy.thruster.hallthruster_input import (
     simulate_hallthruster_input as simulate_hallthruster_input,
 )  # for configs

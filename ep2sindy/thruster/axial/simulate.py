@@ -89,10 +89,8 @@ def simulate(
     >>> field["n_i"].dims
     ('time', 'z')
     """
-    settings = Settings(
-        duration_s, warm_up_s, sample_s, averaged,
-        n_cells, stretch, reconstruct, cfl, coldest_T_e_eV,
-    )  # fmt: skip
+    run = duration_s, warm_up_s, sample_s, averaged
+    settings = Settings(*run, n_cells, stretch, reconstruct, cfl, coldest_T_e_eV)
     start = as_start(initial)
     simulation = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
     parameters = _parameters(settings, thruster, operating_point) | {"initial": start.label}
