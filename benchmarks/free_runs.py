@@ -16,7 +16,7 @@ import numpy as np
 import ep2sindy as ep
 from benchmarks.timing import cpu_s
 from ep2sindy.model.inputs import spline, spline_pieces
-from ep2sindy.model.solve import Border, Products, Solved, solved
+from ep2sindy.model.solve import Border, Products, Solved, solve_stages
 
 PERIODS, PER_PERIOD = 10, 60
 # Each system with its period in its own unit of time.
@@ -30,7 +30,7 @@ SYSTEMS = {
 def run(rates: Callable, t: np.ndarray, y: np.ndarray, rtol: float) -> Solved:
     """Without a bound or an edge."""
     free = Border((), lambda _, state: state)
-    return solved(rates, free, t, y, blow_up=np.inf, bound="", rtol=rtol, limit_s=300.0)
+    return solve_stages(rates, free, t, y, blow_up=np.inf, bound="", rtol=rtol, limit_s=300.0)
 
 
 def equations(system: ep.systems.System, curves: tuple[np.ndarray, np.ndarray]) -> Products:

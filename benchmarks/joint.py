@@ -19,7 +19,7 @@ from benchmarks.breathing_family import LAW, LIBRARY, PARAMETERS, TRUTH, realiza
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.operating.law import fit_law
-from ep2sindy.operating.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.test_functions import Bumps
@@ -28,9 +28,9 @@ from ep2sindy.runtime.parallel import Loky, Workers
 from ep2sindy.selection.criteria import EBIC
 
 
-def find(recipe: AnyMethod, points: Mapping[str, Sequence[Trajectory]]) -> JointDiscovery:
+def find(recipe: AnyMethod, points: Mapping[str, Sequence[Trajectory]]) -> SharedDiscovery:
     """The same search for all points jointly and for one alone."""
-    return discover_jointly(points, LIBRARY, recipe, seed=0)
+    return discover_shared(points, LIBRARY, recipe, seed=0)
 
 
 def run_family(
@@ -73,14 +73,14 @@ def outcome(recipe: AnyMethod, task: tuple[float, int], *, seed: int = 0) -> dic
     return row | (_errors(joint) if row["joint"] else dict.fromkeys(ERRORS, np.nan))
 
 
-def _right(found: JointDiscovery) -> float:
+def _right(found: SharedDiscovery) -> float:
     return float(all(set(found.chosen[state]) == set(terms) for state, terms in TRUTH.items()))
 
 
 ERRORS = ("error_free", "error_tied", "p_value")
 
 
-def _errors(joint: JointDiscovery) -> dict[str, float]:
+def _errors(joint: SharedDiscovery) -> dict[str, float]:
     tied = fit_law(joint, LAW, parameters=PARAMETERS)
     errors: dict[str, list[float]] = {"error_free": [], "error_tied": []}
     for point, parameters in PARAMETERS.items():

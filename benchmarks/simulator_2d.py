@@ -13,10 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.thruster.plane.build import build_model, initial_state, state_of
 from ep2sindy.thruster.plane.grid import MaskedGrid
 from ep2sindy.thruster.plane.kernels import advance
-from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D, PLANES, PROFILES, THRUSTER_2D
+from ep2sindy.thruster.plane.simulate import (
+    OPERATING_POINT_2D,
+    PLANES,
+    PROFILES,
+    THRUSTER_2D,
+    build_model,
+    initial_state,
+    state_of,
+)
 from ep2sindy.thruster.plane.state_kernels import Model, State
 
 SAMPLE_S = 1.5e-6

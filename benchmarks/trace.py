@@ -22,8 +22,8 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import free_run
-from ep2sindy.model.likeness import Verdict
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.free_run import FreeRunScore

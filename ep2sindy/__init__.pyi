@@ -22,8 +22,8 @@ from ep2sindy.library.library import named_terms as named_terms
 from ep2sindy.discovery.discover import discover as discover
 from ep2sindy.discovery.discover import Discovery as Discovery
 from ep2sindy.discovery.recipe import Recipe as Recipe  # for configs
-from ep2sindy.operating.shared_support import discover_jointly as discover_jointly
-from ep2sindy.operating.shared_support import JointDiscovery as JointDiscovery
+from ep2sindy.operating.shared_support import discover_shared as discover_shared
+from ep2sindy.operating.shared_support import SharedDiscovery as SharedDiscovery
 from ep2sindy.discovery.pointwise import pointwise as pointwise
 from ep2sindy.estimation.estimate import estimate as estimate
 
@@ -52,13 +52,13 @@ from ep2sindy.selection.criteria import Knee as Knee  # for configs
 from ep2sindy.selection.criteria import Evidence as Evidence  # for configs
 from ep2sindy.selection.refined import RefinedScore as RefinedScore  # for configs
 from ep2sindy.selection.free_run import FreeRunScore as FreeRunScore  # for configs
-from ep2sindy.model.likeness import FreeRunBounds as FreeRunBounds  # for configs
+from ep2sindy.model.comparison import FreeRunBounds as FreeRunBounds  # for configs
 
 # Models
 from ep2sindy.model.model import SparseModel as SparseModel
 from ep2sindy.model.free_run import FreeRun as FreeRun
 from ep2sindy.model.free_run import free_run as free_run
-from ep2sindy.model.likeness import Verdict as Verdict
+from ep2sindy.model.comparison import Verdict as Verdict
 from ep2sindy.model.stability import LimitCycle as LimitCycle
 from ep2sindy.model.stability import limit_cycle as limit_cycle
 from ep2sindy.model.stability import share_reaching as share_reaching

@@ -60,6 +60,8 @@ RENAMED = {
     "tied_fit": "operating.fit_law",
     "trace": "signals.from_one_signal",
     "Joint": "TrajectorySearch",
+    "JointDiscovery": "SharedDiscovery",
+    "discover_jointly": "discover_shared",
     "refine_many": "refine",
     "refine_tied": "refinement.refine_law",
     "TiedRefinement": "refinement.LawRefinement",

@@ -15,7 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from ep2sindy.app.main import main
-from ep2sindy.app.runner import about, started_run, study_class
+from ep2sindy.app.runner import about, start_run, study_class
 from ep2sindy.app.schema import study_of
 from ep2sindy.report.page import page_html
 
@@ -63,7 +63,7 @@ class Computed:
 
 
 def computed(config: DictConfig) -> Computed:
-    with started_run(config) as run:
+    with start_run(config) as run:
         study = study_of(study_class(config.study), config)
         outcome = study.compute(run)
         sections = outcome.sections()

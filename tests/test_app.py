@@ -13,9 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
 from ep2sindy.app import program, sweep
-from ep2sindy.app.build import Configured
-from ep2sindy.app.runner import check_overrides, hparams_of, known_studies, run_config, study_class
-from ep2sindy.app.schema import keys_of, study_of, value_of
+from ep2sindy.app.runner import check_overrides, hparams_of, list_studies, run_config, study_class
+from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.runtime.files import write_json, write_text
@@ -186,7 +185,7 @@ def test_only_groups_that_a_study_uses_may_be_set() -> None:
 
 
 def test_studies_are_found_by_name() -> None:
-    assert "libraries" in known_studies()
+    assert "libraries" in list_studies()
     assert study_class("libraries").__name__ == "Study"
     with pytest.raises(ValueError, match=r"study must name a module .* 'librarys' came"):
         study_class("librarys")

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from ep2sindy.signals.attractor import (
-    _averaged,
+    _moving_average,
     best_shift,
     distribution_distances,
     find_cycle,
@@ -36,7 +36,9 @@ def times(n_periods: float) -> np.ndarray:
 def test_averages_under_a_window_are_those_of_scipy(n: int) -> None:
     x = np.exp(1j * np.arange(301) ** 1.5)
     window = np.hanning(n)
-    np.testing.assert_allclose(_averaged(x, window), fftconvolve(x, window, "same"), atol=1e-12)
+    np.testing.assert_allclose(
+        _moving_average(x, window), fftconvolve(x, window, "same"), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("n_periods", [6.3, 20.0, 81.7])

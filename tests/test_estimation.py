@@ -16,7 +16,7 @@ from ep2sindy.estimation import problem as estimation_problem
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
 from ep2sindy.estimation.noise import noise_beside
-from ep2sindy.estimation.problem import EstimationProblem, scaled_problem
+from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -112,7 +112,7 @@ def test_departures_are_those_of_the_dense_problem(rng: np.random.Generator) -> 
 
 def lorenz_problem(**settings: object) -> tuple[EstimationProblem, ep.Trajectory]:
     run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 200)
-    return scaled_problem([run], ep.lorenz().model.library, **settings), run  # type: ignore[arg-type]
+    return scale_problem([run], ep.lorenz().model.library, **settings), run  # type: ignore[arg-type]
 
 
 def truth(problem: EstimationProblem, model: ep.SparseModel) -> np.ndarray:

@@ -8,7 +8,7 @@ import xarray as xr
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ep2sindy.app.runner import run_config, started_run
+from ep2sindy.app.runner import run_config, start_run
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.figures.trends import trends_figure
@@ -37,7 +37,7 @@ def composed(*overrides: str) -> DictConfig:
 
 def computed(config: DictConfig) -> tuple[Outcome, str, str]:
     """What a study finds, its page and its log: all but figures, which take long to draw."""
-    with started_run(config) as run:
+    with start_run(config) as run:
         outcome = study_of(Study, config).compute(run)
         sections = outcome.sections()
         run.screen.show(sections)

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy.app.runner import run_config, started_run
+from ep2sindy.app.runner import run_config, start_run
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.discovery.pointwise import Block, Kept
@@ -32,7 +32,7 @@ def composed(*overrides: str) -> DictConfig:
 def computed(*overrides: str) -> tuple[Outcome, Path]:
     """What the study finds, and the run folder, without tables and figures."""
     config = composed(*overrides)
-    with started_run(config) as run:
+    with start_run(config) as run:
         return study_of(pointwise.Study, config).compute(run), run.folder.path
 
 

@@ -11,9 +11,8 @@ import pytest
 import xarray as xr
 from omegaconf import DictConfig
 
-from ep2sindy.app.build import Configured
 from ep2sindy.app.runner import run_config
-from ep2sindy.app.schema import study_of
+from ep2sindy.app.schema import Configured, study_of
 from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError

@@ -8,8 +8,8 @@ import pytest
 from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.comparison import FreeRunBounds, Verdict
 from ep2sindy.model.free_run import free_run, samples_in
-from ep2sindy.model.likeness import FreeRunBounds, Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.systems.systems import lorenz
 

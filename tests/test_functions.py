@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import ep2sindy as ep
-from ep2sindy.data.given import kept_inside
+from ep2sindy.data.coerce import keep_inside
 from ep2sindy.library import functions as registry
 from ep2sindy.library.equations import (
     equation_html,
@@ -161,7 +161,7 @@ def test_polynomials_are_the_same_library_as_ever() -> None:
     columns = np.ones((7, 3))
     assert library.functions == ()
     assert library.with_functions(columns, axis=1) is columns
-    assert kept_inside(library, columns, columns) is columns
+    assert keep_inside(library, columns, columns) is columns
     assert library.exponents.shape == (10, 2)
 
 
@@ -323,7 +323,7 @@ def test_what_a_smoother_moves_out_of_a_domain_stays_with_its_sample() -> None:
     library = named_terms(["x", "v"], ["log(x)", "v"])
     samples, moved = np.array([[0.1, 1.0], [0.2, 2.0]]), np.array([[-0.1, 1.5], [0.3, 2.5]])
     expected = [[0.1, 1.5], [0.3, 2.5]]
-    np.testing.assert_array_equal(kept_inside(library, moved, samples), expected)
+    np.testing.assert_array_equal(keep_inside(library, moved, samples), expected)
 
 
 @pytest.mark.parametrize(

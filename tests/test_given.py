@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.given import trajectories_of
+from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.discovery.method import check_kind
 from ep2sindy.selection.rule import Selection
 

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.gaps import gap_words, present_rows
+from ep2sindy.data.gaps import describe_gaps, present_rows
 
 T = np.sort(np.random.default_rng(2).uniform(0.0, 1.0, 400))
 T[[0, -1]] = 0.0, 1.0
@@ -172,7 +172,7 @@ def test_samples_that_no_row_holds_together_are_named() -> None:
 
 
 def test_gaps_are_told_with_their_length() -> None:
-    words = gap_words(np.array([0, 1, 2, 5, 6, 8, 9, 10.0]), 11)
+    words = describe_gaps(np.array([0, 1, 2, 5, 6, 8, 9, 10.0]), 11)
     assert words.startswith(
         "3 of 11 samples are missing (NaN) and left out; the longest gap is 3 s"
     )

@@ -15,7 +15,7 @@ from ep2sindy.app.inspection import experiments
 from ep2sindy.data.conversion import conversion
 from ep2sindy.data.quantities import meant_by
 from ep2sindy.data.readers.registry import open_source
-from ep2sindy.data.recognition import recognised
+from ep2sindy.data.recognition import recognise
 
 NT, NZ, NR = 40, 7, 5
 T = np.arange(NT) * 1.5e-6
@@ -153,7 +153,7 @@ def test_a_rate_beside_a_time_says_its_unit(tmp_path: Path, factor: float, unit:
 def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
     square = 1e18 * np.repeat(WAVE[:, :, :1], NZ, axis=2)
     np.savez(tmp_path / "a.npz", t=T, z=Z, r=R[0] + Z, ni=square, I_d=WAVE[:, 0, 0])
-    found = recognised(open_source(tmp_path / "a.npz"))
+    found = recognise(open_source(tmp_path / "a.npz"))
     assert "n_i" not in found.variables
     assert any(
         "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]" in q for q in found.questions
@@ -162,7 +162,7 @@ def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
 
 def test_two_names_for_one_quantity_are_asked(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, ni=N_I[:, 0, 0], ion_density=N_I[:, 1, 0])
-    found = recognised(open_source(tmp_path / "a.npz"))
+    found = recognise(open_source(tmp_path / "a.npz"))
     assert "n_i may be 'ni' or 'ion_density': name one" in found.questions
 
 

@@ -12,7 +12,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.operating.law import fit_law
-from ep2sindy.operating.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset, Search
@@ -74,13 +74,13 @@ def rows_of(
 
 def searched(
     rows: Mapping[str, RegressionRows], *, selection: Selection, search: Search = BEST
-) -> JointDiscovery:
+) -> SharedDiscovery:
     def label(point: str) -> Trajectory:
         ramp = np.arange(3.0)
         values = np.ones((3, 6))
         return Trajectory(ramp, ramp[:, None], ["y"], values, NAMES, label=point)
 
-    return discover_jointly(
+    return discover_shared(
         {point: [label(point)] for point in rows},
         named_terms(NAMES, NAMES),
         Regression(formulation=Given(rows), search=search, selection=selection),
@@ -98,7 +98,7 @@ def test_one_point_gives_what_discover_does(formulation: Formulation, selection:
     library = polynomial(["x", "y"], degree=3)
     recipe = Regression(formulation, BestSubset(n_best=3), selection=selection, depth=3)
     alone = discover([run], library, recipe, seed=1)
-    joint = discover_jointly({"A": [run]}, library, recipe, seed=1)
+    joint = discover_shared({"A": [run]}, library, recipe, seed=1)
     for state, front in alone.fronts.items():
         assert joint.fronts[state].supports == tuple(c.terms for c in front.candidates)
         assert joint.fronts[state].errors == pytest.approx(front.errors, rel=1e-12)
@@ -221,7 +221,7 @@ def test_order_of_points_changes_nothing() -> None:
 
 def test_points_may_be_sampled_differently() -> None:
     fast, slow = replace(lotka_volterra(), rate_Hz=25.0, duration_s=30.0), lotka_volterra(b=0.5)
-    found = discover_jointly(
+    found = discover_shared(
         {
             "fast": [fast.trajectory()],
             "slow": [slow.trajectory(), slow.trajectory().window(0, 400)],

@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import cho_factor, cho_solve, null_space
 
 from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratio
-from ep2sindy.signals.kernels import likelihood, smoothed
+from ep2sindy.signals.kernels import likelihood, smooth
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.systems.systems import (
     System,
@@ -66,7 +66,7 @@ def restricted_likelihood(
 def test_smoother_is_the_process_conditioned_on_the_samples(
     t: np.ndarray, log10_ratio: float
 ) -> None:
-    signal, slope = smoothed(np.diff(t), NOISE, 10.0**log10_ratio)
+    signal, slope = smooth(np.diff(t), NOISE, 10.0**log10_ratio)
     exact_signal, exact_slope = universal_kriging(t, NOISE, 10.0**log10_ratio)
     # Dense algebra loses the digits here: its condition number reaches ratio * 11^5.
     assert np.allclose(signal, exact_signal, atol=1e-8)
@@ -88,9 +88,9 @@ def test_likelihood_is_that_of_the_joint_normal(t: np.ndarray, log10_ratio: floa
 @every_time
 @every_ratio
 def test_smoother_is_a_symmetric_matrix(t: np.ndarray, log10_ratio: float) -> None:
-    matrix = smoothed(np.diff(t), np.eye(12), 10.0**log10_ratio)[0]
+    matrix = smooth(np.diff(t), np.eye(12), 10.0**log10_ratio)[0]
     assert np.allclose(matrix, matrix.T, atol=1e-10)
-    assert np.allclose(smoothed(np.diff(t), NOISE, 10.0**log10_ratio)[0], matrix @ NOISE)
+    assert np.allclose(smooth(np.diff(t), NOISE, 10.0**log10_ratio)[0], matrix @ NOISE)
     eigenvalues = np.linalg.eigvalsh(matrix)
     assert eigenvalues.min() >= -1e-10
     assert eigenvalues.max() <= 1.0 + 1e-10
@@ -213,7 +213,7 @@ def test_crowded_samples_cost_few_digits() -> None:
     t = np.concatenate([[0.0, 1e-3, 2e-3], 2e-3 + np.arange(1.0, 20.0)])
     values = (1.0 + t - 0.3 * t**2)[:, None]
     steps = np.diff(t) / np.diff(t).mean()
-    matrix = smoothed(steps, np.eye(22), 1e-8)[0]
+    matrix = smooth(steps, np.eye(22), 1e-8)[0]
     assert np.allclose(matrix, matrix.T, atol=1e-9)
     assert np.allclose(matrix @ values, values, atol=1e-8)
 

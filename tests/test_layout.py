@@ -203,7 +203,7 @@ def test_files_and_functions_stay_short() -> None:
 
 # Values that are not ours, by module: of these it may be asked what they have.
 FOREIGN = {
-    "app.build": "a callable of a user's own, which may be compiled and have no name",
+    "app.schema": "a callable of a user's own, which may be compiled and have no name",
     "app.runner": "a module of a user's own, which may be a package of experiments",
     "runtime.compilation": "kernels of numba, which has no public way to its cache",
     "runtime.files": "an error of any kind, which may say what the system said",

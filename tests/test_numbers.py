@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ep2sindy.data.given import trajectories_of
+from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.regression.sampling import is_even
 from ep2sindy.signals.spectrum import is_uniform

@@ -10,7 +10,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.likeness import Verdict
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, OperatingFit, leave_one_out, operating_fit
 from ep2sindy.operating.law import OperatingLaw, in_hull

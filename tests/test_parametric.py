@@ -17,16 +17,16 @@ from ep2sindy.operating.point_fits import (
     Refining,
     TimeBootstrap,
     fit_points,
-    resampled_coefficients,
-    searched_jointly,
+    resample_coefficients,
+    search_shared,
 )
 from ep2sindy.operating.quantities import (
     Estimate,
     Fitted,
     PointResult,
     Quantity,
-    drawn_estimates,
-    propagated_estimates,
+    estimates_of_covariance,
+    estimates_of_draws,
 )
 from ep2sindy.operating.quantity_law import laws, power_law_r2, trends
 from ep2sindy.operating.records import OperatingRecord
@@ -158,7 +158,7 @@ def test_one_search_over_all_points_leaves_out_those_that_do_not_oscillate(
 ) -> None:
     law, rng = polynomial(["V"], degree=1), np.random.default_rng(0)
     plane = [replace(p, parameters={"V": p.parameters["V"]}) for p in points]
-    joint = searched_jointly(plane, results, study(), law, rng=rng)
+    joint = search_shared(plane, results, study(), law, rng=rng)
     assert joint is not None
     assert [fitted is None for fitted in joint.fitted] == [False, False, False, True]
     assert joint.found.chosen["x"] == ("x*u", "x*y*R")
@@ -179,7 +179,7 @@ def test_a_joint_search_says_why_it_ties_nothing(
     points: list[OperatingRecord], results: list[PointResult]
 ) -> None:
     law = polynomial(["V", "m"], degree=2)
-    joint = searched_jointly(points, results, study(), law, rng=np.random.default_rng(0))
+    joint = search_shared(points, results, study(), law, rng=np.random.default_rng(0))
     assert joint is not None
     assert joint.tied is None
     assert "a law of 6 terms needs as many points: 3 came" in joint.why_not_tied
@@ -190,9 +190,9 @@ def test_there_is_no_joint_search_of_one_point_or_without_best_subsets(
 ) -> None:
     law, rng = polynomial(["V", "m"], degree=1), np.random.default_rng(0)
     alone = [points[0], points[3]], [results[0], results[3]]
-    assert searched_jointly(*alone, study(), law, rng=rng) is None
+    assert search_shared(*alone, study(), law, rng=rng) is None
     lasso = replace(study(), recipe=replace(study().recipe, search=AdaptiveLasso()))
-    assert searched_jointly(points, results, lasso, law, rng=rng) is None
+    assert search_shared(points, results, lasso, law, rng=rng) is None
 
 
 def test_a_relation_holds_exactly_in_fits_refinements_and_draws(
@@ -297,7 +297,7 @@ def test_draws_are_least_squares_on_repeated_rows() -> None:
     relations = CASES["constrained"].constraint
     model = constrained_fit(problems, relations)
     settings = {"block": 40, "n_draws": 7}
-    found = resampled_coefficients(
+    found = resample_coefficients(
         problems, relations, model, **settings, rng=np.random.default_rng(5)
     )
     (problem,) = problems
@@ -338,7 +338,7 @@ def test_draws_of_whitened_rows_spread_as_their_covariance_says(case: Case) -> N
     noisy = replace(run, states=run.states + noise)
     problems = Weak(split=RandomSplit(0.0)).assemble([noisy], LIBRARY, rng=rng)
     model = constrained_fit(problems, case.constraint)
-    draws = resampled_coefficients(problems, case.constraint, model, block=1, n_draws=500, rng=rng)
+    draws = resample_coefficients(problems, case.constraint, model, block=1, n_draws=500, rng=rng)
     assert model.covariance is not None
     ratio = draws.std(axis=0) / np.sqrt(np.diag(model.covariance))
     # 18 segments of time: a standard deviation from them is known to 17 %, twice that is allowed.
@@ -370,11 +370,11 @@ def coverage(*, block: int, n_seeds: int) -> float:
     for rng in np.random.default_rng(0).spawn(n_seeds):
         problem = correlated_problem(rng, n_rows=1000, memory=5)
         model = constrained_fit([problem], relations)
-        draws = resampled_coefficients(
+        draws = resample_coefficients(
             [problem], relations, model, block=block, n_draws=200, rng=rng
         )
         coef = np.array([model.terms("z")[name] for name in ("a", "b")])
-        estimates, _ = drawn_estimates(coef, draws, quantities, relations, library)
+        estimates, _ = estimates_of_draws(coef, draws, quantities, relations, library)
         inside += [e.low <= t <= e.high for e, t in zip(estimates.values(), (2, 3), strict=True)]
     return float(np.mean(inside))
 
@@ -403,7 +403,7 @@ def model_of(covariance: np.ndarray | None = None) -> SparseModel:
 def test_intervals_are_carried_from_coefficients_to_quantities() -> None:
     model = model_of(np.diag([4.0, 1e-4, 0.01, 4e-4]))
     case = CASES["free"]
-    found = propagated_estimates(model, case.quantities, case.constraint, LIBRARY)
+    found = estimates_of_covariance(model, case.quantities, case.constraint, LIBRARY)
     reach = {name: 0.5 * (e.high - e.low) for name, e in found.items()}
     z = 1.959964
     assert reach == pytest.approx(

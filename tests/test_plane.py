@@ -17,13 +17,14 @@ from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.plane import electron_kernels as electrons
 from ep2sindy.thruster.plane import heavy_kernels as heavy
 from ep2sindy.thruster.plane import kernels
-from ep2sindy.thruster.plane.build import build_model, initial_state
 from ep2sindy.thruster.plane.grid import MaskedGrid
 from ep2sindy.thruster.plane.simulate import (
     OPERATING_POINT_2D,
     PLANES,
     PROFILES,
     THRUSTER_2D,
+    build_model,
+    initial_state,
     simulate_2d,
 )
 from ep2sindy.thruster.transport import AnomalousTransport
@@ -83,10 +84,10 @@ def test_what_enters_leaves_or_stays_in_every_step():
     _, model, state, work, columns = set_up()
     inflow = model.neutral_inflow * THRUSTER_2D.area * DT_S
     for _ in range(20):
-        before, left = kernels.held(state, model), state.left[0]
+        before, left = kernels.count_heavy(state, model), state.left[0]
         heavy.heavy_step(state, model, DT_S, work)
         assert electrons.electron_step(state, model, DT_S, columns)
-        gained = kernels.held(state, model) - before
+        gained = kernels.count_heavy(state, model) - before
         # rounding of the sum over all atoms, of which a step's inflow is a thousandth
         assert gained + state.left[0] - left == pytest.approx(inflow, rel=1e-9)
 
@@ -182,13 +183,13 @@ def test_the_mean_field_is_that_of_the_reference_density():
 @pytest.mark.parametrize("p", [-3.0, -1e-5, 1e-5, 0.5, 20.0])
 def test_fitted_fluxes_are_exact_between_two_temperatures(p):
     """Steady convection and conduction without sources: T = a + b exp(p x)."""
-    before, behind = electrons.fitted(2.0, 2.0 * p)
+    before, behind = electrons.exponential_weights(2.0, 2.0 * p)
     exact = 2.0 * p * (5.0 - (9.0 - 5.0) / np.expm1(p))
     assert before * 5.0 - behind * 9.0 == pytest.approx(exact, rel=1e-11)
 
 
 def test_fitted_fluxes_without_convection_are_conduction():
-    assert electrons.fitted(2.0, 0.0) == (2.0, 2.0)
+    assert electrons.exponential_weights(2.0, 0.0) == (2.0, 2.0)
 
 
 def test_the_vectorised_logarithm_is_exact_to_rounding():

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from ep2sindy.discovery.regimes import find_regimes
 from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import drawn
+from ep2sindy.report.picture import draw
 from ep2sindy.report.screen import WIDTH, Screen
 from ep2sindy.studies.pointwise import Outcome
 
@@ -73,7 +73,7 @@ def printed(found: Outcome, folder: Path) -> str:
 
 
 def page(found: Outcome) -> str:
-    figures = {name: drawn(Figure(), b"", each.caption) for name, each in found.figures().items()}
+    figures = {name: draw(Figure(), b"", each.caption) for name, each in found.figures().items()}
     return unescape(page_html("a study", found.sections(), figures))
 
 

@@ -14,11 +14,11 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy._stubs import dotted_names
-from ep2sindy.app.runner import started_run, study_class, write
+from ep2sindy.app.runner import start_run, study_class, write
 from ep2sindy.app.schema import study_of
 from ep2sindy.report.document import Captioned
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.progress import SILENT, Bars, Told, as_progress, counted
+from ep2sindy.runtime.progress import SILENT, Bars, Told, as_progress, count_pieces
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore
 from tests import programs
@@ -145,7 +145,7 @@ def test_refinements_tell_their_iterations_and_windows(prey: ep.Trajectory) -> N
     lengths = [20, 40]
     found = [
         ep.refine(model, [prey], window=length, n_windows=2, rng=0, progress=watch)
-        for length in counted(watch, lengths, "window length")
+        for length in count_pieces(watch, lengths, "window length")
     ]
     outer, *inner = watch.stages
     assert (outer.unit, outer.total, outer.depth) == ("window length", 2, 0)
@@ -158,7 +158,7 @@ def test_a_search_of_all_points_tells_points_and_equations(prey: ep.Trajectory) 
     watch = Recorder()
     points = {"a": [prey], "b": [ep.lotka_volterra().trajectory(noise=0.01, rng=1)]}
     recipe = ep.Regression(ep.Differential(), ep.BestSubset(max_terms=2))
-    ep.discover_jointly(points, LIBRARY, recipe, progress=watch)
+    ep.discover_shared(points, LIBRARY, recipe, progress=watch)
     assert [(each.unit, each.total) for each in watch.stages] == [("point", 2), ("equation", 2)]
     watch.check()
 
@@ -208,7 +208,7 @@ def test_what_fails_leaves_its_stage() -> None:
     watch = Recorder()
     with pytest.raises(ZeroDivisionError), watch.stage(2, "piece"):
         1 / 0  # noqa: B018
-    for _ in (pieces := counted(watch, [1, 2], "piece")):
+    for _ in (pieces := count_pieces(watch, [1, 2], "piece")):
         break
     pieces.close()
     assert [(each.done, each.over) for each in watch.stages] == [(0, True), (0, True)]
@@ -228,7 +228,7 @@ def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.Captu
         "simulate_hallthruster_input",
     }  # fmt: skip
     assert {asking[name] for name in set(asking) - simulators} == {False}
-    assert {"discover", "estimate", "refine", "pointwise", "discover_jointly"} <= set(asking)
+    assert {"discover", "estimate", "refine", "pointwise", "discover_shared"} <= set(asking)
     ep.discover(prey, LIBRARY, regression())
     assert capfd.readouterr() == ("", "")
 
@@ -286,11 +286,11 @@ def test_a_run_tells_what_it_reads_computes_and_draws(
     )  # fmt: skip
     watch = Recorder()
     study = study_of(study_class(config.study), config)
-    monkeypatch.setattr("ep2sindy.app.runner.drawn", lambda figure, png, caption: "")
+    monkeypatch.setattr("ep2sindy.app.runner.draw", lambda figure, png, caption: "")
     monkeypatch.setattr("ep2sindy.report.folder.RunFolder.write_figure", lambda *_: b"")
     monkeypatch.setattr("ep2sindy.report.tensorboard.Board.image", lambda *_: None)
     monkeypatch.setattr("ep2sindy.app.runner.page_html", lambda *_: "")
-    with started_run(config) as run:
+    with start_run(config) as run:
         watched = Run(**{name: getattr(run, name) for name in run.__dict__} | {"watch": watch})
         outcome = study.compute(watched)
         blank = Captioned(lambda: None, "")

@@ -9,9 +9,9 @@ from ep2sindy.thruster.propellants import (
     PropellantTable,
     TabulatedRates,
     XenonFits,
+    describe_uncovered,
     ionization_rate,
     thermal_speed,
-    uncovered,
 )
 
 T = np.linspace(1.0, 100.0, 300)
@@ -187,12 +187,12 @@ def test_rates_must_cover_the_ends_of_the_discharge():
 
 
 def test_a_run_beyond_the_table_says_how_far_it_got():
-    assert uncovered(ep.thruster.propellant("krypton"), 99.0) is None
-    assert uncovered(XenonFits(), 199.0) is None
+    assert describe_uncovered(ep.thruster.propellant("krypton"), 99.0) is None
+    assert describe_uncovered(XenonFits(), 199.0) is None
     message = (
         "the rates of krypton cover T_e up to 100 eV, the run reached 120 eV; extend the table"
     )
-    assert uncovered(ep.thruster.propellant("krypton"), 120.0) == message
+    assert describe_uncovered(ep.thruster.propellant("krypton"), 120.0) == message
 
 
 def test_a_second_charge_needs_its_rates():

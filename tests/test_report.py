@@ -12,10 +12,10 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ep2sindy.figures.style import hover
-from ep2sindy.report.about import About, asked_of
+from ep2sindy.report.about import About, settings_used
 from ep2sindy.report.document import Equation, Link, Picture, Section, Table, Text
 from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import drawn
+from ep2sindy.report.picture import draw
 from ep2sindy.report.screen import WIDTH, Screen, rich_table
 from ep2sindy.report.tensorboard import Board
 
@@ -37,7 +37,7 @@ SECTIONS = [
     Section("Only a picture", [Picture("front")], level=3),
 ]
 PIXEL = b"any bytes: a page embeds what it is given"
-FIGURES = {"front": drawn(Figure(figsize=(4.0, 3.0)), PIXEL, "Error against size <&>.")}
+FIGURES = {"front": draw(Figure(figsize=(4.0, 3.0)), PIXEL, "Error against size <&>.")}
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ def test_names_from_data_never_become_markup(name: str) -> None:
     table = Table(pd.DataFrame({name: [name, equation, Link(name, "x.html")]}), name, note=name)
     provenance = {"command": [name], "commit": name, "seed": 0, "versions": {name: name}}
     about = About(name, {name: name}, [name], [name], provenance, name)
-    figures = {"front": drawn(_hovering(name), PIXEL, name)}
+    figures = {"front": draw(_hovering(name), PIXEL, name)}
     section = Section(name, [Text(name), equation, table, Picture("front")])
     page = Parsed(page_html(name, [section], figures, about))
     assert not {"script", "img"} & set(page.elements)
@@ -142,10 +142,10 @@ def _hovering(text: str) -> Figure:
 
 
 def test_marks_of_a_figure_say_more_under_the_mouse() -> None:
-    html = drawn(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
+    html = draw(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
     assert "<title>n_i' of 2 terms\nsecond line</title>" in html
     assert "hover" not in html
-    assert html == drawn(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
+    assert html == draw(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_settings_read_in_words() -> None:
         "depth": None,
         "other": 3,
     }
-    assert asked_of(settings, set(settings) - {"other"}) == {
+    assert settings_used(settings, set(settings) - {"other"}) == {
         "data": "path a.csv, variables (x (name X, unit 1))",
         "time series": "ZoneAverage (states x)",
         "search": "BestSubset (max_terms 4)",

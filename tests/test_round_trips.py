@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
-from ep2sindy.data.given import trajectories_of
+from ep2sindy.data.coerce import trajectories_of
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.open import open_field

@@ -10,11 +10,11 @@ from scipy.stats import norm
 
 import ep2sindy as ep
 from benchmarks.spoilt import spoilt
-from ep2sindy.data.repeats import check_repeats
+from ep2sindy.data.coerce import check_repeats
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.estimation.lateness import delayed_gram, move_channels
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, between, gram, observe
-from ep2sindy.estimation.problem import EstimationProblem, scaled_problem
+from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.systems.systems import System
 
 LIMITS = [(-np.inf, 0.3), (0.3, np.inf), (-1.0, 0.5), (2.0, 2.5), (-9.0, -8.0), (30.0, np.inf)]
@@ -51,7 +51,7 @@ def test_far_beyond_a_limit_it_is_as_good_as_a_value() -> None:
 
 def clipped_problem() -> tuple[EstimationProblem, System]:
     system, run = spoilt("lorenz", "clip 80", 0, 0.02)
-    return scaled_problem([run], system.model.library), system
+    return scale_problem([run], system.model.library), system
 
 
 def test_residuals_beside_limits_are_the_slope_of_what_is_least() -> None:
@@ -152,7 +152,7 @@ def late_record(delays: tuple[float, ...]) -> tuple[EstimationProblem, System]:
     )  # fmt: skip
     states = [found.sol(t + 0.5 - each / 100.0)[k] for k, each in enumerate(delays)]
     run = ep.Trajectory(t, np.stack(states, axis=1), ["x", "y", "z"])
-    return scaled_problem([run], system.model.library), system
+    return scale_problem([run], system.model.library), system
 
 
 def fit_of_samples(problem: EstimationProblem, system: System) -> TrajectoryFit:

@@ -14,14 +14,14 @@ from ep2sindy.model.inputs import spline, spline_pieces
 from ep2sindy.model.many import DrivenWindows, Ensemble, rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import _scaled_rhs
-from ep2sindy.model.solve import Border, Products, Solved, _first_step, scheme, solved
+from ep2sindy.model.solve import Border, Products, Solved, _first_step, scheme, solve_stages
 
 NO_BORDER = Border((), lambda _, y: y)
 
 
 def run(rates: Callable, t: np.ndarray, y: np.ndarray, **settings: object) -> Solved:
     given = {"blow_up": 1e6, "bound": "one", "rtol": 1e-8, "limit_s": 300.0}
-    return solved(rates, NO_BORDER, t, y, **given | settings)
+    return solve_stages(rates, NO_BORDER, t, y, **given | settings)
 
 
 def products(model: SparseModel) -> Products:

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import ep2sindy as ep
-from ep2sindy.app.build import bind
+from ep2sindy.app.schema import bind
 from tests.programs import ROOT, composed
 
 THRUSTERS = sorted(path.stem for path in (ROOT / "conf" / "thruster").glob("*.yaml"))

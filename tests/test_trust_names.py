@@ -21,7 +21,7 @@ from ep2sindy.report.about import About
 from ep2sindy.report.document import Equation, Link, Section, Table, Text
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import drawn
+from ep2sindy.report.picture import draw
 from ep2sindy.report.screen import Screen
 
 PATHS = ["../../x", "/tmp/x", "a/b", "a\\b", "..", ".", "", "~x", "a\nb", "a\0b", "x" * 300]
@@ -102,7 +102,7 @@ def test_page_and_screen_show_markup_as_it_is(text: str, tmp_path: Path) -> None
         ]  # fmt: skip
         provenance = {"commit": text, "seed": text, "command": [text], "versions": {text: text}}
         about = About(text, {text: text}, [text], [text], provenance, text)
-        figures = {"a": drawn(Figure(), b"", text)}
+        figures = {"a": draw(Figure(), b"", text)}
         sections = [Section(text, blocks)]
         screen = Screen(tmp_path / "run.log")
         screen.show(sections)

@@ -18,7 +18,7 @@ from ep2sindy.runtime import compilation
 def compilations(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[bool]:
     """What comes of each compilation, the next one first; the stamp lies in `tmp_path`."""
     outcomes = [True, True, True]
-    monkeypatch.setattr(warm, "kept_in", lambda: tmp_path / "kernels")
+    monkeypatch.setattr(warm, "cache_folder", lambda: tmp_path / "kernels")
     monkeypatch.setattr(warm, "_compiled_side_by_side", lambda: outcomes.pop(0))
     return outcomes
 

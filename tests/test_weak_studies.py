@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from ep2sindy.app.build import Configured
+from ep2sindy.app.schema import Configured
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.identified import frontier_figure
@@ -21,7 +21,7 @@ from ep2sindy.runtime.parallel import Serial
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.studies import frontier as frontiers
 from ep2sindy.studies import weak_windows
-from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings, fitted_terms
+from ep2sindy.studies.weak import Setting, boxes_grid, fit_settings, fit_terms
 from ep2sindy.studies.weak_windows import (
     coefficient_error,
     true_library,
@@ -94,7 +94,7 @@ def test_without_noise_smooth_windows_find_the_coefficients() -> None:
 
 def test_windows_of_two_points_are_the_differential_form() -> None:
     run = sampled().trajectory(noise=0.01, rng=np.random.default_rng(0))
-    found = fitted_terms(
+    found = fit_terms(
         [run], true_library(lotka_volterra()), TERMS, boxes(500, 2), rng=np.random.default_rng(1)
     )
     rng = np.random.default_rng(1)

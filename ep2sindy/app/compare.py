@@ -30,7 +30,7 @@ from ep2sindy.report.results import in_words, value_text
 from ep2sindy.report.screen import Screen
 from ep2sindy.runtime.files import read_json, write_text
 from ep2sindy.runtime.screen import say
-from ep2sindy.studies.views import shown_equation
+from ep2sindy.studies.views import display_equation
 
 ABOUT = """Compares runs: settings that differ, headline figures, equations with their intervals.
 A run is the folder that it printed last, such as outputs/breathing/2025-01-31_101500."""
@@ -240,7 +240,7 @@ def _models(runs: Sequence[ReadRun]) -> list[Section]:
     for name in dict.fromkeys(name for run in runs for name in run.models):
         models = {run.label: run.models[name] for run in runs if name in run.models}
         blocks: list[Block] = [
-            shown_equation(model, state, clock, lead=label)
+            display_equation(model, state, clock, lead=label)
             for label, model in models.items()
             for state in model.states
         ]

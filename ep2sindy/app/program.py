@@ -34,7 +34,7 @@ from ep2sindy.app.safety import check_places, checked_loader, resolved
 from ep2sindy.runtime.screen import plain, say
 from ep2sindy.runtime.threads import start_on_one_thread
 from ep2sindy.trust.interruption import end_as_interrupted
-from ep2sindy.trust.user_code import PACKAGE, isolated_children
+from ep2sindy.trust.user_code import PACKAGE, isolate_children
 
 USUAL_WARNING = warnings.formatwarning
 
@@ -61,7 +61,7 @@ def run() -> None:
                 sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
             failed.extend(run_job(config, conf))
 
-        with checked_loader(), isolated_children(), said_as_text():
+        with checked_loader(), isolate_children(), said_as_text():
             job()
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
         sys.exit(plain(f"error: {str(error) or type(error).__name__}"))
@@ -158,11 +158,12 @@ def prepare_arguments(conf: Path) -> None:
 
 def run_job(config: DictConfig, conf: Path) -> list[str]:
     """One run, and why it ended early, if it did; a sweep notes that and goes on."""
-    with noted_job() as (done, ended_early):
+    with note_job() as (done, ended_early):
         try:
             if config.experiment is None:
                 raise ValueError(
-                    f"choose an experiment with +exp=NAME; there are {known(conf)}. A config of "
+                    "choose an experiment with +exp=NAME; there are "
+                    f"{list_experiments(conf)}. A config of "
                     "your own begins with the line '# @package _global_'"
                 )
             typed = HydraConfig.get().overrides.task
@@ -180,7 +181,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
 
 
 @contextmanager
-def noted_job() -> Iterator[
+def note_job() -> Iterator[
     tuple[Callable[[Path, Mapping[str, float]], None], Callable[[BaseException], None]]
 ]:
     """In a sweep: say which job begins, and note how it ended; otherwise do nothing.
@@ -220,7 +221,7 @@ def first_word(config: DictConfig) -> str:
     return f"{config.experiment}: loading study={config.get('study')}; writes below {folder}/"
 
 
-def known(conf: Path) -> str:
+def list_experiments(conf: Path) -> str:
     """Experiments that there are to choose from."""
     folders = {conf, Path.cwd() / "conf"}
     return ", ".join(sorted({path.stem for each in folders for path in each.glob("exp/*.yaml")}))

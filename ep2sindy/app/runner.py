@@ -21,14 +21,14 @@ from ep2sindy.app.safety import check_output
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
-from ep2sindy.report.about import ASIDE, About, asked_of, by_place
+from ep2sindy.report.about import ASIDE, About, by_place, settings_used
 from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import drawn
+from ep2sindy.report.picture import draw
 from ep2sindy.report.run import Run
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
-from ep2sindy.runtime.progress import Bars, counted
+from ep2sindy.runtime.progress import Bars, count_pieces
 from ep2sindy.studies.study import Experiment, Outcome
 from ep2sindy.trust.user_code import load_user_module
 
@@ -57,7 +57,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
         study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
         advance(1)
     warm()
-    with started_run(config) as run:
+    with start_run(config) as run:
         outcome = study.compute(run)
         headline = write(run, outcome, study, formats)
     return Finished(run.folder.path, headline)
@@ -83,12 +83,12 @@ def study_class(name: object) -> type:
             raise  # the module is there, but one that it needs is not
         raise ValueError(
             f"study must name a module of ep2sindy.studies that has a class Study, one of "
-            f"{known_studies()}, or one of your own as package.module, below the folder that you "
+            f"{list_studies()}, or one of your own as package.module, below the folder that you "
             f"start in: {name!r} came"
         ) from error
 
 
-def known_studies() -> list[str]:
+def list_studies() -> list[str]:
     """Modules of the room that define a study; read as text, for importing them takes seconds."""
     folder = Path(ep2sindy.studies.__file__ or "").parent
     found = []
@@ -136,7 +136,7 @@ def check_overrides(overrides: Iterable[str], *, used: Collection[str], experime
 
 
 @contextmanager
-def started_run(config: DictConfig) -> Iterator[Run]:
+def start_run(config: DictConfig) -> Iterator[Run]:
     """A new run folder that already holds its config and provenance."""
     folder = RunFolder.create(Path(config.output), config.experiment, now=datetime.now())
     folder.write_text("config.yaml", OmegaConf.to_yaml(config, resolve=True))
@@ -166,11 +166,11 @@ def write(
     sections, headline = outcome.sections(), dict(outcome.headline())
     run.screen.show(sections)
     figures = {}
-    for name, captioned in counted(run.watch, outcome.figures().items(), "figure"):
+    for name, captioned in count_pieces(run.watch, outcome.figures().items(), "figure"):
         figure = captioned.draw()
         png = folder.write_figure(name, figure, formats)
         run.board.image(name, png)
-        figures[name] = drawn(figure, png, captioned.caption)
+        figures[name] = draw(figure, png, captioned.caption)
     run.board.equations({name: model.text() for name, model in models.items()})
     run.board.settings(hparams_of(run.settings, keys_of(type(study))), headline)
     folder.write_text("report.html", page_html(run.title, sections, figures, about(run, study)))
@@ -185,7 +185,7 @@ def about(run: Run, study: Experiment) -> About:
     purpose = (type(study).__doc__ or "").split("\n\n")[0].replace("\n", " ")
     return About(
         purpose=" ".join(purpose.split()),
-        asked=asked_of(run.settings, keys_of(type(study))),
+        asked=settings_used(run.settings, keys_of(type(study))),
         said=run.said,
         warnings=run.warnings,
         provenance=run.provenance,

@@ -35,8 +35,8 @@ NOTED = ("runtime.choices", "runtime.config_sources", "job.override_dirname")
 SILENT = {"version": 1, "root": {"level": "ERROR"}, "disable_existing_loggers": True}
 FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_logging": SILENT}
 
-MOST_VALUES = 100_000  # of one file, with all that its anchors stand for
-MOST_CHARACTERS = 1_000_000  # of one setting, with all that its references stand for
+MAX_VALUES = 100_000  # of one file, with all that its anchors stand for
+MAX_CHARACTERS = 1_000_000  # of one setting, with all that its references stand for
 
 BRACES = re.compile(r"\$\{(.*)\}", re.DOTALL)
 WORD = re.compile(r"[^\s.,:$'\"(){}\[\]]+")
@@ -241,9 +241,9 @@ def check_yaml(path: Path) -> None:
     text = path.read_text("utf-8")
     if "&" not in text or "*" not in text:
         return
-    if (n := _size(yaml.compose(text, Loader=yaml.SafeLoader), {})) > MOST_VALUES:
+    if (n := _size(yaml.compose(text, Loader=yaml.SafeLoader), {})) > MAX_VALUES:
         raise ValueError(
-            f"{path} may hold up to {MOST_VALUES} values: with its anchors written out it has "
+            f"{path} may hold up to {MAX_VALUES} values: with its anchors written out it has "
             f"{n:.3g}; write what it needs"
         )
 
@@ -251,7 +251,7 @@ def check_yaml(path: Path) -> None:
 def _size(node: Any, known: dict[int, int]) -> int:
     """Values below a node, each as often as it is written out; an anchor in itself has no end."""
     if id(node) not in known:
-        known[id(node)] = MOST_VALUES + 1  # until it is known
+        known[id(node)] = MAX_VALUES + 1  # until it is known
         inner = node.value if isinstance(node, yaml.CollectionNode) else []
         each = [part for pair in inner for part in (pair if isinstance(pair, tuple) else [pair])]
         known[id(node)] = 1 + sum(_size(part, known) for part in each)
@@ -264,7 +264,7 @@ def check_references(settings: Any) -> None:
     settings: a config's groups and values as they are written. A name in `${...}` counts as the
     longest of the settings whose key it is, for what it stands for need not be known here.
     """
-    most = MOST_CHARACTERS + 10 * len(str(settings))
+    most = MAX_CHARACTERS + 10 * len(str(settings))
     named: dict[str, list[Any]] = {}
     known: dict[int, int] = {}
     try:

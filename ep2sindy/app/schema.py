@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, get_type_hints
+import inspect
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import partial
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from ep2sindy.app.build import (
-    child,
-    hints_of,
-    is_required,
-    value_of,
-)
+from ep2sindy._stubs import place_of
+from ep2sindy.app.targets import target_of
 from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.recipe import Recipe, method_of
-from ep2sindy.studies.source import Source
+from ep2sindy.studies.source import Source, Step
+from ep2sindy.studies.study import Check, Deferred
 
 # Keys of conf/config.yaml that every run has.
 COMMON = ("experiment", "study", "seed", "output", "figures")
@@ -52,7 +55,7 @@ def study_of(study: type, config: DictConfig) -> Any:
         if "thruster" in unknown:  # a file of ./conf/thruster without its first line
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
         raise ValueError(f"unknown keys {sorted(unknown)}; there are {sorted(known)}{hint}")
-    return _filled(study, _without_formats(config, has_own="figures" in keys_of(study)))
+    return _fill(study, _without_formats(config, has_own="figures" in keys_of(study)))
 
 
 def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:
@@ -67,12 +70,12 @@ def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:
     return found
 
 
-def _filled(study: type, config: DictConfig) -> Any:
+def _fill(study: type, config: DictConfig) -> Any:
     """A dataclass from the top level of the config."""
     arguments = {}
     for name, kind in hints_of(study).items():
         if kind in GATHERED:
-            arguments[name] = _gathered(kind, config)
+            arguments[name] = _gather_groups(kind, config)
         elif name in config or OmegaConf.is_missing(config, name):
             arguments[name] = value_of(kind, child(config, name, name), name)
         elif is_required(study, name):
@@ -80,7 +83,7 @@ def _filled(study: type, config: DictConfig) -> Any:
     return study(**arguments)
 
 
-def _gathered(kind: Any, config: DictConfig) -> Any:
+def _gather_groups(kind: Any, config: DictConfig) -> Any:
     """A method or source from its groups: one left out (`~search`) must not turn into a default."""
     groups = _groups(kind)
     if lacking := [name for name in groups if name not in config]:
@@ -97,3 +100,323 @@ def _groups(kind: Any) -> dict[str, Any]:
     """The groups that make a value of this kind, each with the kind that it must be."""
     hints = get_type_hints(GATHERED[kind], include_extras=True)
     return {name: hint for name, hint in hints.items() if name != "return"}
+
+
+# From nodes of a config to values: the one place where a setting is held to its kind.
+#
+# A setting's kind stands in the signature that it goes to: a field of a study, or an argument of
+# what a `_target_` names. Of an argument only what must be plain is checked here, for a class or
+# function says best itself what is wrong with the rest.
+
+
+PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+
+
+def value_of(kind: Any, node: Any, place: str) -> Any:
+    """A value of this kind from a node of the config; place: its dotted path, for errors."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        value = contents(node)
+        if isinstance(parts[1], Check) and not parts[1].test(value):
+            raise ValueError(f"{place} must be {parts[1].message}: {value!r} came")
+        return value_of(parts[0], node, place)
+    if kind is Any:
+        return contents(node)
+    if kind is Deferred:
+        return Configured(node, place)
+    if kind == Step:
+        return bind_step(node, place)
+    if origin in (Union, UnionType):
+        return _one_of(parts, node, place)
+    if isinstance(node, DictConfig) and "_target_" in node:
+        return instantiate(node, origin or kind, place)
+    if isinstance(kind, type) and is_dataclass(kind):
+        return _dataclass(kind, node, place)
+    if origin is not None:
+        return _container(origin, parts, node, place)
+    return _scalar(kind, node, place)
+
+
+def _container(origin: type, parts: Sequence[Any], node: Any, place: str) -> Any:
+    if issubclass(origin, Mapping):
+        if not OmegaConf.is_dict(node):
+            raise ValueError(f"{place} must be like {{name: ...}}: {contents(node)!r} came")
+        if parts[1] is Deferred or is_dataclass(parts[1]):
+            check_names(map(str, node), place)
+        places = {key: f"{place}.{key}" for key in node}
+        return {str(k): value_of(parts[1], child(node, k, at), at) for k, at in places.items()}
+    if not OmegaConf.is_list(node):
+        raise ValueError(f"{place} must be a list: {contents(node)!r} came")
+    places = {k: f"{place}[{k}]" for k in range(len(node))}
+    return [value_of(parts[0], child(node, k, at), at) for k, at in places.items()]
+
+
+def check_names(names: Iterable[str], place: str) -> None:
+    """Raise ValueError for a name, of what files and headings are called by, that is more."""
+    for name in names:
+        if not re.fullmatch(r"\w[\w .,+-]{,99}", name):
+            raise ValueError(
+                f"{place} must be named by words, for files are named so: letters, digits and "
+                f"_ . , + -, not {name!r}"
+            )
+
+
+def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
+    """A value of the first kind that it fits; the last says what is wrong."""
+    if node is None and type(None) in kinds:
+        return None
+    kinds = [kind for kind in kinds if kind is not type(None)]
+    for kind in kinds[:-1]:
+        try:
+            return value_of(kind, node, place)
+        except ValueError:
+            continue
+    return value_of(kinds[-1], node, place)
+
+
+def _scalar(kind: Any, node: Any, place: str) -> Any:
+    """A plain value. One that names no `_target_` is never of a type that is not plain."""
+    value = check_plain((kind,), node, place)
+    return float(value) if kind is float else value
+
+
+def check_plain(kinds: Collection[type], node: Any, place: str) -> Any:
+    """The value of a node; raises ValueError for one that is of none of these kinds."""
+    value = contents(node)
+    if not any(_is_plain(value, kind) for kind in kinds):
+        wanted = [PLAIN.get(kind, f"a {kind.__name__}, named by its _target_") for kind in kinds]
+        raise ValueError(f"{place} must be {' or '.join(wanted)}: {value!r} came")
+    return value
+
+
+def _is_plain(value: object, kind: type) -> bool:
+    """Whether a value is of a plain kind; a whole number is a number too, true is none."""
+    return type(value) is kind or (kind, type(value)) == (float, int)
+
+
+def _dataclass(kind: type, node: Any, place: str) -> Any:
+    """A mapping as a dataclass: no key may be missing, and none be there that does nothing."""
+    names = [f.name for f in fields(kind) if f.init]
+    needed = [name for name in names if is_required(kind, name)]
+    given = set(map(str, node)) if isinstance(node, DictConfig) else None
+    if given is None or given - set(names) or set(needed) - given:
+        came = sorted(given) if given is not None else contents(node)
+        if len(needed) == len(names):
+            raise ValueError(f"{place} must have {_listed(needed)}: {came} came")
+        raise ValueError(
+            f"{place} may have {sorted(names)} and needs {_listed(needed)}: {came} came"
+        )
+    hints = hints_of(kind)
+    return kind(
+        **{
+            name: value_of(hints[name], child(node, name, at), at)
+            for name, at in ((name, f"{place}.{name}") for name in names)
+            if name in given
+        }
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """`a, b and c`."""
+    return " and ".join([", ".join(names[:-1]), *names[-1:]] if len(names) > 1 else names) or "none"
+
+
+def hints_of(kind: type) -> dict[str, Any]:
+    """Field of a dataclass that it is made with -> its annotation."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {f.name: hints[f.name] for f in fields(kind) if f.init}
+
+
+def is_required(kind: type, name: str) -> bool:
+    (field,) = (f for f in fields(kind) if f.name == name)
+    return field.default is MISSING and field.default_factory is MISSING
+
+
+def child(parent: Any, key: Any, place: str) -> Any:
+    """A child, interpolations resolved."""
+    if OmegaConf.is_missing(parent, key):
+        raise ValueError(f"{place} must be set: it is still '???'")
+    return parent[key]
+
+
+def contents(node: Any) -> Any:
+    """The plain value of a node, interpolations resolved."""
+    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+
+
+def instantiate(node: DictConfig, kind: type, place: str) -> Any:
+    """The object that a node names, if it is of this kind."""
+    value = bind(node, place)()
+    if not isinstance(value, kind):
+        raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: {value!r} came")
+    return value
+
+
+def bind_step(node: Any, place: str) -> Step:
+    """A step of `prepare`; an argument that it does not know is refused here."""
+    if not isinstance(node, DictConfig) or "_target_" not in node:
+        raise ValueError(
+            f"{place} must be like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: {node!r} came"
+        )
+    return bind(node, place, None)
+
+
+def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
+    """What a node's `_target_` names, with the rest of the node, built, as its arguments.
+
+    place: the node's dotted path, for errors. first: arguments that it is given when called.
+    Raises ValueError where it cannot be called so, or what a nested target raised itself.
+    """
+    settings = {name: child(node, name, f"{place}.{name}") for name in map(str, node)}
+    target = target_of(node, place)
+    kinds = _plain_arguments(target)
+    call = partial(
+        target,
+        **{
+            name: _argument(kinds.get(name, ()), value, f"{place}.{name}")
+            for name, value in settings.items()
+            if name != "_target_"
+        },
+    )
+    try:
+        takes = inspect.signature(target)
+    except ValueError:  # compiled, it does not say what it takes
+        return call
+    try:
+        takes.bind(*first, **call.keywords)
+    except TypeError as error:
+        name = getattr(target, "__name__", target)
+        names = list(takes.parameters)[len(first) :]
+        raise ValueError(f"{place}, {name}: {error}; it takes {names}") from error
+    return call
+
+
+def _plain_arguments(target: Any) -> dict[str, tuple[type, ...]]:
+    """Arguments of a target that can only be plain values, or None: by name, their kinds."""
+    try:
+        hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
+    except Exception:  # an annotation that is not there while the program runs; no annotations
+        return {}
+    alternatives = {name: _alternatives(hint) for name, hint in hints.items()}
+    return {name: kinds for name, kinds in alternatives.items() if set(kinds) <= set(PLAIN)}
+
+
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    """The kinds of a union but None; of another hint itself."""
+    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return tuple(part for part in parts if part is not type(None))
+
+
+def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
+    """An argument of a target, with what it names at any depth made. kinds: empty for any."""
+    if kinds and node is not None:
+        return check_plain(kinds, node, place)
+    if isinstance(node, ListConfig):
+        places = [f"{place}[{k}]" for k in range(len(node))]
+        return [_argument((), child(node, k, at), at) for k, at in enumerate(places)]
+    if not isinstance(node, DictConfig):
+        return node
+    if "_target_" not in set(node):  # a DictConfig itself denies one that is still to be set
+        named = {key: f"{place}.{key!s}" for key in node}
+        return {key: _argument((), child(node, key, at), at) for key, at in named.items()}
+    call = bind(node, place)
+    try:
+        return call()
+    except TypeError as error:
+        raise ValueError(f"{place} cannot be made: {error}") from error
+
+
+def check_set(node: DictConfig) -> None:
+    """Raise ValueError for a value, at any depth, that a config leaves to its user."""
+    if missing := sorted(OmegaConf.missing_keys(node)):
+        raise ValueError(f"{missing[0]} must be set: it is still '???'")
+
+
+@dataclass(frozen=True, eq=False)
+class Configured:
+    """A node that names a `_target_`, built when asked for: see `Deferred`."""
+
+    node: Any
+    place: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.node, DictConfig) or "_target_" not in self.node:
+            raise ValueError(f"{self.place} must name a _target_: {self.node!r} came")
+        check_set(self.node)
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        plain: Any = OmegaConf.to_container(self.node, resolve=True)
+        return {str(key): value for key, value in plain.items()}
+
+    def build(self) -> Any:
+        return bind(self.node, self.place)()
+
+    def changed(
+        self, places: Mapping[str, Any], more: Mapping[str, Any] | None = None
+    ) -> Configured:
+        node = deepcopy(self.node)
+        missing = object()
+        for place, value in places.items():
+            write_defaults(node, place, root=self.place)
+            if OmegaConf.select(node, place, default=missing) is missing:
+                raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
+            OmegaConf.update(node, place, value)
+        OmegaConf.set_struct(node, False)  # a key that it does not take is refused when it is built
+        merged: Any = OmegaConf.merge(node, dict(more or {}))
+        return Configured(merged, self.place)
+
+    def __str__(self) -> str:
+        return OmegaConf.to_yaml(self.node, resolve=True, sort_keys=True)
+
+
+def write_defaults(node: DictConfig, place: str, *, root: str) -> None:
+    """Add what stands at a dotted place by default, if the targets on the way have it.
+
+    root: where the node itself stands, for errors. `thruster.transport.c_plume` in a thruster that
+    says nothing of its transport becomes all of the transport that it has by default.
+    """
+    *outer, last = place.split(".")
+    for name in (*outer, last):
+        if not isinstance(node, DictConfig):
+            return
+        if name not in node and "_target_" in node:
+            values = defaults_of(target_of(node, root))
+            if name in values:
+                OmegaConf.update(node, name, as_node(values[name]), force_add=True)
+        if name not in node:
+            return
+        node = node[name]
+
+
+def defaults_of(call: Any) -> dict[str, Any]:
+    """Arguments of a class or function that have a default, with it."""
+    if is_dataclass(call):
+        found = {}
+        for each in fields(call):
+            if each.init and each.default is not MISSING:
+                found[each.name] = each.default
+            elif each.init and each.default_factory is not MISSING:
+                found[each.name] = each.default_factory()
+        return found
+    try:
+        takes = inspect.signature(call).parameters.values()
+    except (TypeError, ValueError):  # compiled, it does not say what it takes
+        return {}
+    return {each.name: each.default for each in takes if each.default is not each.empty}
+
+
+def as_node(value: Any) -> Any:
+    """A value as a config has it: a dataclass as a node that names its class."""
+    if is_dataclass(value) and not isinstance(value, type):
+        members = {each.name: as_node(getattr(value, each.name)) for each in fields(value)}
+        taken = {each.name for each in fields(value) if each.init}
+        return {"_target_": _name(type(value))} | {n: m for n, m in members.items() if n in taken}
+    if isinstance(value, Mapping):
+        return {str(name): as_node(member) for name, member in value.items()}
+    return [as_node(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def _name(kind: type) -> str:
+    """By the package's stubs where they have it: modules may move."""
+    return place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"  # a user's

@@ -21,13 +21,13 @@ from ep2sindy.figures.trends import sweep_figure
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text
 from ep2sindy.report.folder import freeze_layout
 from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import DPI, Drawn, drawn
+from ep2sindy.report.picture import DPI, Drawn, draw
 from ep2sindy.report.results import in_words, value_text
 from ep2sindy.runtime.files import read_json, write_json, write_text
 from ep2sindy.runtime.screen import in_line
 
 RECORDS = "jobs"
-MOST_PANELS = 12
+MAX_PANELS = 12
 CAPTION = "Headline figures of the jobs that came to their end."
 
 Records = Sequence[Mapping[str, Any]]
@@ -142,12 +142,12 @@ def _figures(records: Records, varied: Mapping[str, Sequence[str]]) -> dict[str,
         f"job {record['job']}: {', '.join(f'{key}={v[k]}' for key, v in varied.items())}"
         for k, record in enumerate(records)
     ]
-    chosen = dict(list(shown.items())[:MOST_PANELS])
+    chosen = dict(list(shown.items())[:MAX_PANELS])
     figure = sweep_figure(x, chosen, x_label=label, jobs=jobs)
     freeze_layout(figure)
     png = BytesIO()
     figure.savefig(png, format="png", dpi=DPI)
-    return {"headline": drawn(figure, png.getvalue(), CAPTION)}
+    return {"headline": draw(figure, png.getvalue(), CAPTION)}
 
 
 def _number(value: Any) -> float:

@@ -18,10 +18,10 @@ import numpy as np
 
 import ep2sindy as ep
 from ep2sindy.model.many import DrivenWindows, Ensemble
-from ep2sindy.runtime.compilation import ANNOUNCEMENT, kept_in, sources, tell_each_kernel
+from ep2sindy.runtime.compilation import ANNOUNCEMENT, cache_folder, sources, tell_each_kernel
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say
-from ep2sindy.trust.user_code import isolated
+from ep2sindy.trust.user_code import isolate
 
 ABOUT = """Compiles all kernels of the package, once after installation: half a minute on two cores.
 Runs of the command line do so by themselves; in Python, a call compiles what it uses."""
@@ -31,12 +31,12 @@ def main(arguments: Sequence[str]) -> None:
     """Compile, and say where the kernels are kept."""
     argparse.ArgumentParser("ep2sindy warm", description=ABOUT).parse_args(arguments)
     warm()
-    say(f"all kernels are compiled; they are kept in {kept_in()}")
+    say(f"all kernels are compiled; they are kept in {cache_folder()}")
 
 
 def warm() -> None:
     """Compile all kernels, saying so, unless these sources have been compiled by this machine."""
-    stamp, state = kept_in() / "warm", _state()
+    stamp, state = cache_folder() / "warm", _state()
     if stamp.is_file() and stamp.read_text("utf-8") == state:
         return
     say(ANNOUNCEMENT, error=True)
@@ -63,7 +63,7 @@ def _compiled_side_by_side() -> bool:
     texts = [path.read_text("utf-8") for path in sources()]
     n_kernels = sum(text.count("\n@compiled") - text.count(inlined) for text in texts)
     reader, writer = os.pipe()
-    command, environment = isolated("ep2sindy.app.warm")
+    command, environment = isolate("ep2sindy.app.warm")
     parts = [subprocess.Popen([*command, each], stdout=writer, env=environment) for each in PARTS]
     os.close(writer)
     with open(reader, encoding="utf-8") as lines, Bars().stage(n_kernels, "kernel") as advance:

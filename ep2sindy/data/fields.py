@@ -94,7 +94,7 @@ def grid_values(array: xr.DataArray) -> Float[np.ndarray, "time z r"]:
     return array.expand_dims(missing).transpose(*DIMS).values.astype(np.float64)
 
 
-def masked_cells(array: xr.DataArray) -> Bool[np.ndarray, "1 z r"]:
+def mask_cells(array: xr.DataArray) -> Bool[np.ndarray, "1 z r"]:
     """Cells that hold no plasma: NaN in the first sample (`check_samples` sees to the others)."""
     return np.isnan(grid_values(array.isel(time=[0], missing_dims="ignore")))
 

@@ -51,7 +51,7 @@ def without_gaps(field: xr.Dataset) -> xr.Dataset:
     return field.isel(time=np.flatnonzero(present_rows(alone)))
 
 
-def gap_words(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
+def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
     """How many of `n_samples` are missing at the times that are left, and how long at most."""
     longest, usual = float(np.diff(t).max()), float(np.median(np.diff(t)))
     return (

@@ -19,7 +19,7 @@ from ep2sindy.data.fields import (
     check_samples,
     grid_points,
     grid_values,
-    masked_cells,
+    mask_cells,
 )
 from ep2sindy.library.units import unit_product
 
@@ -272,7 +272,7 @@ def _new_name(field: xr.Dataset, name: str) -> str:
 def _samples(field: xr.Dataset, name: str) -> Float[np.ndarray, "time z r"]:
     """Values of a variable, none of them missing at times."""
     values = grid_values(field[name])
-    check_samples(field[name], values, masked_cells(field[name]))
+    check_samples(field[name], values, mask_cells(field[name]))
     return values
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from ep2sindy.data.mapping import Variable
 from ep2sindy.data.quantities import MADE_FROM
 from ep2sindy.data.readers.registry import open_source, reader_of
-from ep2sindy.data.recognition import Held, Recognised, recognised
+from ep2sindy.data.recognition import ArrayInfo, Recognised, recognise
 from ep2sindy.runtime.screen import WIDTH, html_table, in_line, one_screen, text_table
 
 HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
@@ -120,7 +120,7 @@ class Inspection:
     def _rows(self) -> list[list[str]]:
         return [self._row(each) for each in self.found.held]
 
-    def _row(self, one: Held) -> list[str]:
+    def _row(self, one: ArrayInfo) -> list[str]:
         shape = f"({', '.join(map(str, one.shape))})"
         if one.problem:
             return [one.name, "", "", "", "", "", one.problem]
@@ -129,7 +129,7 @@ class Inspection:
         return [one.name, shape, one.unit, f"{one.low:.4g}", f"{one.high:.4g}", missing,
                 self._role(one) + step]  # fmt: skip
 
-    def _role(self, one: Held) -> str:
+    def _role(self, one: ArrayInfo) -> str:
         return ", ".join(self._roles.get(one.name, [])) or "-"
 
     @cached_property
@@ -157,7 +157,7 @@ def inspect_file(path: str | Path) -> Inspection:
     """
     path = Path(path)
     source = open_source(path)
-    found = recognised(source)
+    found = recognise(source)
     kind = reader_of(path).name
     return Inspection(path, kind, source.words, found, source.channel_m)
 

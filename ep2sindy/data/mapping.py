@@ -72,7 +72,7 @@ class Problems:
         """What the file holds, where a name that it does not hold was asked for."""
         if not any(" no variable " in each for each in self.found):
             return ""
-        return f"{joined} holds {listed(source)}; set the name, or null if the file has it not"
+        return f"{joined} holds {list_arrays(source)}; set the name, or null if the file has it not"
 
 
 def in_file(
@@ -98,7 +98,7 @@ def in_file(
 
 def read_array(source: Source, ours: str, name: str) -> xr.DataArray:
     """One array of the file, or part of one, as real numbers, in the file's unit and shape."""
-    whole, part = _parted(source, name)
+    whole, part = _split_selection(source, name)
     if whole is None:
         near = get_close_matches(name, source.names, n=1)
         hint = f", but {near[0]!r}" if near else ""
@@ -119,7 +119,7 @@ def read_array(source: Source, ours: str, name: str) -> xr.DataArray:
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
 
-def _parted(source: Source, name: str) -> tuple[str | None, tuple[int | slice, ...]]:
+def _split_selection(source: Source, name: str) -> tuple[str | None, tuple[int | slice, ...]]:
     """The array that a name means, and the part of it; None where there is no such array."""
     if name in source.known:
         return name, ()
@@ -132,7 +132,7 @@ def _parted(source: Source, name: str) -> tuple[str | None, tuple[int | slice, .
     return found[1], tuple(slice(None) if part == ":" else int(part) for part in parts)
 
 
-def listed(source: Source) -> str:
+def list_arrays(source: Source) -> str:
     """Names with shapes and units: `ni (6, 4, 3) cm^-3, t (6)`."""
     texts = []
     for name in source.names[:N_LISTED]:

@@ -44,10 +44,10 @@ def seconds(t: object) -> np.ndarray:
     if array.dtype.kind == "m":
         return np.where(np.isnat(array), np.nan, array / np.timedelta64(1, "s"))
     is_short = array.ndim == 1 and array.dtype in (np.float16, np.float32)
-    return evened(array) if is_short else real_numbers(array, "t")
+    return even_grid(array) if is_short else real_numbers(array, "t")
 
 
-def evened(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
     """Times in float64: those of a shorter type, even but for its rounding, are on an even grid."""
     times = real_numbers(t, "t")
     if len(times) < 3 or t.dtype not in (np.float16, np.float32):

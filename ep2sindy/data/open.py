@@ -14,14 +14,14 @@ from pathlib import Path
 import xarray as xr
 
 from ep2sindy.data.conversion import conversion, to_si
+from ep2sindy.data.dimensions import assign_dims, read_axes
 from ep2sindy.data.fields import CLOCK, DIMS, check_field, mask_outside, write_netcdf
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
-from ep2sindy.data.placing import place, read_axes
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import open_source, reader_of
 from ep2sindy.data.readers.source import UNDECODED, Source, damage_named, file_named
-from ep2sindy.data.recognition import recognised
+from ep2sindy.data.recognition import recognise
 
 
 def open_field(
@@ -62,7 +62,7 @@ def open_field(
     source = open_source(Path(path))
     axes = {"time": time, "z": z, "r": r}
     if variables is None:
-        found = recognised(source, dt_s=dt_s, given={n: v for n, v in axes.items() if v})
+        found = recognise(source, dt_s=dt_s, given={n: v for n, v in axes.items() if v})
         found.check(source)
         variables, dt_s = found.variables, found.dt_s
         axes = {axis: given or found.axes.get(axis) for axis, given in axes.items()}
@@ -103,7 +103,7 @@ def _field(
     if dt_s is None and "time" in points:
         points["time"].attrs[CLOCK] = axes["time"].unit
     if set(points) == {*axes, "time"}:
-        placed = _placed(source, arrays, wanted, points, problems)
+        placed = _assign_dims(source, arrays, wanted, points, problems)
     problems.check(source)
     field = xr.Dataset(coords={axis: (axis, p.values, p.attrs) for axis, p in points.items()})
     for ours, array in placed.items():
@@ -113,14 +113,14 @@ def _field(
     for ours, variable in in_file({"mask": mask}, problems).items():
         with problems.noted():
             array = read_array(source, ours, str(variable.name))
-            inside = _placed(source, {ours: array}, {ours: variable}, points, problems)
+            inside = _assign_dims(source, {ours: array}, {ours: variable}, points, problems)
             field = mask_outside(field, inside[ours] != 0) if inside else field
     problems.check(source)
     check_field(field)
     return field.assign_attrs(source.attributes)
 
 
-def _placed(
+def _assign_dims(
     source: Source,
     arrays: Mapping[str, xr.DataArray],
     wanted: Mapping[str, Variable],
@@ -133,7 +133,7 @@ def _placed(
     placed = {}
     for ours, array in arrays.items():
         with problems.noted():
-            placed[ours] = place(array, ours, wanted[ours].dims, lengths, file_dims)
+            placed[ours] = assign_dims(array, ours, wanted[ours].dims, lengths, file_dims)
     return placed
 
 

@@ -130,7 +130,7 @@ ENDINGS = {
 }  # fmt: skip
 
 
-def named_unit(name: str) -> tuple[str, str | None]:
+def split_unit(name: str) -> tuple[str, str | None]:
     """`t_us` as `t` and `us`; a name that ends in no unit with None."""
     for ending in sorted(ENDINGS, key=len, reverse=True):
         if name.lower().endswith(f"_{ending}") and len(name) > len(ending) + 1:
@@ -163,7 +163,7 @@ def meant_by(name: str) -> set[str]:
     if exact:
         return exact
     *_, last = re.split(r"[/.]", name)
-    for text in (last, named_unit(last)[0], name, named_unit(name)[0]):
+    for text in (last, split_unit(last)[0], name, split_unit(name)[0]):
         if last.isdigit():
             break
         if said := words_of(text):

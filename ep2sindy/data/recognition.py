@@ -11,23 +11,23 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.conversion import SUFFIX_UNITS, conversion, counted_in
+from ep2sindy.data.dimensions import fitting, time_length
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
-from ep2sindy.data.placing import fitting, time_length
 from ep2sindy.data.quantities import (
     AXES,
     QUANTITIES,
     Quantity,
     likely_time_unit,
     meant_by,
-    named_unit,
+    split_unit,
     step_said,
     typical,
 )
 from ep2sindy.data.readers.source import Source
 from ep2sindy.library.units import unit_like
 
-MOST_COLUMNS = 32  # of an array whose columns are taken as signals of their own
+MAX_COLUMNS = 32  # of an array whose columns are taken as signals of their own
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Recognised:
     words. questions: what is left open, in words. n_samples: None where they cannot be counted.
     """
 
-    held: Sequence[Held]
+    held: Sequence[ArrayInfo]
     variables: Mapping[str, Variable]
     axes: Mapping[str, Variable]
     dt_s: float | None
@@ -62,7 +62,7 @@ class Recognised:
             )
 
 
-def recognised(
+def recognise(
     source: Source,
     *,
     dt_s: float | None = None,
@@ -72,7 +72,7 @@ def recognised(
     problems = Problems()
     named = in_file(given or {}, problems)
     problems.check(source)
-    held = [held_array(source, name) for name in source.names]
+    held = [describe_array(source, name) for name in source.names]
     usable = [each for each in held if not each.problem]
     questions: list[str] = []
     guesses: dict[str, str] = {}
@@ -93,16 +93,18 @@ def recognised(
     variables = _variables(source, rest, axes, held, lengths, questions, guesses)
     time = axes.get("time")
     if "time" not in named and time is not None and (one := _of(held, time.name)):
-        said_s = _said_step_s(usable)
+        said_s = _stated_step_s(usable)
         axes["time"] = with_time_unit(axes["time"], one, variables, said_s, guesses)
     return Recognised(held, variables, axes, dt_s, guesses, questions, lengths.get("time"))
 
 
-def _of(held: Sequence[Held], name: str | None) -> Held | None:
+def _of(held: Sequence[ArrayInfo], name: str | None) -> ArrayInfo | None:
     return next((each for each in held if each.name == name), None)
 
 
-def _axis(axis: str, held: Sequence[Held], source: Source, questions: list[str]) -> Variable | None:
+def _axis(
+    axis: str, held: Sequence[ArrayInfo], source: Source, questions: list[str]
+) -> Variable | None:
     """The vector that is this coordinate: by its name, for time also by its unit or its place."""
     unit = AXES[axis].unit
     rising = [each for each in held if each.step is not None]
@@ -120,7 +122,9 @@ def _axis(axis: str, held: Sequence[Held], source: Source, questions: list[str])
     return Variable(exact[0].name, exact[0].unit or unit) if exact else None
 
 
-def _step_s(source: Source, axes: Mapping[str, Variable], held: Sequence[Held]) -> float | None:
+def _step_s(
+    source: Source, axes: Mapping[str, Variable], held: Sequence[ArrayInfo]
+) -> float | None:
     """The time step that a preamble says, unless the time has a unit: a count of samples has none.
 
     Without a time, that of a scalar such as dt or fs.
@@ -129,10 +133,10 @@ def _step_s(source: Source, axes: Mapping[str, Variable], held: Sequence[Held]) 
     one = _of(held, time.name) if time is not None else None
     if source.step_s is not None:
         return None if one is not None and is_of(one.unit, "s") else source.step_s
-    return _said_step_s(held) if time is None else None
+    return _stated_step_s(held) if time is None else None
 
 
-def _said_step_s(held: Sequence[Held]) -> float | None:
+def _stated_step_s(held: Sequence[ArrayInfo]) -> float | None:
     """The time step that scalars such as dt or fs say, if they say one."""
     scalars = [step_said(e.name, e.low) for e in held if not e.lengths and not e.dims]
     said = {step for step in scalars if step is not None}
@@ -141,9 +145,9 @@ def _said_step_s(held: Sequence[Held]) -> float | None:
 
 def _lengths(
     axes: Mapping[str, Variable],
-    held: Sequence[Held],
+    held: Sequence[ArrayInfo],
     source: Source,
-    rest: Sequence[Held],
+    rest: Sequence[ArrayInfo],
     dt_s: float | None,
     questions: list[str],
 ) -> dict[str, int]:
@@ -164,16 +168,16 @@ def _lengths(
     return lengths
 
 
-def _dim(variable: Variable, held: Sequence[Held], axis: str) -> str:
+def _dim(variable: Variable, held: Sequence[ArrayInfo], axis: str) -> str:
     one = _of(held, variable.name)
     return one.dims[0] if one is not None and one.dims else axis
 
 
 def _variables(
     source: Source,
-    rest: Sequence[Held],
+    rest: Sequence[ArrayInfo],
     axes: Mapping[str, Variable],
-    held: Sequence[Held],
+    held: Sequence[ArrayInfo],
     lengths: Mapping[str, int],
     questions: list[str],
     guesses: dict[str, str],
@@ -203,14 +207,14 @@ def _variables(
     return found
 
 
-def _may_be(ours: str, one: Held) -> bool:
+def _may_be(ours: str, one: ArrayInfo) -> bool:
     return one.unit in ("", "1") or converts(ours, one.unit)
 
 
 def _fits(
-    one: Held,
+    one: ArrayInfo,
     axes: Mapping[str, Variable],
-    held: Sequence[Held],
+    held: Sequence[ArrayInfo],
     lengths: Mapping[str, int],
     questions: list[str],
 ) -> bool:
@@ -233,13 +237,13 @@ def _fits(
     return len(ways) == 1
 
 
-def _has_columns(one: Held, lengths: Mapping[str, int]) -> bool:
+def _has_columns(one: ArrayInfo, lengths: Mapping[str, int]) -> bool:
     """Whether an array is a few signals side by side."""
     n = lengths.get("time", 0)
-    return len(one.shape) == 2 and sorted(one.shape)[-1] == n and min(one.shape) <= MOST_COLUMNS
+    return len(one.shape) == 2 and sorted(one.shape)[-1] == n and min(one.shape) <= MAX_COLUMNS
 
 
-def _columns(one: Held, lengths: Mapping[str, int], taken: set[str]) -> dict[str, Variable]:
+def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dict[str, Variable]:
     """The signals of such an array, one by one."""
     if fitting(one.shape, lengths) or not _has_columns(one, lengths) or len(one.lengths) < 2:
         return {}
@@ -269,7 +273,7 @@ def is_of(unit: str, like: str) -> bool:
     return bool(unit) and unit != "1" and unit_like(unit, like=like)
 
 
-def with_unit(ours: str, one: Held, quantity: Quantity, guesses: dict[str, str]) -> Variable:
+def with_unit(ours: str, one: ArrayInfo, quantity: Quantity, guesses: dict[str, str]) -> Variable:
     """The unit that the file says, its name's ending, ours, or else the likely one."""
     stated = one.unit if is_of(one.unit, quantity.unit) or converts(ours, one.unit) else ""
     stated = stated or _ending(ours, one.name)
@@ -288,7 +292,7 @@ def with_unit(ours: str, one: Held, quantity: Quantity, guesses: dict[str, str])
 
 def with_time_unit(
     time: Variable,
-    one: Held,
+    one: ArrayInfo,
     variables: Mapping[str, Variable],
     said_s: float | None,
     guesses: dict[str, str],
@@ -314,7 +318,7 @@ def with_time_unit(
 
 def _ending(ours: str, name: str) -> str:
     """The unit at the end of a name, if our name can have it."""
-    unit = named_unit(re.split(r"[/.]", name)[-1])[1]
+    unit = split_unit(re.split(r"[/.]", name)[-1])[1]
     return unit if unit and converts(ours, unit) else ""
 
 
@@ -328,10 +332,10 @@ def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
     return True
 
 
-def own_unit(ours: str, one: Held) -> str:
+def own_unit(ours: str, one: ArrayInfo) -> str:
     """The unit that the file says, if numbers can be converted from it; else none."""
     suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
-    options = (one.unit, named_unit(ours)[1] or "", *suffixes)
+    options = (one.unit, split_unit(ours)[1] or "", *suffixes)
     return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")
 
 
@@ -342,7 +346,7 @@ TEXT = "text or objects"  # what is not even tried
 
 
 @dataclass(frozen=True)
-class Held:
+class ArrayInfo:
     """One array of a file. unit: "" where the file says none. n_missing: NaN or infinite.
 
     step: mean step of a vector that increases, else None. even: whether its steps are equal.
@@ -368,18 +372,18 @@ class Held:
         return tuple(n for n in self.shape if n > 1)
 
 
-def held_array(source: Source, name: str) -> Held:
+def describe_array(source: Source, name: str) -> ArrayInfo:
     """What one array holds; reads it."""
     try:
         array = read_array(source, name, name)
     except ValueError as error:
-        return Held(name, problem=_short(str(error)))
+        return ArrayInfo(name, problem=_short(str(error)))
     values = np.asarray(array.values, dtype=np.float64)
     finite = values[np.isfinite(values)]
     stated = counted_in(str(array.attrs.get("units", "") or source.units.get(name, "")))
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     step, even = _step(values.ravel()) if values.size in values.shape else (None, False)
-    return Held(
+    return ArrayInfo(
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,

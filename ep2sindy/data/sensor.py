@@ -63,7 +63,7 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
             (lower, -np.inf, levels[0], counts[1:]),
         ):
             there = x == level
-            if _clipped(x, there, others):
+            if _is_clipped(x, there, others):
                 limit[there, j] = end
                 ends.append(f"{there.sum()} samples at {level:.4g}")
         if ends:
@@ -71,7 +71,7 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
     return Bounds(lower, upper, tuple(words)) if words else None
 
 
-def _clipped(
+def _is_clipped(
     x: Float[np.ndarray, " samples"],
     there: Bool[np.ndarray, " samples"],
     others: Int[np.ndarray, " levels"],

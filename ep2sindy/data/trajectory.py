@@ -19,13 +19,13 @@ from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 
 
-def fixed(values: dict) -> MappingProxyType:
+def read_only_mapping(values: dict) -> MappingProxyType:
     """A mapping that cannot be changed."""
     return MappingProxyType(values)
 
 
 # Pickle does not know the kind, and trajectories and models go to other processes.
-copyreg.pickle(MappingProxyType, lambda kept: (fixed, (dict(kept),)))
+copyreg.pickle(MappingProxyType, lambda kept: (read_only_mapping, (dict(kept),)))
 
 
 class ConstantStateError(ValueError):

@@ -22,7 +22,7 @@ from ep2sindy.data.fields import (
     clock_of,
     grid_points,
     grid_values,
-    masked_cells,
+    mask_cells,
 )
 from ep2sindy.data.gaps import without_gaps
 from ep2sindy.data.quantities import MADE_FROM
@@ -61,13 +61,13 @@ def zone_average(
     """
     check_field(field)
     columns = {name: [(name, 1)] for name in (*states, *inputs)}
-    columns |= {f"<{p.replace(' ', '')}>": _averaged(field, split_factors(p)) for p in products}
+    columns |= {f"<{p.replace(' ', '')}>": _average_of(field, split_factors(p)) for p in products}
     used = list(dict.fromkeys(name for factors in columns.values() for name, _ in factors))
     _check_names(field, used, [*states, *inputs, *products])
-    slices = zone_slices(field, in_numbers(zone, field))
+    slices = zone_slices(field, resolve_zone(zone, field))
     part = field[used].assign_coords({axis: field[axis] for axis in field.dims}).isel(slices)
     part = without_gaps(part)
-    masks = {name: masked_cells(part[name]) for name in used}
+    masks = {name: mask_cells(part[name]) for name in used}
     weights = _zone_weights(field, slices, masks, axisymmetric=axisymmetric)
     means = _means(part, masks, weights, list(columns.values()))
     return Trajectory(
@@ -107,7 +107,7 @@ class ZoneAverage:
 
     def place(self, field: xr.Dataset) -> str:
         """What of the field's grid it averages over, in words."""
-        words = zone_words(self.zone, field)
+        words = describe_zone(self.zone, field)
         return f"average over {words}" if words else ""
 
 
@@ -172,7 +172,7 @@ def _nearest(field: xr.Dataset, *, z: float | None, r: float | None) -> dict[str
 Factors = list[tuple[str, int]]
 
 
-def _averaged(field: xr.Dataset, factors: Factors) -> Factors:
+def _average_of(field: xr.Dataset, factors: Factors) -> Factors:
     """A product, or the variable that holds its average in time, where the field has one."""
     for name, variable in field.data_vars.items():
         kept = variable.attrs.get("average_of")
@@ -286,7 +286,7 @@ class Zone:
             object.__setattr__(self, axis, (float(bounds[0]), float(bounds[1])))
 
 
-def in_numbers(zone: Zone | None, field: xr.Dataset) -> Zone:
+def resolve_zone(zone: Zone | None, field: xr.Dataset) -> Zone:
     """The zone with its ends in m.
 
     Raises ValueError for a downstream part of a channel whose length the field does not say.
@@ -308,9 +308,9 @@ def in_numbers(zone: Zone | None, field: xr.Dataset) -> Zone:
     return replace(zone, z=((1.0 - SHARE) * length_m, length_m))
 
 
-def zone_words(zone: Zone | None, field: xr.Dataset) -> str:
+def describe_zone(zone: Zone | None, field: xr.Dataset) -> str:
     """What of the grid a zone takes: `z 15 to 25 mm (20 of 100 points), ...`; "" without a grid."""
-    ends = in_numbers(zone, field)
+    ends = resolve_zone(zone, field)
     slices = zone_slices(field, ends)
     texts = []
     for axis in SPACE:

@@ -33,12 +33,12 @@ from ep2sindy.selection.rule import (
     support_of,
 )
 
-MOST_COMBINATIONS = 1_000_000  # that relations between equations may have to be checked on
+MAX_COMBINATIONS = 1_000_000  # that relations between equations may have to be checked on
 
 
 # Of a right equation chi-squared per row is 1, give or take a standard error, and a little more:
 # the noise is estimated from the samples that it judges. Measured: 0.7 to 1.3 with 70 rows.
-MOST_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
+MAX_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
 
 SMALLEST = np.finfo(np.float64).tiny  # an exact fit leaves nothing
 
@@ -273,7 +273,7 @@ def reweight(
     left = rows.target - theta @ fitted
     freedom = max(len(left) - len(order), 1)
     chi_squared = float(left @ left) / freedom
-    leaves_noise = chi_squared <= MOST_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
+    leaves_noise = chi_squared <= MAX_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
     autocorrelation = float(left[1:] @ left[:-1]) / max(float(left @ left), SMALLEST)
     return EquationFit(
         equation=candidate.equation,
@@ -288,7 +288,7 @@ def _least_sum(
     fronts: Sequence[ParetoFront], relations: Sequence[Relation]
 ) -> Int[np.ndarray, " fronts"]:
     """The combination of candidates of least summed score that has the relations' terms."""
-    places = admissible(fronts, combinations(fronts, MOST_COMBINATIONS), relations)
+    places = admissible(fronts, combinations(fronts, MAX_COMBINATIONS), relations)
     sums = np.sum([f.scores[column] for f, column in zip(fronts, places.T, strict=True)], axis=0)
     return places[int(np.argmin(sums))]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.given import Runs, trajectories_of
+from ep2sindy.data.coerce import Runs, trajectories_of
 from ep2sindy.discovery.choice import NoiseTest, noise_test
 from ep2sindy.discovery.method import DiscoveryMethod, Known, TrajectorySearch, check_kind, old_name
 from ep2sindy.estimation.estimate import Estimate
@@ -23,7 +23,7 @@ from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
 
-MOST_NOTES = 6  # on a screen
+MAX_NOTES = 6  # on a screen
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Discovery:
         return self.noise_test.misfit
 
     def __repr__(self) -> str:
-        notes = [f"note: {each}" for each in self._notes()[:MOST_NOTES]]
+        notes = [f"note: {each}" for each in self._notes()[:MAX_NOTES]]
         left = len(self._notes()) - len(notes)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
         head = [self._headline(), *([self.note] if self.note else [])]

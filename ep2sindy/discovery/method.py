@@ -15,8 +15,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool
 
+from ep2sindy.data.coerce import check_repeats
 from ep2sindy.data.numbers import column_norms, zero_to_one
-from ep2sindy.data.repeats import check_repeats
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import Choice, choose, choose_by_runs

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.given import check_domain
-from ep2sindy.data.repeats import check_repeats
+from ep2sindy.data.coerce import check_domain, check_repeats
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
-from ep2sindy.estimation.problem import EstimationProblem, check_size, scaled_problem
+from ep2sindy.estimation.problem import EstimationProblem, check_size, scale_problem
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Aligned,
@@ -29,10 +28,10 @@ from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation
 from ep2sindy.model.model import SparseModel
-from ep2sindy.runtime.progress import Progress, as_progress, counted
+from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 
-MOST_RIVALS = 5
-LEAST_ODDS = 1e-3  # of a rival that is worth a word
+MAX_RIVALS = 5
+MIN_ODDS = 1e-3  # of a rival that is worth a word
 HEAVY, STANDARD_ERRORS = 4.0, 5.0  # a kurtosis that is told; by which it must be above 3
 COLLINEAR = 5.0  # standard errors of a variance that is no more than noise
 PART = 0.05  # of the largest share: states with less have no part in a relation
@@ -137,7 +136,7 @@ def estimate(
     check_size(runs, library, terms or {})
     watch = as_progress(progress)
     with watch.stage(None, "step", "states and coefficients") as advance:
-        problem = scaled_problem(runs, library, relations, terms, advance=advance)
+        problem = scale_problem(runs, library, relations, terms, advance=advance)
         answer = _answer(problem, max_terms, align=align)
     model = _model(answer, library, units or runs[0].units, provenance or {})
     return _report(answer, model, max_terms, watch)
@@ -150,7 +149,9 @@ def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progre
     pair = gram(problem, fit, found.annealed.level)
     supports = {
         state: _score_supports(problem, pair, found, block, few_terms)
-        for block, state in counted(watch, list(enumerate(problem.states)), "equation", "rivals")
+        for block, state in count_pieces(
+            watch, list(enumerate(problem.states)), "equation", "rivals"
+        )
     }
     return Estimate(
         model=model,
@@ -281,9 +282,9 @@ def _rivals(
         chosen = set(_named_coef(problem, fit.free, block))
         for each in supports[state]:
             odds = float(np.exp(-0.5 * each.deviance))
-            if set(each.coef) != chosen and odds >= LEAST_ODDS:
+            if set(each.coef) != chosen and odds >= MIN_ODDS:
                 rivals.append(Rival(state, tuple(each.coef), odds))
-    return tuple(sorted(rivals, key=lambda r: -r.odds)[:MOST_RIVALS])
+    return tuple(sorted(rivals, key=lambda r: -r.odds)[:MAX_RIVALS])
 
 
 def _few(problem: EstimationProblem, max_terms: int) -> str:

@@ -18,7 +18,7 @@ from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
 
 PAYS = 1.0  # by which delays must lower squares and prices, beyond their own price
-MOST_SAMPLES = 10.0  # of a delay that is believed: a larger one is no small error of a clock
+MAX_SAMPLES = 10.0  # of a delay that is believed: a larger one is no small error of a clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ def suspect_delays(
         return None
     delays = _those_that_show(problem, around, best.support, late)
     gain -= np.count_nonzero(delays) * log(problem.n_samples)
-    return delays if gain > PAYS and 0.0 < np.abs(delays).max() <= MOST_SAMPLES else None
+    return delays if gain > PAYS and 0.0 < np.abs(delays).max() <= MAX_SAMPLES else None
 
 
 def fit_delays(

@@ -25,14 +25,14 @@ from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
 
 FREE_START = 100.0  # variance of the first state before any sample: ten times its RMS
-MOST_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
+MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
 SETTLED = 1e-2  # a step that lowers the squares by less is the last: a term costs ten
 # Squares so many times their number, falling by less than this share a step, come to nothing.
 FAR, CRAWLS = 10.0, 0.02
 RIDGE = 1e-12  # of a Hessian of unit diagonal
 # What samples that resolve the motion never need: then it is coefficients that run away, and each
 # substep costs as much as the first.
-MOST_SUBSTEPS, FEWEST_ALLOWED, MOST_IN_ALL = 32, 4, 20_000
+MAX_SUBSTEPS, MIN_ALLOWED, MAX_IN_ALL = 32, 4, 20_000
 FAR_OUT = 1e3  # noise beyond a limit, where it is a value to all digits
 TELLS = 1e-3  # share of a value's weight, below which limits say nothing of a state between them
 LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
@@ -112,7 +112,7 @@ def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> T
     fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
         return fit  # there is no slope to follow
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         problem.advance(1)
         change, moves = _step(problem, fit, level)
         if not np.isfinite(change).all():
@@ -161,7 +161,7 @@ def enough_substeps(
 ) -> int:
     """Runge-Kutta steps between samples that err by less than a share of what the flow may."""
     n = level.n_substeps
-    most = min(MOST_SUBSTEPS, max(FEWEST_ALLOWED, MOST_IN_ALL // problem.n_samples))
+    most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
     while 2 * n <= most:
         with np.errstate(over="ignore", invalid="ignore"):
             errors = [

@@ -15,7 +15,7 @@ from ep2sindy.estimation.problem import EstimationProblem
 
 FLOOR = 1e-3  # of the RMS: no model and no integration is exact
 SIGNIFICANT = 3.5  # standard errors of an autocorrelation
-MOST_LASTING = 0.98
+MAX_LASTING = 0.98
 ALIKE = 7.0  # of the logarithm of their mean square, which scatters by 2.15 over sqrt(n)
 LONGER = 6.0  # of autocorrelations, which scatter by up to 1.7 over sqrt(n)
 NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # that are tried beside limits
@@ -145,7 +145,7 @@ def _memory(left: Sequence[Float[np.ndarray, "samples d"]]) -> Float[np.ndarray,
     """Correlation from one sample to the next."""
     squares = sum(np.square(e).sum(axis=0) for e in left)
     lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in left)
-    return np.clip(lagged / np.maximum(squares, TINY), 0.0, MOST_LASTING)
+    return np.clip(lagged / np.maximum(squares, TINY), 0.0, MAX_LASTING)
 
 
 def _shapes(

@@ -249,7 +249,7 @@ class EstimationProblem:
         return np.argmax(self._shares[:, 0] != 0.0, axis=1)
 
 
-def scaled_problem(
+def scale_problem(
     runs: Sequence[Trajectory],
     library: Library,
     relations: Sequence[Relation] = (),

@@ -14,7 +14,7 @@ from math import inf, log
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.given import kept_inside
+from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.lateness import (
     PAYS,
@@ -43,20 +43,20 @@ SAMPLES_PER_COEFFICIENT = 10  # of an equation, where they do not: more terms fo
 LET_GO = 0.5  # of a state's spread: what is left of a state that the model does not follow
 ENOUGH_SAMPLES = 300  # to trust the first start: fewer are quickly tried from all
 # Moves of late channels, since the model of a delay is linear; mean steps that need no other.
-MOST_MOVES, SETTLED = 3, 0.05
-FEWEST_LEFT = 5  # samples of a record, that a smoother takes
-MOST_PASSES = 4  # until noise and support agree: two are the rule
+MAX_MOVES, SETTLED = 3, 0.05
+MIN_LEFT = 5  # samples of a record, that a smoother takes
+MAX_PASSES = 4  # until noise and support agree: two are the rule
 # Of the smoother, by log10 of process to measurement noise: where the likely one leads astray.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
 # rho, and the share of a term's price that is asked there: free states hide part of what a term
 # explains, and what is dropped too early would have to be found again.
 COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
 COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
-MOST_EXCHANGES = 3  # of supports at one level
+MAX_EXCHANGES = 3  # of supports at one level
 # Where supports are weighed again: colder, a linear model of the flow tells too little of others;
 # warmer, free states hide what tells them apart.
 WEIGHED_AT = 0.003
-WITHIN, MOST_TRIED, MOST_ROUNDS = 12.0, 6, 6  # above the chosen score; of each round; of all
+WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # above the chosen score; of each round; of all
 UNSURE = 0.05  # of the RMS: noise taken for a start where the smoother's is not believed
 CUTOFF = 1e-8  # singular values of unit columns: smaller ones follow noise
 
@@ -136,10 +136,10 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
     if step is None:
         return None
     here, now, late, delays = problem, found, step != 0.0, np.zeros(len(step))
-    for _ in range(MOST_MOVES):
+    for _ in range(MAX_MOVES):
         delays = delays + step
         here = move_channels(here, now.annealed.fit.paths, step)
-        if min(len(record.samples) for record in here.records) < FEWEST_LEFT:
+        if min(len(record.samples) for record in here.records) < MIN_LEFT:
             return None  # brought as far apart as a record is long: that is no delay
         now = _from_start(here, None, max_terms)
         if now.annealed.around is None:
@@ -157,10 +157,10 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
 def _from_start(problem: EstimationProblem, log10_ratio: float | None, max_terms: int) -> Solution:
     """Anneal with the smoother's noise, then with the noise that the model leaves, until both
     and the support agree."""
-    fit, std = smoothed_start(problem, log10_ratio)
+    fit, std = start_from_smooth(problem, log10_ratio)
     prices = term_prices(problem, float(problem.n_samples))
     found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)
-    for _ in range(MOST_PASSES):
+    for _ in range(MAX_PASSES):
         before, noise = found.fit.support, noise_beside(problem, found.fit)
         prices = term_prices(problem, problem.n_samples * float(noise.independent.mean()))
         found = anneal(problem, found.fit, noise.effective, prices, COLD, max_terms=max_terms)
@@ -219,7 +219,7 @@ def polish(
     if not found.fit.total < FAR * problem.n_squares:
         return found
     tried = {found.fit.support.tobytes()}
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         warmer, level = at_level(problem, found.fit, replace(found.level, rho=WEIGHED_AT))
         around = delayed_gram(problem, warmer, level)
         pair = around.at_rest
@@ -229,7 +229,7 @@ def polish(
             problem, pair, prices, warmer.support, within=WITHIN, max_terms=max_terms
         )
         others = [each for each in others if each.support.tobytes() not in tried]
-        for each in others[:MOST_TRIED]:
+        for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
             start = replace(warmer, support=each.support, free=each.free)
             fit, cold = at_level(problem, start, level)
@@ -262,7 +262,7 @@ def _exchange_terms(
 ) -> tuple[TrajectoryFit, float]:
     """Exchange terms by the Gram pair, fit again, and accept what lowers squares plus prices."""
     score = fit.total + prices[fit.support].sum()
-    for _ in range(MOST_EXCHANGES):
+    for _ in range(MAX_EXCHANGES):
         pair = gram(problem, fit, level)
         if not (pair.finite and np.isfinite(score)):
             break
@@ -278,7 +278,7 @@ def _exchange_terms(
     return fit, float(score)
 
 
-def smoothed_start(
+def start_from_smooth(
     problem: EstimationProblem, log10_ratio: float | None
 ) -> tuple[TrajectoryFit, tuple[np.ndarray, ...]]:
     """All coefficients free, on smoothed states; and the noise beside them, by record (samples, d).
@@ -291,7 +291,7 @@ def smoothed_start(
     variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
     samples = [np.concatenate([r.samples, r.inputs], axis=1) for r in problem.records]
     values = [
-        kept_inside(problem.library, np.concatenate([e.smoothed, r.inputs], axis=1), raw)
+        keep_inside(problem.library, np.concatenate([e.smoothed, r.inputs], axis=1), raw)
         for e, r, raw in zip(estimates, problem.records, samples, strict=True)
     ]
     paths = tuple(each[:, : len(problem.states)] for each in values)

@@ -12,9 +12,9 @@ from ep2sindy.estimation.likelihood import Gram, unit_sizes
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.regression.searches import BestSubset
 
-MOST_SWEEPS = 10  # over the equations: two or three are the rule
+MAX_SWEEPS = 10  # over the equations: two or three are the rule
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
-MOST_ALTERNATIVES = 24  # of one equation, about which the others' are sought again
+MAX_ALTERNATIVES = 24  # of one equation, about which the others' are sought again
 CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which terms are dependent
 
 
@@ -58,7 +58,7 @@ def best_support(
         return excess(problem, each.support, max_terms), each.score
 
     best = penalise(gram, start, prices)
-    for _ in range(MOST_SWEEPS):
+    for _ in range(MAX_SWEEPS):
         before = best
         for block in np.unique(problem.block):
             own = problem.block == block
@@ -109,7 +109,7 @@ def alternatives(
         masks = supports_by_size(problem, gram, chosen, block, max_terms=max_terms)
         seeds = [penalise(gram, m, prices) for m in masks if not np.array_equal(m, chosen)]
         seeds = [each for each in seeds if each.score <= limit + within]
-        for seed in sorted(seeds, key=lambda each: each.score)[:MOST_ALTERNATIVES]:
+        for seed in sorted(seeds, key=lambda each: each.score)[:MAX_ALTERNATIVES]:
             each = best_support(
                 problem, gram, prices, seed.support, max_terms=max_terms, held=block
             )

@@ -52,7 +52,7 @@ COLOURMAP, DARK = "Blues", 0.7
 
 IDENTIFIED = COLOURS[1]
 
-MOST_DOTS = 1500  # of the samples in a panel
+MAX_DOTS = 1500  # of the samples in a panel
 
 
 def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.DataFrame:
@@ -231,7 +231,7 @@ def _draw_one(
 ) -> None:
     """Samples as dots, the truth as a line, the model as one that both show beneath."""
     x, y = _coordinates(each.samples.t, each.samples.states, over_time)
-    step = -(-len(x) // MOST_DOTS)
+    step = -(-len(x) // MAX_DOTS)
     ax.plot(x[::step], y[::step], ".", color=GREY, ms=3.5, mew=0, label="samples")
     truth = _coordinates(each.truth.t, each.truth.states, over_time)
     ax.plot(*truth, color=DATA, lw=1.6, label="truth")

@@ -20,7 +20,7 @@ from ep2sindy.figures.style import (
     make_grid,
     make_panels,
 )
-from ep2sindy.model.likeness import LONG
+from ep2sindy.model.comparison import LONG
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
 

@@ -34,14 +34,14 @@ from ep2sindy.figures.style import (
     unit_text,
 )
 from ep2sindy.library.equations import latex_derivative, latex_name, latex_term_name
-from ep2sindy.library.units import prefixed, unit_product
+from ep2sindy.library.units import unit_product, with_prefix
 from ep2sindy.operating.law import OperatingLaw
 
 FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # of errors; what is farther off stands filled on the edge
 
-LEAST_RANGE = 0.1  # of a coefficient's size: what is constant is drawn so
+MIN_RANGE = 0.1  # of a coefficient's size: what is constant is drawn so
 
-MOST_LINES = 5  # values of the second parameter that are drawn
+MAX_LINES = 5  # values of the second parameter that are drawn
 
 QUANTITIES = ("f_kHz", "relative_amplitude")
 _MARK = {"ls": "none", "color": COLOURS[1], "zorder": 4}
@@ -99,7 +99,7 @@ def _choose_lines(
         for key, of in by_value
     ]
     groups = [group for group in groups if group[1][along].nunique() > 1] or groups
-    n = min(len(groups), MOST_LINES)
+    n = min(len(groups), MAX_LINES)
     return [groups[k] for k in np.unique(np.linspace(0, len(groups) - 1, n).round().astype(int))]
 
 
@@ -126,7 +126,7 @@ def _focus(ax: Axes, rows: pd.DataFrame) -> None:
     """The range of the values, not of an interval that reaches far."""
     values = np.concatenate([rows["alone"], rows["law"]])
     low, high = values.min(), values.max()
-    size = (LEAST_RANGE * np.abs(values).max()) or 1.0
+    size = (MIN_RANGE * np.abs(values).max()) or 1.0
     margin = max(0.15 * (high - low), 0.5 * (size - (high - low)))
     ax.set_ylim(low - margin, high + margin)
 
@@ -202,7 +202,7 @@ def _draw_shapes(
 
 def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:
     """Factor on kHz, and the unit, that bring the middle of the frequencies near one."""
-    factor, prefix = prefixed(1e3 * float(np.nanmedian(f_kHz)))
+    factor, prefix = with_prefix(1e3 * float(np.nanmedian(f_kHz)))
     return 1e3 * factor, f"{prefix}Hz"
 
 

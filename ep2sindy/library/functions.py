@@ -48,7 +48,7 @@ class Kind:
         """By name; a user's function brings its registration to another process."""
         if not self.own:
             return _built_in, (self.name,)
-        return _arrived, (self.name, self.value, self.slope, self.domain)
+        return _register_received, (self.name, self.value, self.slope, self.domain)
 
 
 @dataclass(frozen=True)
@@ -276,6 +276,8 @@ def _built_in(name: str) -> Kind:
     return _kinds[name]
 
 
-def _arrived(name: str, value: Values, slope: Values, domain: tuple[Interval, ...]) -> Kind:
+def _register_received(
+    name: str, value: Values, slope: Values, domain: tuple[Interval, ...]
+) -> Kind:
     """A user's function that came from another process: registered here, unless it is already."""
     return _kinds.setdefault(name, Kind(name, value, slope, domain, own=True))

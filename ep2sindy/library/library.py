@@ -27,7 +27,7 @@ from ep2sindy.library.terms import (
     product,
     read_term,
 )
-from ep2sindy.runtime.screen import N_LINES, cut, html_table, one_screen, wrapped
+from ep2sindy.runtime.screen import N_LINES, cut, html_table, one_screen, wrap
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,7 +333,7 @@ def library_text(
     for k, (degree, found) in enumerate(by_degree):
         left = N_LINES - len(lines) - (len(by_degree) - k - 1)
         head = f"{len(found)} of degree {degree}:"
-        lines += wrapped([head, *found], what="terms", n_lines=max(1, min(6, left)))
+        lines += wrap([head, *found], what="terms", n_lines=max(1, min(6, left)))
     return one_screen(lines)
 
 

@@ -150,8 +150,8 @@ def factor_of(part: Part) -> Factor:
 
 
 LARGEST_DEGREE = 100
-MOST_TERMS = 20_000  # whose products with each other take 3 GB
-MOST_EXPONENTS = 4_000_000  # all terms that there may be, of 200 variables
+MAX_TERMS = 20_000  # whose products with each other take 3 GB
+MAX_EXPONENTS = 4_000_000  # all terms that there may be, of 200 variables
 
 
 def check_degrees(degree: int, function_degree: int, n_variables: int, n_functions: int) -> None:
@@ -169,21 +169,21 @@ def check_degrees(degree: int, function_degree: int, n_variables: int, n_functio
 def _check_size(name: str, degree: int, n_factors: int) -> None:
     if degree > LARGEST_DEGREE:
         raise ValueError(f"{name} must be {LARGEST_DEGREE} or less: {degree} came")
-    if (n_terms := comb(n_factors + degree, degree)) <= MOST_TERMS:
+    if (n_terms := comb(n_factors + degree, degree)) <= MAX_TERMS:
         check_exponents(n_terms, n_factors)
         return
-    fits = next(d for d in range(degree, -1, -1) if comb(n_factors + d, d) <= MOST_TERMS)
+    fits = next(d for d in range(degree, -1, -1) if comb(n_factors + d, d) <= MAX_TERMS)
     raise ValueError(
-        f"a library may have up to {MOST_TERMS} terms: {name}={degree} of {n_factors} variables "
+        f"a library may have up to {MAX_TERMS} terms: {name}={degree} of {n_factors} variables "
         f"and functions makes {n_terms:.4g}; {name}={fits} makes {comb(n_factors + fits, fits)}"
     )
 
 
 def check_exponents(n_terms: int, n_factors: int) -> None:
     """Raise ValueError for more terms than a library may hold of so many factors."""
-    if n_terms * n_factors > MOST_EXPONENTS:
+    if n_terms * n_factors > MAX_EXPONENTS:
         raise ValueError(
-            f"a library may have up to {MOST_EXPONENTS / 1e6:g} million exponents, one for every "
+            f"a library may have up to {MAX_EXPONENTS / 1e6:g} million exponents, one for every "
             f"term and variable or function: {n_terms} terms of {n_factors} came; leave out terms, "
             "or variables that no term has"
         )

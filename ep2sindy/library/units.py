@@ -118,7 +118,7 @@ def unit_product(factors: Iterable[tuple[str, int | float]]) -> str:
     return " ".join(parts) or "1"
 
 
-def prefixed(value: float) -> tuple[float, str]:
+def with_prefix(value: float) -> tuple[float, str]:
     """Factor and SI prefix that bring a value between 1 and 1000: 1.4e4 -> (1e-3, "k")."""
     prefixes = {-9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
     power = 3 * math.floor(math.log10(value) / 3) if value > 0 else 0
@@ -157,14 +157,14 @@ class Clock:
         """What a duration is multiplied by to be read, and its unit: (1e6, "µs")."""
         if self.unit != "s":
             return 1.0 / self.seconds, self.unit
-        factor, prefix = prefixed(duration_s)
+        factor, prefix = with_prefix(duration_s)
         return factor, f"{prefix.replace('u', 'µ')}s"
 
     def frequency_scale(self, frequency_Hz: float) -> tuple[float, str]:
         """The same of a frequency: (1e-3, "kHz"), (3.2e7, "1/year")."""
         if self.unit != "s":
             return self.seconds, f"1/{self.unit}"
-        factor, prefix = prefixed(frequency_Hz)
+        factor, prefix = with_prefix(frequency_Hz)
         return factor, f"{prefix.replace('u', 'µ')}Hz"
 
     def duration_text(self, duration_s: float, *, digits: int = 3) -> str:

@@ -11,9 +11,9 @@ import numpy as np
 from ep2sindy.library.equations import equation_html, equation_parts
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.rollout import Equations
-from ep2sindy.runtime.screen import N_LINES, cut, wrapped
+from ep2sindy.runtime.screen import N_LINES, cut, wrap
 
-MOST_TERMS = 40  # of one equation in a notebook
+MAX_TERMS = 40  # of one equation in a notebook
 
 
 @runtime_checkable
@@ -44,7 +44,7 @@ def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
         parts = equation_parts(model.terms(state), reach=half_widths(model, state)) or ["0"]
         parts[-1] += f" [{_rate_unit(model, state)}]"
         share = 1 + spare // (len(states) - k)
-        own = wrapped([f"{state}' =", *parts], what="terms", n_lines=share)
+        own = wrap([f"{state}' =", *parts], what="terms", n_lines=share)
         spare -= len(own) - 1
         lines += own
     return [*lines, *tail]
@@ -54,7 +54,7 @@ def model_html(model: Readable) -> str:
     """The same for a notebook."""
     lines = []
     for state in model.states:
-        terms = dict(list(model.terms(state).items())[:MOST_TERMS])
+        terms = dict(list(model.terms(state).items())[:MAX_TERMS])
         left = len(model.terms(state)) - len(terms)
         text = equation_html(state, terms, reach=half_widths(model, state))
         more = f" ... {left} more terms" if left else ""

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.likeness import FreeRunBounds, Record, Verdict, record_of
+from ep2sindy.model.comparison import FreeRunBounds, Record, Verdict, record_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import phase_along

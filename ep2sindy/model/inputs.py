@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 Drive = Callable[[float], np.ndarray]
 
 
-def sampled(
+def inputs_at_samples(
     names: Sequence[str], inputs: ArrayLike | Mapping[str, Any] | None, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "... n_inputs"]:
     """Inputs at samples, (*shape, n_inputs), from such an array or from arrays by name.
@@ -50,7 +50,7 @@ def driven(
     given = dict(inputs) if isinstance(inputs, Mapping) else {}
     functions = {name: value for name, value in given.items() if callable(value)}
     at_samples = {n: np.array([f(now) for now in t.tolist()]) for n, f in functions.items()}
-    samples = sampled(names, {**given, **at_samples} if given else inputs, (len(t),))
+    samples = inputs_at_samples(names, {**given, **at_samples} if given else inputs, (len(t),))
     if not names:
         return None, samples
     smooth = spline(t, samples)

@@ -18,7 +18,7 @@ from ep2sindy.runtime.compilation import compiled
 
 FINISHED, LOOK, CROSSED, FAILED = 0, 1, 2, 3  # why `advance` returns
 
-SAFETY, LEAST_FACTOR, MOST_FACTOR = 0.9, 0.2, 10.0  # of a step from the one before
+SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0  # of a step from the one before
 EXPONENT = -1.0 / 8.0  # of the error that chooses a step; its estimate is of seventh order
 
 
@@ -148,15 +148,15 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
         calls += 12
         error = _error(e3, e5, slopes, h, y, at, rtol)
         if error < 1.0:
-            factor = MOST_FACTOR
+            factor = MAX_FACTOR
             if error > 0.0:
-                factor = min(MOST_FACTOR, SAFETY * error**EXPONENT)
+                factor = min(MAX_FACTOR, SAFETY * error**EXPONENT)
             if again:
                 factor = min(1.0, factor)
             return ahead, h, h * factor, calls
         # What is not finite shortens the step as far as a step may be shortened.
         factor = SAFETY * error**EXPONENT
-        h *= factor if factor > LEAST_FACTOR else LEAST_FACTOR
+        h *= factor if factor > MIN_FACTOR else MIN_FACTOR
         again = True
     return t, h, h, calls
 

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from ep2sindy.data.given import Run, is_run, trajectory_of
+from ep2sindy.data.coerce import Run, is_run, trajectory_of
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.model.display import model_html, model_lines
-from ep2sindy.model.inputs import sampled
+from ep2sindy.model.inputs import inputs_at_samples
 from ep2sindy.model.rollout import Rollout, rates, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
@@ -197,7 +197,7 @@ class SparseModel:
             raise ValueError(
                 f"x must have a column for each of {list(self.states)}: shape {states.shape} came"
             )
-        return self.derivative(states, sampled(self.inputs, inputs, states.shape[:-1]))
+        return self.derivative(states, inputs_at_samples(self.inputs, inputs, states.shape[:-1]))
 
     def score(
         self,

@@ -14,7 +14,7 @@ from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.inputs import Drive, driven, spline, spline_pieces
-from ep2sindy.model.solve import Border, Products, Rates, edges_of, solved
+from ep2sindy.model.solve import Border, Products, Rates, edges_of, solve_stages
 
 
 @runtime_checkable
@@ -99,7 +99,7 @@ def rollout(
     window = trajectory.window(start, stop)
     data = window.columns(model.states)
     inputs = window.columns(model.inputs)
-    found = _integrated(
+    found = _integrate(
         model,
         window.t,
         data[0] if initial is None else initial,
@@ -134,14 +134,14 @@ def simulate(
         )
     check_time(times)
     drive, samples = driven(model.inputs, inputs, times)
-    library, coef = used_terms(model.library, model.coef)
+    library, coef = terms_in_use(model.library, model.coef)
     values, terms = library.at_points([*model.states, *model.inputs])
     values[:] = np.append(start, samples[0])
     # What starts at zero is as large as its first rate makes it; what stays there, one.
     with np.errstate(over="ignore", invalid="ignore"):
         moved = np.abs(terms() @ coef) * (times[-1] - times[0])
     reach = np.where((start == 0.0) & np.isfinite(moved), moved, np.abs(start))
-    return _integrated(
+    return _integrate(
         model,
         times,
         start,
@@ -155,7 +155,7 @@ def simulate(
     )
 
 
-def _integrated(
+def _integrate(
     model: Equations,
     t: np.ndarray,
     x0: np.ndarray,
@@ -172,8 +172,8 @@ def _integrated(
     border = _border(model, np.append(x0, samples[0]), drive, scale)
     if edge := border.beyond(t[0], x0 / scale):
         message = f"the start, at t = {t[0]:.6g} s, is outside {edge.text}"
-        return _ended(model, t[:1], x0[None], samples, message, edge.function.name)
-    found = solved(
+        return _rollout_of(model, t[:1], x0[None], samples, message, edge.function.name)
+    found = solve_stages(
         _scaled_rhs(model, drive, scale),
         border,
         t,
@@ -183,7 +183,7 @@ def _integrated(
         rtol=rtol,
         limit_s=limit_s,
     )
-    return _ended(
+    return _rollout_of(
         model,
         found.t,
         found.y * scale,
@@ -194,7 +194,7 @@ def _integrated(
     )
 
 
-def _ended(
+def _rollout_of(
     model: Equations,
     t: np.ndarray,
     states: np.ndarray,
@@ -223,7 +223,7 @@ def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.
     def values(t: float, y: np.ndarray) -> np.ndarray:
         return y * scale if drive is None else np.append(y * scale, drive(t))
 
-    library, _ = used_terms(model.library, model.coef)
+    library, _ = terms_in_use(model.library, model.coef)
     return Border(edges_of(library.functions, [*model.states, *model.inputs], start), values)
 
 
@@ -256,11 +256,11 @@ def rates(
     values: Float[np.ndarray, "... variables"],
 ) -> Float[np.ndarray, "... n_states"]:
     """library(values) coef; NaN outside the domain of a function that has a coefficient."""
-    used, coef = used_terms(library, coef)
+    used, coef = terms_in_use(library, coef)
     return used.evaluate(values) @ coef
 
 
-def used_terms(
+def terms_in_use(
     library: Library, coef: Float[np.ndarray, "terms n_states"]
 ) -> tuple[Library, Float[np.ndarray, "_ n_states"]]:
     """Terms with a coefficient, where there are functions: others may have no value there."""

@@ -59,15 +59,15 @@ class ScaledModel:
         self, y: Float[np.ndarray, "n_states points"]
     ) -> Float[np.ndarray, "n_states points"]:
         """f at many states."""
-        return self.coef.T @ _evaluated(self.terms, y)
+        return self.coef.T @ _evaluate(self.terms, y)
 
     def rate(self, y: Float[np.ndarray, "states points"]) -> Float[np.ndarray, " points"]:
         """Frobenius norm of the Jacobian at many states: no smaller than its largest eigenvalue."""
-        jacobian = self.weights[:, len(y) :].T @ _evaluated(self.products, y)
+        jacobian = self.weights[:, len(y) :].T @ _evaluate(self.products, y)
         return np.sqrt(np.einsum("jp,jp->p", jacobian, jacobian))
 
 
-def _evaluated(library: Library, y: np.ndarray) -> np.ndarray:
+def _evaluate(library: Library, y: np.ndarray) -> np.ndarray:
     """(products, points): along points in one stretch, unlike `Library.evaluate`."""
     columns = np.ones((len(y) + 1, y.shape[1]))
     columns[:-1] = y

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.given import check_domain, kept_inside
+from ep2sindy.data.coerce import check_domain, keep_inside
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.rollout import Equations, rates, used_terms
+from ep2sindy.model.rollout import Equations, rates, terms_in_use
 from ep2sindy.signals.smoothers import Smoother
 
 
@@ -32,12 +32,12 @@ def derivative_r2(
     smoother: Smoother,
 ) -> float:
     """Mean over the states of the R2 of their derivatives: see `SparseModel.score`."""
-    library, _ = used_terms(model.library, model.coef)
+    library, _ = terms_in_use(model.library, model.coef)
     check_domain([run], library)
     values, data = run.columns(model.library.variables), run.columns(model.states)
     if x_dot is None:
         smooth = smoother.smooth(run.t, values)
-        values = kept_inside(library, smooth, values)
+        values = keep_inside(library, smooth, values)
         truth = smoother.derivative(run.t, data)
     else:
         truth = np.asarray(x_dot, dtype=np.float64)

@@ -141,7 +141,7 @@ class Stage:
     crossed: bool = False
 
 
-def solved(
+def solve_stages(
     rates: Rates,
     border: Border,
     t: Float[np.ndarray, " samples"],

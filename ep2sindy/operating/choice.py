@@ -27,7 +27,7 @@ from ep2sindy.operating.records import (
     check_records,
     interpolation_errors,
 )
-from ep2sindy.operating.shared_support import discover_jointly
+from ep2sindy.operating.shared_support import discover_shared
 from ep2sindy.refinement.law import LawRefinement
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.differential import Differential
@@ -35,7 +35,7 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 
-MOST_PARAMETERS = 2  # of a map that can be drawn
+MAX_PARAMETERS = 2  # of a map that can be drawn
 N_TOGETHER = 24  # points of a map that are computed as one piece: the records travel with each
 CLOSE = 0.05  # of its bound: a deviation that is no reason for another term
 
@@ -74,7 +74,7 @@ def candidate_structures(
     """
     method = Regression(formulation=Differential(), search=BestSubset(max_terms=max_terms))
     runs = {record.label: [record.run] for record in records}
-    found = discover_jointly(runs, library, method, progress=progress)
+    found = discover_shared(runs, library, method, progress=progress)
     sizes = {
         state: [support for support in front.supports if len(support) >= 2]
         for state, front in found.fronts.items()
@@ -257,7 +257,7 @@ def find_branch(
 def map_points(points: Sequence[Mapping[str, float]], n: int) -> list[dict[str, float]]:
     """A grid over the ranges of the points, the last parameter varying fastest."""
     names = list(points[0])
-    if len(names) > MOST_PARAMETERS:
+    if len(names) > MAX_PARAMETERS:
         return []
     values = np.array([[point[name] for name in names] for point in points])
     axes = [

@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import constraint
+from ep2sindy.model.comparison import FreeRunBounds, Verdict, deviation
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import FreeRunBounds, Verdict, deviation
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
 from ep2sindy.operating.records import (

@@ -24,7 +24,7 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, point_label
-from ep2sindy.operating.shared_support import JointDiscovery, JointFront
+from ep2sindy.operating.shared_support import JointFront, SharedDiscovery
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
@@ -297,7 +297,7 @@ class LawFit:
 
 
 def fit_law(
-    shared: JointDiscovery, functions: Library, *, parameters: Mapping[str, Mapping[str, float]]
+    shared: SharedDiscovery, functions: Library, *, parameters: Mapping[str, Mapping[str, float]]
 ) -> LawFit:
     """Fit the chosen supports again, all points at once, their coefficients tied by a law.
 
@@ -359,7 +359,9 @@ class _Tied:
 
 
 def _tied(
-    front: JointFront, shared: JointDiscovery, law_at: Mapping[str, Float[np.ndarray, " functions"]]
+    front: JointFront,
+    shared: SharedDiscovery,
+    law_at: Mapping[str, Float[np.ndarray, " functions"]],
 ) -> _Tied:
     """One least squares over the rows of all points."""
     terms = shared.chosen[front.equation]

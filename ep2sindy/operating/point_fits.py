@@ -25,11 +25,11 @@ from ep2sindy.operating.quantities import (
     Fitted,
     PointResult,
     Quantity,
-    drawn_estimates,
-    propagated_estimates,
+    estimates_of_covariance,
+    estimates_of_draws,
 )
 from ep2sindy.operating.records import OperatingRecord, check_alike, naming
-from ep2sindy.operating.shared_support import JointDiscovery, discover_jointly
+from ep2sindy.operating.shared_support import SharedDiscovery, discover_shared
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import refine
@@ -118,10 +118,10 @@ def fit_points(
     check_alike(points, list(dict.fromkeys(variables)))
     pieces = list(zip(points, rng.spawn(len(points)), strict=True))
     stage = progress.stage(len(points), "point fitted")
-    return collect(workers, partial(_fitted_point, study=study), pieces, stage, tell=tell)
+    return collect(workers, partial(_fit_point, study=study), pieces, stage, tell=tell)
 
 
-def _fitted_point(
+def _fit_point(
     piece: tuple[OperatingRecord, np.random.Generator], *, study: PointStudy
 ) -> PointResult:
     point, rng = piece
@@ -156,7 +156,7 @@ def _point_result(
         fits[name + REFINED] = _refined(
             run, problems, case, study, period_s, start=fits[name].model, rng=streams[2 * k + 1]
         )
-    return replace(result, fits=fits, searched=_searched(run, study, rng=last))
+    return replace(result, fits=fits, searched=_search_point(run, study, rng=last))
 
 
 def _least_squares(
@@ -173,7 +173,7 @@ def _least_squares(
     model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
     n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
     group_s = (run.t[-1] - run.t[0]) / n_groups
-    draws = resampled_coefficients(
+    draws = resample_coefficients(
         problems,
         case.constraint,
         model,
@@ -183,7 +183,9 @@ def _least_squares(
     )
     coef = coefficients_of(model, case.constraint)
     covariance = np.atleast_2d(np.cov(draws[:, coef != 0.0], rowvar=False))
-    estimates, drawn = drawn_estimates(coef, draws, case.quantities, case.constraint, study.library)
+    estimates, drawn = estimates_of_draws(
+        coef, draws, case.quantities, case.constraint, study.library
+    )
     return Fitted(
         model=replace(model, covariance=covariance),
         status=FITTED,
@@ -218,13 +220,15 @@ def _refined(
         status=found.status,
         r2=_r2(problems, found.model),
         loss=found.loss,
-        estimates=propagated_estimates(found.model, case.quantities, case.constraint, study.library)
+        estimates=estimates_of_covariance(
+            found.model, case.quantities, case.constraint, study.library
+        )
         if known
         else {},
     )
 
 
-def _searched(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
+def _search_point(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
     found = discover(run, study.searched, study.recipe, seed=rng)
     fronts = found.fronts.values()
     problems = list(dict.fromkeys(front.problem for front in fronts if front.problem is not None))
@@ -259,7 +263,7 @@ class TimeBootstrap:
             )
 
 
-def resampled_coefficients(
+def resample_coefficients(
     problems: Sequence[RegressionRows],
     constraint: Constraint,
     model: SparseModel,
@@ -341,13 +345,13 @@ class JointResult:
     reason in `why_not_tied`.
     """
 
-    found: JointDiscovery
+    found: SharedDiscovery
     fitted: Sequence[Fitted | None]
     tied: LawFit | None
     why_not_tied: str = ""
 
 
-def searched_jointly(
+def search_shared(
     points: Sequence[OperatingRecord],
     results: Sequence[PointResult],
     study: PointStudy,
@@ -371,7 +375,7 @@ def searched_jointly(
         return None
     if not (isinstance(method, Regression) and isinstance(method.search, BestSubset)):
         return None
-    found = discover_jointly(
+    found = discover_shared(
         {label: [point.trajectory] for label, point in used.items() if point.trajectory},
         study.searched,
         replace(method, bootstraps=Bootstraps(n=0)),
@@ -390,7 +394,7 @@ def searched_jointly(
     return JointResult(found, fitted, tied, reason)
 
 
-def _fitted(found: JointDiscovery, label: str) -> Fitted:
+def _fitted(found: SharedDiscovery, label: str) -> Fitted:
     scores = {
         state: front.points[label].candidates[front.supports.index(found.chosen[state])].r2_train
         for state, front in found.fronts.items()

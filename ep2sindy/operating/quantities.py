@@ -117,7 +117,7 @@ class PointResult:
         return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
 
 
-def drawn_estimates(
+def estimates_of_draws(
     coef: Float[np.ndarray, " coefs"],
     draws: Float[np.ndarray, "draws coefs"],
     quantities: Mapping[str, Quantity],
@@ -141,7 +141,7 @@ def drawn_estimates(
     return estimates, drawn
 
 
-def propagated_estimates(
+def estimates_of_covariance(
     model: SparseModel,
     quantities: Mapping[str, Quantity],
     constraint: Constraint,

@@ -80,7 +80,8 @@ def control_law(
     coef = _least_squares(values, theta[:, support])
     others = [np.delete(np.arange(len(values)), k) for k in range(len(values))]
     searched = [
-        _predicted(theta[k], values[rest], theta[rest], max_terms) for k, rest in enumerate(others)
+        _predict_left_out(theta[k], values[rest], theta[rest], max_terms)
+        for k, rest in enumerate(others)
     ]
     varies = np.ptp(values) > 0.0
     return ControlLaw(
@@ -126,7 +127,7 @@ def _best_support(values: np.ndarray, theta: np.ndarray, max_terms: int | None) 
 
 def _predictions(values: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Every point by the fit to all, and by the fit to the others; infinite where there is none."""
-    left, singular, _ = np.linalg.svd(_scaled(columns), full_matrices=False)
+    left, singular, _ = np.linalg.svd(_unit_columns(columns), full_matrices=False)
     leverage = np.square(left).sum(axis=1)
     fitted = left @ (left.T @ values)
     if singular[-1] <= ROUNDING * singular[0] or leverage.max() > FULL_LEVERAGE:
@@ -134,7 +135,7 @@ def _predictions(values: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, n
     return fitted, values - (values - fitted) / (1.0 - leverage)
 
 
-def _predicted(
+def _predict_left_out(
     row: np.ndarray, values: np.ndarray, theta: np.ndarray, max_terms: int | None
 ) -> float:
     """One more point, by the law found in these."""
@@ -147,7 +148,7 @@ def _least_squares(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(columns / scale, values, rcond=None)[0] / scale
 
 
-def _scaled(columns: np.ndarray) -> np.ndarray:
+def _unit_columns(columns: np.ndarray) -> np.ndarray:
     return columns / column_norms(columns)
 
 

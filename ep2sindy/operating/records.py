@@ -16,12 +16,12 @@ from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
 from ep2sindy.signals.spectrum import steps_in
 
-LEAST_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
+MIN_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
 
 # Two cycles coexist where the relative amplitudes of the records, as far as a plane through the
 # parameters does not explain them, part in two groups this many times as far apart as those in a
 # group are spread, and by this share of themselves; a single amplitude or a trend is no branch.
-APART, LEAST_STEP = 3.0, 0.3
+APART, MIN_STEP = 3.0, 0.3
 
 N_ROBUST = 50  # of the plane's fits, each weighted by the last one's residuals
 
@@ -82,9 +82,9 @@ class OperatingRecord:
                 f"{where}: its record has no period to learn from; leave the point out, or record "
                 "it for longer"
             )
-        if cycle.n_periods < LEAST_PERIODS:
+        if cycle.n_periods < MIN_PERIODS:
             raise ValueError(
-                f"{where}: its record holds {cycle.n_periods:.1f} periods of the {LEAST_PERIODS:g} "
+                f"{where}: its record holds {cycle.n_periods:.1f} periods of the {MIN_PERIODS:g} "
                 "that are needed; record it for longer"
             )
         return cycle
@@ -216,7 +216,7 @@ def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records
     weak, strong = order[: k + 1], order[k + 1 :]
     inner = [np.ptp(left[group]) / len(group) for group in (weak, strong) if len(group) > FEW]
     spread = max(inner, default=np.inf)
-    if not (gaps[k] > LEAST_STEP and gaps[k] > APART * spread):
+    if not (gaps[k] > MIN_STEP and gaps[k] > APART * spread):
         return nothing
     found = nothing.copy()
     found[weak] = 1

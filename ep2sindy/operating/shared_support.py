@@ -18,7 +18,7 @@ from ep2sindy.regression.front import ParetoFront, errors_of, fit_supports, fron
 from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.runtime.progress import Progress, as_progress, counted
+from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
@@ -40,7 +40,7 @@ class JointFront:
 
 
 @dataclass(frozen=True, eq=False)
-class JointDiscovery:
+class SharedDiscovery:
     """What a joint search leaves: per state a front, scores and the support; per point a model.
 
     scores: by state, one per support, summed over the points; the lowest is chosen.
@@ -55,7 +55,7 @@ class JointDiscovery:
 
 
 @one_thread()
-def discover_jointly(
+def discover_shared(
     points: Mapping[str, Sequence[Trajectory]],
     library: Library,
     method: Regression | None = None,
@@ -63,7 +63,7 @@ def discover_jointly(
     seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
     recipe: Regression | None = None,
-) -> JointDiscovery:
+) -> SharedDiscovery:
     """Find equations whose terms are the same at every operating point, coefficients free.
 
     Each point is assembled on its own, with its own sampling, noise and scale. The search finds
@@ -85,14 +85,14 @@ def discover_jointly(
     watch = as_progress(progress)
     problems = {
         p: method.formulation.assemble(points[p], library, rng=rng)
-        for p in counted(watch, sorted(points), "point", "rows of the regression")
+        for p in count_pieces(watch, sorted(points), "point", "rows of the regression")
     }
     fronts = _joint_fronts(problems, search, method.depth, watch)
     scores = _summed_scores(list(fronts.values()), method.selection, library, points)
     best = {state: int(np.argmin(each)) for state, each in zip(fronts, scores, strict=True)}
     provenance = method.provenance | {"joint": ", ".join(points)}
     del provenance["bootstraps"]
-    return JointDiscovery(
+    return SharedDiscovery(
         fronts=fronts,
         scores=dict(zip(fronts, scores, strict=True)),
         chosen={state: front.supports[best[state]] for state, front in fronts.items()},
@@ -120,7 +120,7 @@ def _joint_fronts(
         equation: _joint_front(
             {p: parts[k] for p, parts in problems.items()}, equation, search, depth
         )
-        for k, equation in counted(progress, equations, "equation", "search of all points")
+        for k, equation in count_pieces(progress, equations, "equation", "search of all points")
     }
 
 

@@ -35,7 +35,7 @@ SETTINGS = RefinementSettings(n_reweights=0)
 DESCENT = GradientDescent(max_iter=60, tolerance=1e-3, patience=5)
 
 # A step is fine enough when half of it moves the trajectories by less than either of these.
-ERROR_PER_RESIDUAL, LEAST_ERROR = 0.1, 1e-3  # rms, the second in std
+ERROR_PER_RESIDUAL, MIN_ERROR = 0.1, 1e-3  # rms, the second in std
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ def _judge(
     with np.errstate(over="ignore", invalid="ignore"):  # a blow-up is a status
         window_loss = np.square(nodes - data).mean(axis=(1, 2))
     loss = float(window_loss.mean())
-    allowed = max(ERROR_PER_RESIDUAL * np.sqrt(loss), LEAST_ERROR)
+    allowed = max(ERROR_PER_RESIDUAL * np.sqrt(loss), MIN_ERROR)
     status = status_of(
         finite=bool(fit.finite[0] and np.isfinite(loss)),
         flat=is_flat(loss, data, free_start=problem.free_start),

@@ -26,7 +26,7 @@ CLOSED = 1e-9  # largest gap, in std, between the steps of one trajectory
 CLOSING_STEPS = 10  # of Newton's method, until the gaps are
 
 # A step counts as fine enough when the bias it leaves in a scaling is below either of these.
-BIAS_PER_ERROR, LEAST_BIAS = 0.1, 1e-4
+BIAS_PER_ERROR, MIN_BIAS = 0.1, 1e-4
 
 # A fit counts as stationary when one more Gauss-Newton step would gain less than this share of
 # the loss, or move no scaling by more.
@@ -281,7 +281,7 @@ def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndar
 def is_coarse(bias: np.ndarray, covariance: np.ndarray, scaling: np.ndarray) -> bool:
     """Whether the error of the time step shows in any scaling."""
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    allowed = np.maximum(BIAS_PER_ERROR * error, LEAST_BIAS * np.abs(scaling))
+    allowed = np.maximum(BIAS_PER_ERROR * error, MIN_BIAS * np.abs(scaling))
     return bool((~(np.abs(bias) <= allowed)).any())
 
 

@@ -18,7 +18,7 @@ ALIKE = 1e-3
 
 # Simpler terms that a term is left out for. Without noise, every term on a periodic orbit is nearly
 # a combination of many others, and the law may be the shorter for it.
-MOST_PARTS = 3
+MAX_PARTS = 3
 
 # Rows per term of the library below which a search would fit the noise of its rows...
 FEW = 3
@@ -49,7 +49,7 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
     xx = problem.train_gram.xx[0]
     usable = _distinct(problem.library, xx)
     for j, parts in _combinations(problem.library, problem.train_theta, xx):
-        usable[j] = len(parts) > MOST_PARTS
+        usable[j] = len(parts) > MAX_PARTS
     return usable
 
 
@@ -142,7 +142,7 @@ def _dependent(
     found = []
     for j, columns in _combinations(library, theta, xx):
         parts = [names[i] for i in columns]
-        left_out = " and is left out" if len(parts) <= MOST_PARTS else ""
+        left_out = " and is left out" if len(parts) <= MAX_PARTS else ""
         message = f"{names[j]!r} is a linear combination of {parts} on every row{left_out}"
         found.append(Ambiguity((names[j], *parts), message, True))
     return found
@@ -161,7 +161,7 @@ def _combinations(
     for rank in np.flatnonzero(~independent):
         basis = np.sort(columns[:rank][independent[:rank]])
         weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
-        if (np.abs(weights) > 1e-6).sum() > MOST_PARTS:
+        if (np.abs(weights) > 1e-6).sum() > MAX_PARTS:
             # A Gram matrix has lost half the digits: by rows, many parts may turn out few.
             weights = np.linalg.lstsq(theta[:, basis], theta[:, columns[rank]], rcond=None)[0]
         found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))

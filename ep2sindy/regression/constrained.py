@@ -15,7 +15,7 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
 
-LEAST_RESIDUAL = 1e-6  # of the target's RMS: no equation weighs more, however exact its fit
+MIN_RESIDUAL = 1e-6  # of the target's RMS: no equation weighs more, however exact its fit
 
 N_PASSES = 4  # then a fifth moves nothing by 1e-6 of its error, at 20 % noise
 
@@ -152,17 +152,17 @@ def weighted_equations(
         names = [constraint.coefficients[k][1] for k in at]
         terms = np.array([problem.library.index(name) for name in names], dtype=np.int64)
         if constraint.C[at].any():
-            equations.append(_fitted_alone(problem, number, at, terms))
+            equations.append(_fit_alone(problem, number, at, terms))
     return equations
 
 
-def _fitted_alone(
+def _fit_alone(
     problem: RegressionRows, number: int, at: np.ndarray, terms: np.ndarray
 ) -> WeightedEquation:
     theta, target = problem.train_theta[:, terms], problem.train_target(number)
     start = np.linalg.lstsq(theta, target, rcond=None)[0]
     variance = np.square(target - theta @ start).sum() / max(len(target) - len(terms), 1)
-    least = LEAST_RESIDUAL**2 * np.square(target).mean()
+    least = MIN_RESIDUAL**2 * np.square(target).mean()
     if problem.noisy is not None:
         white = _whiten(problem, terms, start, n_steps=8)
         problem = replace(problem, noisy=replace(problem.noisy, smoothed=white.corrected))

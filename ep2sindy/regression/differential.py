@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ep2sindy.data.given import check_domain, kept_inside
+from ep2sindy.data.coerce import check_domain, keep_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import RegressionRows
@@ -59,6 +59,6 @@ class Differential:
     def _rows(self, run: Trajectory, library: Library) -> tuple[np.ndarray, np.ndarray]:
         values = run.columns(library.variables)
         if self.smooth_library:
-            values = kept_inside(library, self.smoother.smooth(run.t, values), values)
+            values = keep_inside(library, self.smoother.smooth(run.t, values), values)
         with np.errstate(over="ignore"):  # RegressionRows names a term that is not finite
             return library.evaluate(values), self.smoother.derivative(run.t, run.states)

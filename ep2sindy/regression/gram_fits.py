@@ -68,7 +68,7 @@ def independent_terms(xx):
 
 
 @compiled
-def _chosen(masks, m, active):
+def _fill_active(masks, m, active):
     """Fill in the terms of one mask; how many they are."""
     n_active = 0
     for j in range(masks.shape[1]):
@@ -89,7 +89,7 @@ def solve_masks(xx, rhs, masks):
     solution = np.empty(n_terms)
     active = np.empty(n_terms, dtype=np.int64)
     for m in range(n_masks):  # loops: fancy indices would take seconds more to compile
-        n_active = _chosen(masks, m, active)
+        n_active = _fill_active(masks, m, active)
         if solve(xx, rhs[m], active, n_active, solution):
             for i in range(n_active):
                 coef[m, active[i]] = solution[i]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import block_diag, csr_array
 
-from ep2sindy.data.given import check_domain, kept_inside
+from ep2sindy.data.coerce import check_domain, keep_inside
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import usable_terms
@@ -115,7 +115,7 @@ class Weak:
         if estimate is not None:
             estimate = replace(
                 estimate,
-                smoothed=kept_inside(library, np.where(exact, values, estimate.smoothed), values),
+                smoothed=keep_inside(library, np.where(exact, values, estimate.smoothed), values),
                 noise_std=np.where(exact, 0.0, estimate.noise_std),
             )
         if not self.smooth_library:
@@ -123,7 +123,7 @@ class Weak:
         if estimate is not None and kalman is self.smoother:
             return estimate.smoothed, estimate
         smooth = np.where(exact, values, self.smoother.smooth(t, values))
-        return kept_inside(library, smooth, values), estimate
+        return keep_inside(library, smooth, values), estimate
 
     def _problem(
         self,
@@ -280,7 +280,7 @@ NEGLIGIBLE = 1e-3
 # Noise above half a step of its digits lets a record repeat its last value less often than this.
 HELD = 0.5
 
-MOST_LEVELS = 8  # that a switch has; a record of noise has more, however coarse its digits
+MAX_LEVELS = 8  # that a switch has; a record of noise has more, however coarse its digits
 
 
 def exact_columns(
@@ -314,4 +314,4 @@ def exact_columns(
 def is_switched(samples: Float[np.ndarray, " samples"]) -> bool:
     """Whether a signal holds its value over most steps, or jumps between a few levels."""
     held = np.mean(np.diff(samples) == 0.0)
-    return bool(held >= HELD) or len(np.unique(samples)) <= MOST_LEVELS
+    return bool(held >= HELD) or len(np.unique(samples)) <= MAX_LEVELS

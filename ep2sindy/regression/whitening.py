@@ -10,7 +10,7 @@ from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csr_array
 
-from ep2sindy.data.given import kept_inside
+from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 
@@ -27,7 +27,7 @@ ROUNDING = 1e-8
 # 6 and brought it back with the next; those that run away raise it by 14 to 1600.
 RISE = 10.0
 
-MOST_HALVED = 6
+MAX_HALVED = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +86,11 @@ def _following(
     limit: the misfit that a whole step may reach.
     """
     coef = rows.fit(terms)
-    x = kept_inside(problem.library, rows.correct(coef), rows.x)
+    x = keep_inside(problem.library, rows.correct(coef), rows.x)
     whole = _Linearised.at(problem, x, coef)
     if whole.misfit <= limit:
         return whole
-    for n_halved in range(1, MOST_HALVED + 1):
+    for n_halved in range(1, MAX_HALVED + 1):
         share = 0.5**n_halved
         part = _Linearised.at(
             problem, rows.x + share * (x - rows.x), rows.coef + share * (coef - rows.coef)
@@ -201,7 +201,7 @@ def _lift(
     for v in range(n):
         step = np.zeros_like(x)
         step[:, v] = np.sqrt(left) * rows.noise_std[:, v]
-        ahead, behind = (kept_inside(some, x + s * step, x) for s in (1.0, -1.0))
+        ahead, behind = (keep_inside(some, x + s * step, x) for s in (1.0, -1.0))
         both = (ahead[:, v] != x[:, v]) & (behind[:, v] != x[:, v])
         mean = 0.5 * (some.evaluate(ahead) + some.evaluate(behind))
         lift[:, curved] += np.where(both[:, None], mean - here, 0.0)

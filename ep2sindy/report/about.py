@@ -46,7 +46,7 @@ class About:
         return join(self.provenance["command"])
 
 
-def asked_of(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, str]:
+def settings_used(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, str]:
     """The settings that a study uses, in words; those that are not set are left out."""
     shown = [key for key in settings if key in keys and key not in ASIDE]
     rank = {key: k for k, key in enumerate(ASKED)}

@@ -73,7 +73,7 @@ def _environment(template: Path) -> Environment:
     environment.globals.update(
         equation=equation_html, cell=cell_html, classes=_classes, kind_of=_kind
     )
-    environment.filters.update(numeric=numeric_columns, raised=raised_html)
+    environment.filters.update(numeric=numeric_columns, raised=powers_html)
     return environment
 
 
@@ -82,7 +82,7 @@ def equation_html(block: Equation) -> Markup:
     from markupsafe import Markup, escape
 
     lead = escape(f"{block.lead}: ") if block.lead else ""
-    unit = f' <span class="unit">{raised_html(block.unit)}</span>' if block.unit else ""
+    unit = f' <span class="unit">{powers_html(block.unit)}</span>' if block.unit else ""
     mark = escape(block.mark.replace("<-", "←"))
     return Markup(f'{lead}<span class="math">{equation_mathml(block)}</span>{unit}{mark}')
 
@@ -97,11 +97,11 @@ def cell_html(value: object) -> Markup:
         return Markup('<a href="{}">{}</a>').format(value.to, value.text)
     if _is_number(value):
         text = re.sub(r"e([+-])0*(\d+)", r"·10^\1\2", cell_text(value))
-        return raised_html(text.replace("^+", "^"))
-    return raised_html(cell_text(value))
+        return powers_html(text.replace("^+", "^"))
+    return powers_html(cell_text(value))
 
 
-def raised_html(text: str) -> Markup:
+def powers_html(text: str) -> Markup:
     """Text with its powers raised, `m^-3 s^-1`, and all else escaped."""
     from markupsafe import Markup, escape
 

@@ -32,7 +32,7 @@ class Drawn:
     width_px: int
 
 
-def drawn(figure: Figure, png: bytes, caption: str) -> Drawn:
+def draw(figure: Figure, png: bytes, caption: str) -> Drawn:
     """A figure for a page: its PNG, or where something in it says more on hover, its SVG."""
     width = round(figure.get_size_inches()[0] * PX_PER_INCH)
     speaks = figure.findobj(lambda artist: (artist.get_gid() or "").startswith(HOVER))

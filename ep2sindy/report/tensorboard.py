@@ -75,13 +75,13 @@ class Board:
     def _add(self, summary: Any, *, step: int = 0) -> None:
         with writing(self._folder):
             if self._writer is None:
-                self._writer = _opened(self._folder)
+                self._writer = _open(self._folder)
                 self._writer.write(_event(file_version="brain.Event:2"))
             self._writer.write(_event(step=step, summary=summary))
             self._writer.flush()
 
 
-def _opened(folder: Path) -> Any:
+def _open(folder: Path) -> Any:
     """An event file, named as TensorBoard looks for it."""
     from tensorboard.summary.writer.record_writer import RecordWriter
 

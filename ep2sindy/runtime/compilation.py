@@ -41,7 +41,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     if hasattr(kept, "_source_stamp"):  # numba has no public way
         kept._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
     if hasattr(kernel._cache, "save_overload"):
-        kernel._cache.save_overload = partial(_kept_if_room, kernel._cache.save_overload)
+        kernel._cache.save_overload = partial(_keep_if_room, kernel._cache.save_overload)
     return kernel
 
 
@@ -64,7 +64,7 @@ def _imported(files: Iterable[Path]) -> set[Path]:
     return {place for place in places if place.is_file()}
 
 
-def kept_in() -> Path:
+def cache_folder() -> Path:
     """The folder where compiled kernels are kept: beside this file, or where numba chose to."""
 
     @numba.njit(cache=True)
@@ -81,7 +81,7 @@ def tell_each_kernel(tell: Callable[[str], None]) -> None:
     _TOLD.append(tell)
 
 
-def _kept_if_room(save: Callable, *compiled: Any) -> None:
+def _keep_if_room(save: Callable, *compiled: Any) -> None:
     """A disk that takes no more costs the next run half a minute, not this one its results."""
     with suppress(OSError):
         save(*compiled)

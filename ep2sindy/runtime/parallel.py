@@ -19,7 +19,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
-from ep2sindy.trust.user_code import isolated_children, own_packages
+from ep2sindy.trust.user_code import isolate_children, own_packages
 
 # Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
 AHEAD = 2
@@ -147,7 +147,7 @@ class Loky:
         # Pieces are pickled as they are: joblib would keep a copy of every large array on disk.
         workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
         code, numbered = _with_its_code(function), enumerate(pieces)
-        with isolated_children():  # all workers start before the first result is asked for
+        with isolate_children():  # all workers start before the first result is asked for
             found = workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
         yield from found
 

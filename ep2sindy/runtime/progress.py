@@ -105,7 +105,7 @@ def as_progress(progress: Progress | Advance | bool) -> Progress:
     return progress if isinstance(progress, Progress) else Told(progress)
 
 
-def counted(
+def count_pieces(
     progress: Progress, pieces: Collection[Piece], unit: str, label: str = ""
 ) -> Iterator[Piece]:
     """Every piece in turn, as a stage: one is done when the next is asked for."""

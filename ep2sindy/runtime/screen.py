@@ -60,7 +60,7 @@ def cut(text: str, width: int = WIDTH) -> str:
     return text if len(text) <= width else text[: width - 3] + "..."
 
 
-def wrapped(parts: Sequence[str], *, what: str, n_lines: int, indent: str = "    ") -> list[str]:
+def wrap(parts: Sequence[str], *, what: str, n_lines: int, indent: str = "    ") -> list[str]:
     """Parts joined by blanks into lines of a screen's width: at the end `... 7 more terms`."""
     lines, counts = [""], [0]
     for k, part in enumerate(parts):

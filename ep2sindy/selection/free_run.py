@@ -12,14 +12,14 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation
+from ep2sindy.model.comparison import FreeRunBounds, Verdict, compare_cycles, deviation
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
-from ep2sindy.model.likeness import FreeRunBounds, Verdict, against_cycle, deviation
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import ParetoFront
-from ep2sindy.runtime.progress import SILENT, Progress, counted
+from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import (
     FLOOR,
@@ -42,7 +42,7 @@ from ep2sindy.selection.systems import (
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import samples_in, steps_in
 
-LEAST_WINDOWS = 30  # that the winner is refined on
+MIN_WINDOWS = 30  # that the winner is refined on
 
 # Share of the window loss of a smaller system on a neutral cycle that one on a cycle that attracts
 # must come below: where noise is all that is left, more terms pull by chance.
@@ -53,15 +53,15 @@ GAIN = 0.95
 PULL = 0.95
 
 # Of a record, so that its folds leave windows of two: six, less what noise makes of them.
-LEAST_PERIODS = 5.5
+MIN_PERIODS = 5.5
 
 # Change of every state's amplitude from each third of a record to the next, in one direction, above
 # which it spirals: no one cycle has the amplitude of all folds within 10 %.
-MOST_DRIFT = 1.1
+MAX_DRIFT = 1.1
 
 # Periods of a trial run: enough for a transient to die out. A model without inputs runs on where
 # a stretch ends before.
-LEAST_RUN, MOST_RUN = 16.0, 30.0
+MIN_RUN, MAX_RUN = 16.0, 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +237,7 @@ class FreeRunScore:
         found = np.full((len(paths), 2), [MAX_ERROR, np.inf])
         for row, path in zip(found, paths, strict=True):
             if np.isfinite(path).all():
-                likeness = against_cycle(ours, t[half:], path[half:, columns])
+                likeness = compare_cycles(ours, t[half:], path[half:, columns])
                 error = deviation(*likeness, self.bounds)
                 if not np.isnan(error):
                     row[:] = min(error, MAX_ERROR), likeness[2].max()
@@ -260,11 +260,11 @@ class FreeRunScore:
         window = self._window(records, cycles)
         found, resting = [], None
         best = (living or by_error)[: self.n_confirmed]
-        for place, k in enumerate(counted(progress, best, "system", "refined on all data")):
+        for place, k in enumerate(count_pieces(progress, best, "system", "refined on all data")):
             model = trials[k].system.refined_on_all(
                 records.runs,
                 window=window,
-                n_windows=max(LEAST_WINDOWS, self.n_windows),
+                n_windows=max(MIN_WINDOWS, self.n_windows),
                 n_reweights=0,
                 seed=self.seed,
             )
@@ -313,7 +313,7 @@ def cycles_of(records: Records, states: Sequence[str]) -> list[Cycle] | str:
         name = f"record {run.label!r}" if run.label else "the record"
         if cycle is None:
             return f"{name} has no period"
-        if cycle.n_periods < LEAST_PERIODS:
+        if cycle.n_periods < MIN_PERIODS:
             return f"{name} holds {cycle.n_periods:.1f} periods, not six"
         if _spirals(cycle, run.columns(states)):
             return f"{name} spirals"
@@ -328,7 +328,7 @@ def _spirals(cycle: Cycle, states: Float[np.ndarray, "samples n_states"]) -> boo
         basis = np.column_stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
         amplitude.append(np.hypot(*np.linalg.lstsq(basis, part, rcond=None)[0][1:]))
     before, after = np.array(amplitude[:2]), np.array(amplitude[1:])
-    grows, decays = after > MOST_DRIFT * before, before > MOST_DRIFT * after
+    grows, decays = after > MAX_DRIFT * before, before > MAX_DRIFT * after
     return bool(grows.all() or decays.all())
 
 
@@ -347,7 +347,7 @@ def paths_over(
         per_period = steps_in(1.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
         first, n_samples = part.start, part.stop - part.start
         if not ensemble.inputs:
-            n_samples = round(np.clip(n_samples, LEAST_RUN * per_period, MOST_RUN * per_period))
+            n_samples = round(np.clip(n_samples, MIN_RUN * per_period, MAX_RUN * per_period))
             # Over as many periods, no two at one phase.
             later = np.arange(n_starts) * (1.0 + 1.0 / n_starts) * per_period
             starts = np.minimum(first + later.round().astype(np.int64), part.stop - 1)
@@ -355,7 +355,7 @@ def paths_over(
             windows = DrivenWindows.free(begin, step_s=run.dt_s, n_samples=n_samples)
             t = run.dt_s * np.arange(n_samples)
         else:
-            if n_samples < LEAST_RUN * per_period:  # inputs end with the record
+            if n_samples < MIN_RUN * per_period:  # inputs end with the record
                 first, n_samples = 0, run.n_samples
             windows = DrivenWindows.of(run, x, ensemble.inputs, np.array([first]), n_samples - 1)
             t = run.t[first : first + n_samples]

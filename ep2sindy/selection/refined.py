@@ -30,7 +30,7 @@ from ep2sindy.selection.rule import (
 from ep2sindy.selection.systems import Records, System, budget, records_of, systems_of
 
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
-LEAST_PAIRS = 3
+MIN_PAIRS = 3
 
 # Parts that the windows are dealt to: half of the windows of a relaxation oscillation may hold
 # none of its jumps, and then they leave the coefficients of the fast equation open.
@@ -175,7 +175,7 @@ class RefinedScore:
         """Samples in each window."""
         longest = max(run.n_samples for run in runs)
         if self.window_s is None:
-            room = sum(run.n_samples for run in runs) // (2 * LEAST_PAIRS)
+            room = sum(run.n_samples for run in runs) // (2 * MIN_PAIRS)
             wanted = min(dominant_window(runs, states), room)
             window = min(max(wanted, MIN_SAMPLES), longest // 2)
         else:

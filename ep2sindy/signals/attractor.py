@@ -12,13 +12,13 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
 
-LEAST_PERIODS = 3.0  # of a record that can be said to repeat
+MIN_PERIODS = 3.0  # of a record that can be said to repeat
 
-LEAST_VISIBLE = 0.1  # of the variance of any state, noise included: noise alone has lines, too
+MIN_VISIBLE = 0.1  # of the variance of any state, noise included: noise alone has lines, too
 
-LEAST_SHARE = 0.5  # of the variance that the waveform must explain, for a record to have a period
+MIN_SHARE = 0.5  # of the variance that the waveform must explain, for a record to have a period
 
-MOST_HARMONICS = 16
+MAX_HARMONICS = 16
 
 SAMPLES_PER_HARMONIC = 2.5  # of its period, at least: two would be the Nyquist limit
 
@@ -85,19 +85,19 @@ def find_cycle(
     leader = int(np.argmax([sharpness for _, sharpness in lines]))
     rough_Hz = lines[leader][0]
     n_periods = rough_Hz * (t[-1] - t[0])
-    if not n_periods >= LEAST_PERIODS:
+    if not n_periods >= MIN_PERIODS:
         return None
     most = _most_harmonics(len(t), n_periods) if n_harmonics is None else n_harmonics
     phase = _phase(t, scaled, leader, rough_Hz, most)
     frequency_Hz = float(np.polynomial.Polynomial.fit(t, phase, 1).convert().coef[1]) / (2 * np.pi)
     series, rest = _series(phase, scaled, most, chosen=n_harmonics is None)
     whole = np.square(scaled).sum(axis=0)
-    if not (whole - rest >= LEAST_VISIBLE * whole).any():
+    if not (whole - rest >= MIN_VISIBLE * whole).any():
         return None
     noise = len(t) * np.array([_white_variance(*spectrum) for spectrum in spectra])
     known = np.maximum(whole - noise, 1e-12)
     share = 1.0 - float(np.maximum(rest - noise, 0.0).sum() / known.sum())
-    if not (share >= LEAST_SHARE and frequency_Hz > 0.0):
+    if not (share >= MIN_SHARE and frequency_Hz > 0.0):
         return None
     return Cycle(
         frequency_Hz=frequency_Hz,
@@ -114,11 +114,11 @@ def _phase(
     """Phase at every sample, from a rough frequency of the leading state, by up to `most` terms."""
     phase = 2.0 * np.pi * rough_Hz * (t - t[0])
     for _ in range(3):
-        phase = _sharpened(t, phase, scaled, 1)
+        phase = _sharpen(t, phase, scaled, 1)
     if rough_Hz * (t[-1] - t[0]) >= 2.0 * PERIODS_TRACKED:
         phase = phase + _drift(t, scaled[:, leader], phase)
     for _ in range(2):
-        phase = _sharpened(t, phase, scaled, most)
+        phase = _sharpen(t, phase, scaled, most)
     return phase
 
 
@@ -167,12 +167,12 @@ def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
         slow = make_interp_spline(t, slow, k=1)(even)
     per_period = len(t) * 2.0 * np.pi / (straight[-1] - straight[0])
     n = max(3, round(min(PERIODS_TRACKED * per_period, 0.5 * len(t))))
-    drift = np.unwrap(np.angle(_averaged(slow, np.hanning(n + 2)[1:-1])))
+    drift = np.unwrap(np.angle(_moving_average(slow, np.hanning(n + 2)[1:-1])))
     whole = slice(n // 2, len(t) - n // 2)
     return np.interp(t, even[whole], drift[whole])
 
 
-def _averaged(x: np.ndarray, window: np.ndarray) -> np.ndarray:
+def _moving_average(x: np.ndarray, window: np.ndarray) -> np.ndarray:
     """`scipy.signal.fftconvolve(x, window, "same")`: loading that module takes half a second."""
     length = len(x) + len(window) - 1
     fast = fft.next_fast_len(length)
@@ -181,7 +181,7 @@ def _averaged(x: np.ndarray, window: np.ndarray) -> np.ndarray:
     return whole[first : first + len(x)]
 
 
-def _sharpened(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
+def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
     """A phase whose slope in time is changed so that the series of this order fits best.
 
     One Gauss-Newton step: what the slope explains of what the series leaves.
@@ -213,7 +213,7 @@ def _columns(phase: np.ndarray, order: int) -> np.ndarray:
 def _most_harmonics(n_samples: int, n_periods: float) -> int:
     """As many as the samples of a period can tell apart, and their number determine."""
     by_period = n_samples / n_periods / SAMPLES_PER_HARMONIC
-    return int(np.clip(min(by_period, (n_samples - 1) // 4), 1, MOST_HARMONICS))
+    return int(np.clip(min(by_period, (n_samples - 1) // 4), 1, MAX_HARMONICS))
 
 
 def _series(

@@ -110,7 +110,7 @@ class Rate:
 
     def embed(self, signal: Trace) -> Embedded:
         x, v = self.names(signal.name)
-        smoothed, derivative, noise_std = _smoothed(signal, self.harmonics)
+        smoothed, derivative, noise_std = _smooth(signal, self.harmonics)
         states = np.column_stack([smoothed, derivative])
         units = {x: signal.unit, v: unit_product([(signal.unit, 1), ("s", -1)])}
         run = _trajectory(signal, signal.t, states, units)
@@ -141,7 +141,7 @@ class Delays:
 
     def embed(self, signal: Trace) -> Embedded:
         x, before = self.names(signal.name)
-        smoothed, _, noise_std = _smoothed(signal, self.harmonics)
+        smoothed, _, noise_std = _smooth(signal, self.harmonics)
         lag_s = self.share * signal.period_s
         late = signal.t >= signal.t[0] + lag_s
         t = signal.t[late]
@@ -180,7 +180,7 @@ def embed(signal: Trace, embedding: Embedding | None = None) -> Chosen:
     return Chosen(delays, why, delays.embed(signal))
 
 
-def _smoothed(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _smooth(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Signal, derivative and noise, by the Kalman smoother, no finer than so many harmonics."""
     column = signal.x[:, None]
     found = KalmanSmoother().estimate(signal.t, column)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.arrays import read_only
-from ep2sindy.signals.kernels import likelihood, smoothed
+from ep2sindy.signals.kernels import likelihood, smooth
 
 # From a memory of some 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -77,7 +77,7 @@ class KalmanSmoother:
             column = np.ascontiguousarray(scaled[:, j])[:, None]
             log10_ratio[j] = self._ratio(steps, column)
             ratio = 10.0 ** log10_ratio[j]
-            signal[:, j : j + 1], slope[:, j : j + 1] = smoothed(steps, column, ratio)
+            signal[:, j : j + 1], slope[:, j : j + 1] = smooth(steps, column, ratio)
             noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1][0])
         return KalmanEstimate(
             smoothed=values[0] + spread * signal,

@@ -144,7 +144,7 @@ def gains(steps, ratio):
 
 
 @compiled
-def _filtered(steps, values, known):
+def _filter(steps, values, known):
     """Innovations, and the slopes as far as the samples up to each one tell."""
     n_samples, n_columns = values.shape
     innovation, slope = np.empty((n_samples, n_columns)), np.empty((n_samples, n_columns))
@@ -182,7 +182,7 @@ def likelihood(steps, values, ratio):
     neither values nor ratio is left out.
     """
     known = gains(steps, ratio)
-    innovation, _ = _filtered(steps, values, known)
+    innovation, _ = _filter(steps, values, known)
     n_samples, n_columns = values.shape
     total, noise, log_variance = np.zeros(n_columns), np.empty(n_columns), 0.0
     for k in range(3, n_samples):
@@ -197,14 +197,14 @@ def likelihood(steps, values, ratio):
 
 
 @compiled
-def smoothed(steps, values, ratio):
+def smooth(steps, values, ratio):
     """Signal and slope per unit time, both (samples, columns), given all samples.
 
     The signal is the values less the smoothed measurement noise, so no filtered state need be
     kept (Durbin & Koopman 2012, section 4.5).
     """
     known = gains(steps, ratio)
-    innovation, slope = _filtered(steps, values, known)
+    innovation, slope = _filter(steps, values, known)
     n_samples, n_columns = values.shape
     signal = innovation  # row k is read before it is written
     later = np.zeros((3, n_columns))  # what later samples say about the state, as a gradient

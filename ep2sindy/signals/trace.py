@@ -13,7 +13,7 @@ from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
 from ep2sindy.signals.spectrum import dominant_frequency
 
-LEAST_PERIODS = 6.0  # of a record: what a free run is judged on
+MIN_PERIODS = 6.0  # of a record: what a free run is judged on
 
 # Samples to a period that say all of a breathing mode; more cost time, and follow the noise.
 ENOUGH_SAMPLES = 100
@@ -22,7 +22,7 @@ DRIFT = 1.0  # of a standard deviation over the record: more is said
 
 # Of the signal's standard deviation: what the waveform's must be. In white noise, too, a line can
 # be followed that has some.
-LEAST_VISIBLE = 0.5
+MIN_VISIBLE = 0.5
 
 # A sample may lie below zero by so many standard deviations of the noise, and so many samples may,
 # where the signal is positive but for noise.
@@ -123,16 +123,16 @@ def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples
 def _cycle(t: np.ndarray, x: np.ndarray, name: str) -> Cycle:
     """The cycle of a signal that has one, over six periods or more."""
     cycle = find_cycle(t, x[:, None])
-    if cycle is not None and cycle.std[0] < LEAST_VISIBLE * x.std():
+    if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
         cycle = None
     duration_s = float(t[-1] - t[0])
     rough = dominant_frequency(t, x) * duration_s if np.ptp(x) > 0.0 else 0.0
     n_periods = rough if cycle is None else cycle.n_periods
     remedy = "; or take out its drift (detrend=true)" if abs(_drift(t, x)) > DRIFT else ""
-    if 0.5 < n_periods < LEAST_PERIODS:
+    if 0.5 < n_periods < MIN_PERIODS:
         doubt = " if it oscillates at all" if cycle is None else ""
         raise ValueError(
-            f"a trace must hold {LEAST_PERIODS:g} periods or more: {name} holds about "
+            f"a trace must hold {MIN_PERIODS:g} periods or more: {name} holds about "
             f"{n_periods:.1f} in {duration_s:.4g} s{doubt}; record longer, or crop less{remedy}"
         )
     if cycle is None:

@@ -42,7 +42,7 @@ from ep2sindy.report.document import (
 )
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
-from ep2sindy.runtime.progress import SILENT, Progress, counted
+from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.study import Count, Deferred, Levels, Names
 from ep2sindy.systems.draws import DRAWS, check_systems, realization
 from ep2sindy.systems.systems import System
@@ -80,7 +80,7 @@ class Variant(Protocol):
     ) -> Finding: ...
 
 
-def built_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) -> dict[str, Variant]:
+def build_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) -> dict[str, Variant]:
     """The methods of these names, as `definitions` says; no other is built.
 
     Raises ValueError for an unknown name, one whose package is not installed, or what has no
@@ -137,7 +137,7 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         published = published_cells(self.thesis)
-        variants = built_variants(self.variants, self.definitions)
+        variants = build_variants(self.variants, self.definitions)
         n_pieces = len(self.systems) * len(self.noises) * self.n_realizations
         with run.progress(n_pieces, "realization") as progress:
             outcomes = self.outcomes(variants, seed=run.seed, progress=progress)
@@ -237,7 +237,7 @@ def first_realizations(
     name, recipe = recipes[-1]
     found = []
     pairs = list(product(systems, sorted(noises)))
-    for label, noise in counted(progress, pairs, "model", "first realizations"):
+    for label, noise in count_pieces(progress, pairs, "model", "first realizations"):
         (system, runs), (_, (truth, *_)) = (
             realization(label, level, 0, n_trajectories=n_trajectories, seed=seed)
             for level in (noise, 0.0)

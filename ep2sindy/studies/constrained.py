@@ -12,14 +12,14 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.progress import counted
+from ep2sindy.runtime.progress import count_pieces
 from ep2sindy.studies.fits import (
     Outcome,
     Relations,
     Terms,
-    first_and_last,
-    fit_and_judge,
-    judged_summary,
+    evaluation_summary,
+    fit_and_evaluate,
+    split_in_time,
     terms_of,
 )
 from ep2sindy.studies.source import Source
@@ -67,21 +67,21 @@ class Study:
         with run.progress(None, "", "data"):
             field = self.source.field()
         data = self.source.sampled(field, libraries, run)
-        train, held = first_and_last(data, self.held_out)
+        train, held = split_in_time(data, self.held_out)
         judged, labels, findings = {}, {}, {}
         streams = np.random.default_rng(run.seed).spawn(len(models))
         pairs = list(zip(models.items(), streams, strict=True))
-        for (name, (library, constraints)), stream in counted(
+        for (name, (library, constraints)), stream in count_pieces(
             run.watch, pairs, "model", "fits and free runs"
         ):
             # Both draw the same: what differs between them is then the constraint alone.
             seed = int(stream.integers(2**63))
             for kind, each in zip(KINDS, constraints, strict=True):
                 rng = np.random.default_rng(seed)
-                fit = fit_and_judge(train, held, library, each, self.formulation, rng=rng)
+                fit = fit_and_evaluate(train, held, library, each, self.formulation, rng=rng)
                 judged[f"{name}_{kind}"] = fit
                 labels[f"{name}_{kind}"] = f"{name.replace('_', ' ')}, {kind}"
-            findings[name] = {kind: judged_summary(judged[f"{name}_{kind}"]) for kind in KINDS}
+            findings[name] = {kind: evaluation_summary(judged[f"{name}_{kind}"]) for kind in KINDS}
         relations = dict.fromkeys(text for case in self.models.values() for text in case.relations)
         return Outcome(
             train, held, judged, labels, list(relations), self.figures, {"models": findings}

@@ -91,7 +91,7 @@ def terms_of(
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Evaluation:
     """A fit and what it does on the held-out part.
 
     from_sample: started at the first sample; from_fit: at a start fitted to the first samples,
@@ -107,7 +107,7 @@ class Judged:
     loss: float
 
 
-def first_and_last(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
+def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
     """The first part of a record, and the last `held_out` of its samples.
 
     Raises ValueError for a share that leaves either of them under 20 samples.
@@ -121,7 +121,7 @@ def first_and_last(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajec
     return run.window(0, n_train), run.window(n_train, run.n_samples)
 
 
-def fit_and_judge(
+def fit_and_evaluate(
     train: Trajectory,
     held: Trajectory,
     library: Library,
@@ -129,7 +129,7 @@ def fit_and_judge(
     formulation: Formulation,
     *,
     rng: np.random.Generator,
-) -> Judged:
+) -> Evaluation:
     """Least squares under the constraint, in one form of the regression.
 
     Without covariance: smoothed rows and overlapping windows are not independent, and intervals
@@ -142,19 +142,19 @@ def fit_and_judge(
         units=train.units,
         provenance={"formulation": repr(formulation), "trajectories": train.label},
     )
-    return judge(replace(model, covariance=None), held, cpu_s=process_time() - begun)
+    return evaluate(replace(model, covariance=None), held, cpu_s=process_time() - begun)
 
 
-def judge(
+def evaluate(
     model: SparseModel,
     held: Trajectory,
     *,
     cpu_s: float = float("nan"),
     status: str | None = None,
     loss: float = float("nan"),
-) -> Judged:
+) -> Evaluation:
     """Integrate a fitted model over the held-out part, from its first sample and from a fit."""
-    return Judged(
+    return Evaluation(
         model=model,
         from_sample=free_run(model, held),
         from_fit=free_run(model, held, initial=_fitted_start(model, held)),
@@ -192,7 +192,7 @@ class Outcome:
 
     train: Trajectory
     held: Trajectory
-    judged: Mapping[str, Judged]
+    judged: Mapping[str, Evaluation]
     labels: Mapping[str, str]
     relations: Sequence[str]
     shown: PlotRange
@@ -207,7 +207,7 @@ class Outcome:
         return dominant_frequency(self.held.t, self.held.states[:, 0])
 
     @property
-    def labelled(self) -> dict[str, Judged]:
+    def labelled(self) -> dict[str, Evaluation]:
         return {self.labels[name]: each for name, each in self.judged.items()}
 
     def models(self) -> dict[str, SparseModel]:
@@ -260,10 +260,10 @@ class Outcome:
         )
 
     @property
-    def _frequency(self) -> Metric[Judged]:
+    def _frequency(self) -> Metric[Evaluation]:
         """Of a model, beside that of the data."""
 
-        def text(judged: Judged) -> str:
+        def text(judged: Evaluation) -> str:
             run = judged.from_sample
             frequency = run.rollout.clock.frequency_text(self.f_data_Hz * (1.0 + run.f_error))
             return _or_verdict(run, f"{frequency} ({100 * run.f_error:+.1f} %)")
@@ -300,7 +300,7 @@ RUN: Metrics[FreeRun] = [
     Metric("verdict", lambda run: str(run.verdict), View.SCREEN),
     Metric("verdict", lambda run: run.text, View.JSON),
 ]  # fmt: skip
-METHOD: Metrics[Judged] = [
+METHOD: Metrics[Evaluation] = [
     Metric("text", lambda judged: equation_texts(judged.model), View.CSV),
     *(metric.of(lambda judged: judged.from_sample) for metric in RUN),
     *(metric.of(lambda judged: judged.from_fit, "{}_started", View.CSV) for metric in RUN),
@@ -326,7 +326,7 @@ def _or_verdict(run: FreeRun, text: str) -> str:
     return run.text if np.isnan(run.f_error) else text
 
 
-def judged_summary(judged: Judged) -> dict[str, Any]:
+def evaluation_summary(judged: Evaluation) -> dict[str, Any]:
     """f_kHz, f_error, nrmse, amplitude_ratio: of the first state, from the first sample."""
     return model_summary(judged.model) | facts(judged, METHOD)
 

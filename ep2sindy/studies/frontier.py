@@ -19,7 +19,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
-from ep2sindy.studies.benchmark import Variant, built_variants, merits
+from ep2sindy.studies.benchmark import Variant, build_variants, merits
 from ep2sindy.studies.study import Deferred, Names, Positives
 from ep2sindy.systems.systems import System
 
@@ -45,7 +45,7 @@ class Study:
     parallel: Workers
 
     def compute(self, run: Run) -> Outcome:
-        variants = built_variants(self.variants, self.definitions)
+        variants = build_variants(self.variants, self.definitions)
         with run.progress(len(self.rates_Hz) * len(self.durations_s), "trajectory") as progress:
             points = self.points(variants, seed=run.seed, progress=progress)
         return Outcome(self.system, points)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from time import process_time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -17,28 +17,28 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.windows import loss_against_window_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import Constraint, constraint
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Captioned
+from ep2sindy.report.document import Captioned, Section, Table
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.progress import Progress, counted
+from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import (
     COMPARED,
-    Judged,
+    Evaluation,
     Outcome,
     Relations,
     Terms,
-    first_and_last,
-    fit_and_judge,
-    judge,
-    judged_summary,
+    evaluate,
+    evaluation_summary,
+    fit_and_evaluate,
     run_summary,
+    split_in_time,
     terms_of,
 )
-from ep2sindy.studies.ils_draws import draws_table, spread_section, spread_summary
 from ep2sindy.studies.living import LivingSearch, two_periods
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.study import Count, Counts, Share
@@ -47,6 +47,7 @@ from ep2sindy.studies.views import PlotRange
 if TYPE_CHECKING:
     from ep2sindy.refinement.problem import Iteration
     from ep2sindy.refinement.refine import Refinement
+
 
 LABELS = {
     "base": "base",
@@ -92,7 +93,7 @@ class Study:
         with run.progress(None, "", "data"):
             field = self.source.field()
         data = self.source.sampled(field, [library], run)
-        train, held = first_and_last(data, self.held_out)
+        train, held = split_in_time(data, self.held_out)
         self._check_windows(train)
         window = two_periods(train) if self.window is None else self.window
         rng, sweep_rng, draws_rng = np.random.default_rng(run.seed).spawn(3)
@@ -103,8 +104,8 @@ class Study:
             ("constrained", tied, self.formulation),
         )
         judged = {
-            name: fit_and_judge(train, held, library, each, form, rng=next(streams))
-            for name, each, form in counted(run.watch, fits, "fit")
+            name: fit_and_evaluate(train, held, library, each, form, rng=next(streams))
+            for name, each, form in count_pieces(run.watch, fits, "fit")
         }
         lives = self._living(train, rng=next(streams), progress=run.watch)
         own = constraint(lives.library, {state: list(lives.terms(state)) for state in lives.states})
@@ -114,7 +115,7 @@ class Study:
             "living": (lives, own),
         }
         again = {name: self._refinement(*start, train, window) for name, start in starts.items()}
-        for name, (_, each) in counted(run.watch, starts.items(), "refinement"):
+        for name, (_, each) in count_pieces(run.watch, starts.items(), "refinement"):
             watch = watcher(run.board.scalars, name, each)
             refinement = partial(again[name], callback=watch, progress=run.watch)
             judged[name] = refine_and_judge(refinement, held, rng=next(streams))
@@ -123,14 +124,14 @@ class Study:
                 length: refine_and_judge(
                     partial(again[name], window=length, progress=run.watch), held, rng=stream
                 )
-                for length in counted(run.watch, self.windows, "window length", name)
+                for length in count_pieces(run.watch, self.windows, "window length", name)
             }
             for name, stream in zip(("ils", "ils_constrained"), sweep_rng.spawn(2), strict=True)
         }
         draws = {
             name: [
                 free_run(again[name](rng=each).model, held)
-                for each in counted(run.watch, stream.spawn(self.n_draws), "draw", name)
+                for each in count_pieces(run.watch, stream.spawn(self.n_draws), "draw", name)
             ]
             for name, stream in zip(starts, draws_rng.spawn(3), strict=True)
         }
@@ -169,8 +170,8 @@ class Study:
         self,
         train: Trajectory,
         held: Trajectory,
-        judged: Mapping[str, Judged],
-        by_window: Mapping[str, Mapping[int, Judged]],
+        judged: Mapping[str, Evaluation],
+        by_window: Mapping[str, Mapping[int, Evaluation]],
         draws: Mapping[str, Sequence[FreeRun]],
     ) -> Outcome:
         period_s = 1.0 / dominant_frequency(train.t, train.states[:, 0])
@@ -186,7 +187,7 @@ class Study:
             self.figures,
             findings={
                 "methods": {
-                    name: judged_summary(each) | spread_summary(draws.get(name, ()))
+                    name: evaluation_summary(each) | spread_summary(draws.get(name, ()))
                     for name, each in judged.items()
                 },
                 "loss_against_window": windows.to_dict("records"),
@@ -199,15 +200,15 @@ class Study:
 
 def refine_and_judge(
     refinement: Callable[..., Refinement], held: Trajectory, *, rng: np.random.Generator
-) -> Judged:
+) -> Evaluation:
     begun = process_time()
     found = refinement(rng=rng)
     cpu_s = process_time() - begun
-    return judge(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
+    return evaluate(found.model, held, cpu_s=cpu_s, status=found.status, loss=found.loss)
 
 
 def window_table(
-    by_window: Mapping[str, Mapping[int, Judged]], *, dt_s: float, period_s: float
+    by_window: Mapping[str, Mapping[int, Evaluation]], *, dt_s: float, period_s: float
 ) -> pd.DataFrame:
     """One row per method and window length; _started: from a fitted start."""
     rows = []
@@ -247,3 +248,83 @@ def watcher(
         tell(scalars, step=next(steps))
 
     return watch
+
+
+# How far what a refinement does depends on the windows that were drawn.
+
+
+FIGURES = ("f_error", "nrmse", "amplitude", "waveform")
+
+
+def _figures(run: FreeRun) -> dict[str, float]:
+    """Of one free run; amplitude and waveform are those of the state that is farthest off."""
+    ratios = np.array(list(run.amplitude_ratio.values()))
+    return {
+        "f_error": run.f_error,
+        "nrmse": run.nrmse,
+        "amplitude": float(ratios[np.argmax(np.abs(ratios - 1.0))]),
+        "waveform": max(run.waveform_error.values()),
+    }
+
+
+def draws_table(draws: Mapping[str, Sequence[FreeRun]]) -> pd.DataFrame:
+    """One row per method and draw of windows: its model run over held-out time."""
+    rows = [
+        {"method": name, "draw": k, "verdict": str(run.verdict), **_figures(run)}
+        for name, runs in draws.items()
+        for k, run in enumerate(runs)
+    ]
+    return pd.DataFrame(rows)
+
+
+def spread_summary(runs: Sequence[FreeRun]) -> dict[str, Any]:
+    """`spread`: lowest and highest of each figure over the draws, and how many live."""
+    if not runs:
+        return {}
+    found: dict[str, Any] = {
+        "n_draws": len(runs),
+        "n_living": sum(run.verdict is Verdict.LIVES for run in runs),
+    }
+    for name, (low, high) in _spread(runs).items():
+        found[name] = [low, high]
+    return {"spread": found}
+
+
+def _spread(runs: Sequence[FreeRun]) -> dict[str, tuple[float, float]]:
+    """Lowest and highest of each figure, of the draws that have it; NaN where none has."""
+    found = {}
+    for name in FIGURES:
+        values = np.array([_figures(run)[name] for run in runs])
+        known = values[np.isfinite(values)]
+        found[name] = (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
+    return found
+
+
+def spread_section(draws: Mapping[str, Sequence[FreeRun]]) -> Section:
+    """A row per method: what its figures range over."""
+    rows = []
+    for name, runs in draws.items():
+        spread = _spread(runs)
+        low, high = (100.0 * value for value in spread["f_error"])
+        row = {
+            "method": name,
+            "live": f"{sum(run.verdict is Verdict.LIVES for run in runs)} of {len(runs)}",
+            "frequency error": _range(low, high, "+.2f", " %"),
+        }
+        row |= {key: _range(*spread[key], ".3f") for key in ("nrmse", "amplitude", "waveform")}
+        rows.append(row)
+    n = max(map(len, draws.values()))
+    return Section(
+        f"Over {n} draws of windows",
+        [
+            Table(
+                pd.DataFrame(rows),
+                title="lowest and highest, over held-out time from its first sample",
+                note="Amplitude and waveform are those of the state that is farthest off.",
+            )
+        ],
+    )
+
+
+def _range(low: float, high: float, form: str, unit: str = "") -> str:
+    return "-" if np.isnan(low) else f"{low:{form}} to {high:{form}}{unit}"

@@ -25,12 +25,12 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.progress import Progress, counted
+from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.fits import first_and_last
+from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Source, data_summary, zone_length_m
@@ -39,10 +39,10 @@ from ep2sindy.studies.term_roles import Compared, term_roles
 from ep2sindy.studies.views import (
     INTEGRATED,
     PlotRange,
+    display_equation,
     interval_table,
     rollout_tables,
     run_figures,
-    shown_equation,
     trajectories,
 )
 from ep2sindy.trust.user_code import load_user_module
@@ -85,7 +85,7 @@ class LibraryCase:
             names,
             degree=self.degree,
             products=list(self.products),
-            functions=registered(self.functions),
+            functions=register_named(self.functions),
             function_degree=self.function_degree,
         )
 
@@ -140,7 +140,7 @@ class Study:
             name: self._result(
                 runs, name, library, recipes[name], length_m, rng=rng, progress=run.watch
             )
-            for (name, library), rng in counted(run.watch, pairs, "library")
+            for (name, library), rng in count_pieces(run.watch, pairs, "library")
         }
         for name, result in results.items():
             if result.discovery.misfit:
@@ -173,7 +173,7 @@ class Study:
         refitted = refit(found, published, rows, runs, rng)
         lives = roles = None
         if self.living is not None and not found.model.inputs:
-            parts = first_and_last(data, self.held_out)
+            parts = split_in_time(data, self.held_out)
             lives = living_model(
                 *parts, library, rows, self.living, found.model, rng=rng, progress=progress
             )
@@ -207,15 +207,15 @@ def alone(data: Trajectory) -> str | None:
     )
 
 
-def registered(names: Sequence[str]) -> list[str]:
+def register_named(names: Sequence[str]) -> list[str]:
     """Names as a library takes them: `my_module.tanh(2*x)` imports my_module and is `tanh(2*x)`.
 
     Raises ValueError for a module that cannot be imported or does not register the name.
     """
-    return [_registered(str(name)) for name in names]
+    return [_register_one(str(name)) for name in names]
 
 
-def _registered(text: str) -> str:
+def _register_one(text: str) -> str:
     found = _FROM_MODULE.fullmatch(text.strip())
     if found is None:
         return text
@@ -337,7 +337,7 @@ class Outcome:
             text = f"{name}: equations {how}; run freely: {run.text}"
             blocks.append(Text(text, page_only=True))
             for state in run.model.states:
-                blocks.append(shown_equation(run.model, state, clock, on_screen=False))
+                blocks.append(display_equation(run.model, state, clock, on_screen=False))
             if living is None:
                 blocks += interval_table(run.model, clock=clock, page_only=True)
         return Section("What was found", blocks)

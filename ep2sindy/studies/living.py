@@ -19,8 +19,8 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.figures import living as figures
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library
+from ep2sindy.model.comparison import FreeRunBounds, Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import FreeRunBounds, Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle, limit_cycle, share_reaching
@@ -35,10 +35,10 @@ from ep2sindy.signals.spectrum import samples_in
 from ep2sindy.studies.study import Count
 from ep2sindy.studies.views import (
     coefficients,
+    display_equation,
     interval_table,
     intervals,
     rollout_tables,
-    shown_equation,
 )
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ class Living:
         model, clock = self.model, self.run.rollout.clock
         rows = ResultTable([self], LIVING).screen(by_state=True)
         blocks: list[Block] = [
-            *(shown_equation(model, state, clock) for state in model.states),
+            *(display_equation(model, state, clock) for state in model.states),
             *interval_table(model, clock=clock),
             Table(rows, title=_title(self)),
             *(Text(text) for text in (_note(self), _by_derivatives(self))),

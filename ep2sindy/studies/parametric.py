@@ -24,7 +24,7 @@ from ep2sindy.operating.point_fits import (
     Refining,
     TimeBootstrap,
     fit_points,
-    searched_jointly,
+    search_shared,
 )
 from ep2sindy.operating.quantities import REFINED, Fitted, PointResult, Quantity
 from ep2sindy.operating.quantity_law import ControlLaw, exponent, laws, trends
@@ -181,7 +181,7 @@ class Study:
             study=how,
             results=results,
             laws=laws(results, law, max_terms=self.law.max_terms),
-            joint=searched_jointly(points, results, how, tying, rng=together, progress=run.watch),
+            joint=search_shared(points, results, how, tying, rng=together, progress=run.watch),
             along=[(each.along, each.at) for each in self.trends],
             published=published,
             shown=self.figures,

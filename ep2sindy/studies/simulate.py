@@ -38,7 +38,7 @@ from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.cache import write
 from ep2sindy.thruster.verdict import TRANSIT_HZ
 
-LEAST_SAMPLES = 16  # fewer cannot be drawn
+MIN_SAMPLES = 16  # fewer cannot be drawn
 AVERAGED = " Averaged over r by area."
 CAPTIONS = {
     "current": "Discharge current over the record (above) and over the part that is shaded there, "
@@ -240,7 +240,7 @@ class Outcome:
 
     @property
     def can_be_drawn(self) -> bool:
-        return self.field.sizes["time"] >= LEAST_SAMPLES
+        return self.field.sizes["time"] >= MIN_SAMPLES
 
     def models(self) -> dict[str, SparseModel]:
         return {}

@@ -11,7 +11,7 @@ import xarray as xr
 from ep2sindy.report.run import Run
 from ep2sindy.studies.study import Deferred
 
-LEAST_SAMPLES = 200  # some periods of breathing at the usual step: less says nothing of it
+MIN_SAMPLES = 200  # some periods of breathing at the usual step: less says nothing of it
 GLIMPSE_SAMPLES = 20
 BALANCE_TOLERANCE = 1e-3  # of what enters; a record in float32 closes to 1e-4
 BALANCES = {"mass_balance": "mass", "energy_balance": "energy"}
@@ -35,9 +35,9 @@ def check_recorded(field: xr.Dataset) -> None:
     """Raise DivergedError for a run that broke before it had recorded anything of use."""
     if is_simulation(field.attrs) and field.attrs["status"] == "diverged":
         n_samples = field.sizes["time"]
-        if n_samples < LEAST_SAMPLES:
+        if n_samples < MIN_SAMPLES:
             raise DivergedError(
-                f"the simulation must record {LEAST_SAMPLES} samples or more to be studied: it "
+                f"the simulation must record {MIN_SAMPLES} samples or more to be studied: it "
                 f"diverged after {n_samples}; try shorter steps (++data.cfl=0.4), more cells, "
                 "other parameters or another start; +exp=simulate shows what it did"
             )

@@ -12,11 +12,11 @@ from typing import Any, Protocol, runtime_checkable
 import xarray as xr
 
 from ep2sindy.data.fields import grid_points
-from ep2sindy.data.gaps import gap_words
+from ep2sindy.data.gaps import describe_gaps
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
-from ep2sindy.data.zones import Zone, ZoneAverage, in_numbers, zone_words
+from ep2sindy.data.zones import Zone, ZoneAverage, describe_zone, resolve_zone
 from ep2sindy.library.library import Library
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
@@ -129,7 +129,7 @@ def zone_of(source: Source) -> Zone | None:
 
 def zone_length_m(source: Source, field: xr.Dataset) -> float | None:
     """Of the zone that the trajectory is averaged over, along z; None for the whole axis."""
-    z: Any = in_numbers(zone_of(source), field).z
+    z: Any = resolve_zone(zone_of(source), field).z
     return None if z is None else float(z[1] - z[0])
 
 
@@ -138,7 +138,7 @@ def say_field(run: Run, field: xr.Dataset) -> None:
     t = grid_points(field, "time")
     words = [
         field.attrs.get("file", ""),
-        zone_words(None, field),
+        describe_zone(None, field),
         f"{len(t)} samples of {(t[-1] - t[0]) / (len(t) - 1):.4g} s from {t[0]:.4g} s",
     ]
     run.say(in_line(f"data: {'; '.join(word for word in words if word)}"))
@@ -170,7 +170,7 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
     run.say(in_line(f"data: {'; '.join(words)}"))
     say_doubts(run, field)
     if data.n_samples < field.sizes["time"]:
-        run.warn(gap_words(data.t, field.sizes["time"]))
+        run.warn(describe_gaps(data.t, field.sizes["time"]))
 
 
 def data_summary(data: Trajectory) -> dict[str, Any]:

@@ -12,13 +12,13 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery
 from ep2sindy.library.relations import Constraint, Relation, constraint, parse_relation
+from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import FreeRunBounds
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.report.document import Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
-from ep2sindy.runtime.progress import SILENT, Progress, counted
+from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def term_roles(
     support = {state: list(model.terms(state)) for state in model.states}
     roles, window = [], two_periods(train)
     terms = [(s, term, coef) for s in model.states for term, coef in model.terms(s).items()]
-    for state, term, coef in counted(progress, terms, "term", "models without a term"):
+    for state, term, coef in count_pieces(progress, terms, "term", "models without a term"):
         less = support | {state: [name for name in support[state] if name != term]}
         run = None
         if less[state]:

@@ -26,8 +26,8 @@ from ep2sindy.figures.living import (
 )
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
-from ep2sindy.model.likeness import Verdict
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle, share_reaching
@@ -37,18 +37,18 @@ from ep2sindy.report.run import Run
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
-from ep2sindy.signals.trace import LEAST_PERIODS, Trace, from_one_signal
+from ep2sindy.signals.trace import MIN_PERIODS, Trace, from_one_signal
 from ep2sindy.studies.library_result import CandidateRow, candidate_rows
 from ep2sindy.studies.living import cycle_of, runs_from
 from ep2sindy.studies.source import Source, data_summary, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
 from ep2sindy.studies.views import (
     coefficients,
+    display_equation,
     interval_table,
     intervals,
     model_summary,
     rollout_tables,
-    shown_equation,
 )
 
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
@@ -56,7 +56,7 @@ PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that
 # Of each equation where none is known, so that their combinations stay few.
 DEPTH_OF_BOTH = 2
 
-LEAST_JUDGED = 4.0  # periods of the end of a record, to be held out
+MIN_JUDGED = 4.0  # periods of the end of a record, to be held out
 
 STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distances from the cycle's middle, in those of its states
 
@@ -114,7 +114,7 @@ class Study:
         if type(chosen.embedding) is not LogRate and (hint := lost_mean(signal)):
             run.warn(hint)
         states = chosen.embedded.run
-        n_fitted = fitted_samples(signal, states, self.held_out)
+        n_fitted = count_fitted(signal, states, self.held_out)
         found = self._found(chosen, states.window(0, n_fitted), run)
         held = states if n_fitted == states.n_samples else states.window(n_fitted, states.n_samples)
         with run.progress(None, "", "free run and limit cycle"):
@@ -203,11 +203,11 @@ def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str
     return data.changed(places)
 
 
-def fitted_samples(signal: Trace, states: Trajectory, held_out: float) -> int:
+def count_fitted(signal: Trace, states: Trajectory, held_out: float) -> int:
     """Samples to fit: all of a record too short for a part of it to be held out."""
     n_fitted = round((1.0 - held_out) * states.n_samples)
     periods = states.dt_s / signal.period_s * np.array([n_fitted, states.n_samples - n_fitted])
-    enough = periods[0] >= LEAST_PERIODS + 0.5 and periods[1] >= LEAST_JUDGED
+    enough = periods[0] >= MIN_PERIODS + 0.5 and periods[1] >= MIN_JUDGED
     return n_fitted if enough else states.n_samples
 
 
@@ -352,7 +352,7 @@ class Outcome:
         blocks: list[Block] = [Text(self.found.note)] if self.found.note else []
         for state in model.states:
             exact = "known" if state not in self.searched else ""
-            blocks.append(shown_equation(model, state, clock, lead=exact))
+            blocks.append(display_equation(model, state, clock, lead=exact))
         blocks += interval_table(model, self.searched, clock)
         where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
         rows = ResultTable({"model": self}, FREE_RUN).upright("")

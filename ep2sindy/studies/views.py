@@ -146,7 +146,7 @@ def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataF
     return pd.DataFrame(rows)
 
 
-def shown_equation(
+def display_equation(
     model: SparseModel,
     state: str,
     clock: Clock = SECONDS,
@@ -194,7 +194,7 @@ def equation_sections(
         Section(
             name,
             [
-                *(shown_equation(model, state, clock) for state in model.states),
+                *(display_equation(model, state, clock) for state in model.states),
                 *interval_table(model, clock=clock, page_only=page_only),
             ],
             level=3,

@@ -25,7 +25,7 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.report.document import Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.report.run import Run
-from ep2sindy.runtime.progress import SILENT, Progress, counted
+from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fits import Terms, equation_texts, terms_of
 from ep2sindy.studies.source import Source, data_summary
@@ -197,7 +197,7 @@ def check_windows(settings: Mapping[str, Setting], n_samples: int) -> None:
         )
 
 
-def fitted_terms(
+def fit_terms(
     trajectories: Sequence[Trajectory],
     library: Library,
     terms: Mapping[str, Sequence[str]],
@@ -242,8 +242,8 @@ def fit_settings(
     n_samples = run.n_samples if rollout_s is None else samples_in(run, rollout_s)
     results = {}
     pairs = list(zip(settings.items(), rng.spawn(len(settings)), strict=True))
-    for (name, setting), stream in counted(progress, pairs, "setting", "fits and free runs"):
-        found = fitted_terms([run], library, terms, setting, rng=stream)
+    for (name, setting), stream in count_pieces(progress, pairs, "setting", "fits and free runs"):
+        found = fit_terms([run], library, terms, setting, rng=stream)
         model = assemble_model(
             library,
             [fit for fit, _ in found.values()],

@@ -24,7 +24,7 @@ from ep2sindy.report.document import Captioned, Picture, Section, Table, Text
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Positive
-from ep2sindy.studies.weak import Setting, check_windows, fitted_terms, settings_of
+from ep2sindy.studies.weak import Setting, check_windows, fit_terms, settings_of
 from ep2sindy.systems.systems import System
 
 FIGURE = (
@@ -101,7 +101,7 @@ def coefficient_error(
     """||beta - beta_true|| / ||beta_true||, the coefficients of all equations in one vector."""
     truth = {state: system.model.terms(state) for state in system.model.states}
     terms = {state: list(of) for state, of in truth.items()}
-    found = fitted_terms([run], true_library(system), terms, setting, rng=rng)
+    found = fit_terms([run], true_library(system), terms, setting, rng=rng)
     fitted = {state: candidate.coef_by_term for state, (candidate, _) in found.items()}
     beta_true = np.array([truth[state][name] for state in truth for name in terms[state]])
     beta = np.array([fitted[state][name] for state in truth for name in terms[state]])

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.model.solve import Border, solved
+from ep2sindy.model.solve import Border, solve_stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def _integrated(
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]]:
     system = start.system
     t = np.arange(round(system.duration_s * system.rate_Hz)) / system.rate_Hz
-    found = solved(
+    found = solve_stages(
         lambda _, x: system.model.derivative(x, np.empty(0)),
         Border((), lambda _, x: x),
         t,

@@ -22,10 +22,10 @@ def read_or_run(
     cache: str | Path | None, name: str, parameters: dict[str, Any], run: Callable[[], xr.Dataset]
 ) -> xr.Dataset:
     """What `run` returns, from the folder `cache` where one is named; see `kept`."""
-    return run() if cache is None else kept(Path(cache) / name, to_json(parameters), run)
+    return run() if cache is None else keep(Path(cache) / name, to_json(parameters), run)
 
 
-def kept(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
+def keep(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
     """What `run` returns, read from the file that is named by a stem and a hash, or run and kept.
 
     The hash is of all parameters and of this package's source text, so a changed formula is never

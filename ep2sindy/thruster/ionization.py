@@ -39,16 +39,18 @@ def ionization_rate(
     T_e_eV = field["T_e_eV"].astype(np.float64)
     rate: Callable = propellants.ionization_rate
     if table is not None:
-        rate = _tabulated(*read_rate_table(Path(table)), T_e_eV, f"extend {table}")
+        rate = _interpolate_table(*read_rate_table(Path(table)), T_e_eV, f"extend {table}")
     elif gas != "xenon":
         known = propellant(gas)
         rows = np.array(known.T_e_eV), np.array(known.ionization_rate)
-        rate = _tabulated(*rows, T_e_eV, "keep_where leaves cells out, or give a table of your own")
+        rate = _interpolate_table(
+            *rows, T_e_eV, "keep_where leaves cells out, or give a table of your own"
+        )
     R_ion = xr.apply_ufunc(rate, T_e_eV, dask="parallelized", output_dtypes=[np.float64])
     return field.assign(R_ion=R_ion.drop_attrs(deep=False).assign_attrs(units="m^3/s"))
 
 
-def _tabulated(
+def _interpolate_table(
     T_eV: Float[np.ndarray, " rows"],
     rates: Float[np.ndarray, " rows"],
     T_e_eV: xr.DataArray,

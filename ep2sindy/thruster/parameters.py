@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from ep2sindy.thruster.checks import check_not_negative, check_positive
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
-from ep2sindy.thruster.propellants import Propellant, XenonFits, named
+from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
 from ep2sindy.thruster.transport import AnomalousTransport, Transport
 from ep2sindy.thruster.walls import Anode, FixedAnode, SheathWall, Wall
 
@@ -71,7 +71,8 @@ class Thruster:
         if self.charge_states > self.propellant.charge_states:
             raise ValueError(
                 "charge_states 2 needs rates of the second charge, which the propellant "
-                f"{named(self.propellant)} has not; take ep2sindy.thruster.propellant(name='xenon')"
+                f"{gas_name(self.propellant)} has not; take "
+                "ep2sindy.thruster.propellant(name='xenon')"
             )
         if self.propellant.range_eV is None:
             return
@@ -79,7 +80,7 @@ class Thruster:
         for place, T_e_eV in (("anode", self.anode.T_e_eV), ("cathode", self.cathode_T_e_eV)):
             if not low <= T_e_eV <= high:
                 raise ValueError(
-                    f"the rates of {named(self.propellant)} cover T_e from {low:g} to {high:g} "
+                    f"the rates of {gas_name(self.propellant)} cover T_e from {low:g} to {high:g} "
                     f"eV, and it is {T_e_eV:g} eV at the {place}; extend the table"
                 )
 

@@ -39,7 +39,7 @@ def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     runs of HallThruster.jl v0.22 have, linear over 5 eV. The default `XenonFits` are formulas.
     """
     if name == "xenon_5eV":
-        return _ionized_in_steps(propellant("xenon", coulomb_weight=coulomb_weight), name)
+        return _resample_ionization(propellant("xenon", coulomb_weight=coulomb_weight), name)
     if name not in MASSES:
         raise ValueError(
             f"there are the propellants {[*sorted(MASSES), 'xenon_5eV']}: {name!r} came; a table "
@@ -50,7 +50,7 @@ def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     )
 
 
-def _ionized_in_steps(xenon: PropellantTable, name: str) -> PropellantTable:
+def _resample_ionization(xenon: PropellantTable, name: str) -> PropellantTable:
     """Xenon with the ionisation table of 5 eV steps, resampled at 1 eV of mean energy."""
     stored = _columns(GASES / "xenon_ionization_5eV.csv")
     energy = np.arange(1.0 + np.floor(stored["mean_energy_eV"][-1]))

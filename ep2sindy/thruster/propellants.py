@@ -283,16 +283,17 @@ class PropellantTable:
 Propellant = XenonFits | TabulatedRates | PropellantTable
 
 
-def named(propellant: Propellant) -> str:
+def gas_name(propellant: Propellant) -> str:
     """Name of a gas for messages."""
     return propellant.name if isinstance(propellant, PropellantTable) else type(propellant).__name__
 
 
-def uncovered(propellant: Propellant, reached_eV: float) -> str | None:
+def describe_uncovered(propellant: Propellant, reached_eV: float) -> str | None:
     """What to say of a run that got so hot; None where the rates cover it."""
     if propellant.range_eV is None or reached_eV <= propellant.range_eV[1]:
         return None
     return (
-        f"the rates of {named(propellant)} cover T_e up to {propellant.range_eV[1]:g} eV, the run "
+        f"the rates of {gas_name(propellant)} cover T_e up to {propellant.range_eV[1]:g} eV, "
+        "the run "
         f"reached {reached_eV:g} eV; extend the table"
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Lock
 
 from ep2sindy.trust.limits import size_of
-from ep2sindy.trust.user_code import isolated
+from ep2sindy.trust.user_code import isolate
 
 PATIENCE_S = 20.0  # and a second per 10 MB: slower than any disk
 SPEED = 1e7  # bytes per s
@@ -36,24 +36,24 @@ def _verdict(path: Path, reader: str, size: int, changed_ns: int) -> str:
     with _LOCK:
         prober = _prober(os.getpid())
         if prober.poll() is not None:  # since the last file, as by Ctrl-C in a notebook
-            _ended(prober)
+            _end(prober)
             prober = _prober(os.getpid())
         patience_s = PATIENCE_S + size_of(path) / SPEED
         try:
-            line = _asked(prober, [str(path), reader], patience_s)
+            line = _ask(prober, [str(path), reader], patience_s)
         except BaseException:  # its answer would be taken for that on the next file
-            _ended(prober)
+            _end(prober)
             raise
         if line:
             return str(json.loads(line))
-        status = _ended(prober)
+        status = _end(prober)
     if line is None:
         return f"reading it was given up after {patience_s:.0f} s"
     by = signal.Signals(-status).name if status < 0 else f"status {status}"
     return f"the library that reads it breaks down over it ({by})"
 
 
-def _asked(prober: subprocess.Popen, file: list[str], patience_s: float) -> bytes | None:
+def _ask(prober: subprocess.Popen, file: list[str], patience_s: float) -> bytes | None:
     """What it says of a file; nothing, if it dies, and None, if it takes too long."""
     assert prober.stdin is not None
     assert prober.stdout is not None
@@ -62,7 +62,7 @@ def _asked(prober: subprocess.Popen, file: list[str], patience_s: float) -> byte
     return prober.stdout.readline() if _answers(prober, patience_s) else None
 
 
-def _ended(prober: subprocess.Popen) -> int:
+def _end(prober: subprocess.Popen) -> int:
     """The status of a process that is ended here, if it has not ended itself."""
     _prober.cache_clear()
     prober.kill()
@@ -80,7 +80,7 @@ def _answers(prober: subprocess.Popen, patience_s: float) -> bool:
 @cache
 def _prober(process: int) -> subprocess.Popen:
     """One for each process of ours: a fork must not share its parent's."""
-    command, environment = isolated("ep2sindy.trust.probe")
+    command, environment = isolate("ep2sindy.trust.probe")
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,

@@ -19,10 +19,10 @@ def end_as_interrupted() -> None:
     for name in ENDING:
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, _interrupted)  # `nohup` asked to ignore it: then it is
+            signal.signal(number, _interrupt)  # `nohup` asked to ignore it: then it is
 
 
-def _interrupted(number: int, frame: FrameType | None) -> None:
+def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt(signal.Signals(number).name)
 
 

@@ -41,7 +41,7 @@ def leave_folder() -> None:
         sys.path[:] = [path for path in sys.path if Path(path).resolve() != here]
 
 
-def isolated(module: str) -> tuple[list[str], dict[str, str]]:
+def isolate(module: str) -> tuple[list[str], dict[str, str]]:
     """Command and environment of a process that runs a module of the package, and that imports
     nothing of the current folder, unless it is a checkout of the package."""
     here = Path.cwd()
@@ -58,7 +58,7 @@ def away_from(settings: str) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def isolated_children() -> Iterator[None]:
+def isolate_children() -> Iterator[None]:
     """Processes of Python that are started within import nothing of the current folder."""
     before = os.environ.get(SAFE)
     os.environ[SAFE] = "1"

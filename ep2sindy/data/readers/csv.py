@@ -12,7 +12,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.data.readers.notation import ungrouped
+from ep2sindy.data.readers.notation import remove_grouping
 from ep2sindy.data.readers.source import Reader, Source
 from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, SEPARATORS, Layout, layout_of
 
@@ -20,7 +20,7 @@ from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, SEPARATORS, La
 N_LOOKED_AT, CHARACTERS_LOOKED_AT = 2000, 10_000_000
 
 # What pandas gets: it takes hundreds of bytes for every column.
-LONGEST_LINE, MOST_COLUMNS = 1_000_000, 10_000
+LONGEST_LINE, MAX_COLUMNS = 1_000_000, 10_000
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -64,9 +64,9 @@ def _first_lines(path: Path, encoding: str) -> list[str]:
             lines.append(line)
             n_characters += len(line)
             n_cells = max(len(line.split(sign)) for sign in SEPARATORS)
-            if n_cells > MOST_COLUMNS or len(line) > LONGEST_LINE:
+            if n_cells > MAX_COLUMNS or len(line) > LONGEST_LINE:
                 raise ValueError(
-                    f"a table may have up to {MOST_COLUMNS} columns, in lines of up to "
+                    f"a table may have up to {MAX_COLUMNS} columns, in lines of up to "
                     f"{LONGEST_LINE} characters: line {len(lines)} has {n_cells} cells in its "
                     f"first {len(line)} characters; write one sample per line, and large arrays "
                     "as npz, HDF5 or NetCDF"
@@ -122,7 +122,7 @@ def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, 
         return column.to_numpy(dtype=np.float64)
     text = column.astype("string").str.strip()
     if layout.has_marks:
-        text = text.map(partial(ungrouped, decimal=layout.decimal), na_action="ignore")
+        text = text.map(partial(remove_grouping, decimal=layout.decimal), na_action="ignore")
     text = text.str.replace(layout.decimal, ".", regex=False)
     text = text.str.replace(r"[dD](?=[+-]?\d+$)", "e", regex=True)  # Fortran's exponents
     values = pd.to_numeric(text, errors="coerce")

@@ -32,7 +32,7 @@ def read_hallthruster(path: Path) -> Source:
     Source: https://um-pepl.github.io/HallThruster.jl (Use JSON for input and output).
     """
     content = read_json(path.read_text(encoding="utf-8-sig"))
-    frames, beside = _parted(content)
+    frames, beside = _split_frames(content)
     columns = {name: v for name, v in leaves(beside).items() if _is_column(v)}
     if not frames and not columns:
         raise ValueError("it holds no output.frames; run the simulation with save_time_resolved")
@@ -53,7 +53,7 @@ def read_hallthruster(path: Path) -> Source:
     return Source(path, names, read, words=words, channel_m=channel_m, units=_units(names))
 
 
-def _parted(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
+def _split_frames(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
     """The frames, and what stands beside them."""
     if isinstance(content, list):
         frames, beside = content, {}

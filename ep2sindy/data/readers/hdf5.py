@@ -32,7 +32,7 @@ def read_hdf5(path: Path) -> Source:
     def read(name: str) -> xr.DataArray:
         with h5py.File(path) as file:
             found = file[name]
-            values, attrs = written(found), _attributes(found, name)
+            values, attrs = read_written(found), _attributes(found, name)
             packed = xr.Variable([f"dim_{k}" for k in range(values.ndim)], values, attrs)
         plain = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
         return xr.DataArray(plain.values, attrs={"units": attrs["units"]})
@@ -52,7 +52,7 @@ def names_in_hdf5(path: Path) -> list[str]:
     return names
 
 
-def written(found: h5py.Dataset) -> np.ndarray:
+def read_written(found: h5py.Dataset) -> np.ndarray:
     """The values of a data set; NaN where none were ever written, for HDF5 gives zeros there.
 
     Raises ValueError where not one was, and for a null dataspace, which has no place for any.

@@ -8,7 +8,7 @@ from zipfile import ZipFile
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.hdf5 import names_in_hdf5, written
+from ep2sindy.data.readers.hdf5 import names_in_hdf5, read_written
 from ep2sindy.data.readers.source import Reader, Source, leaves
 from ep2sindy.trust.limits import check_declared
 
@@ -27,7 +27,7 @@ def read_matlab73(path: Path) -> Source:
 
     def read(name: str) -> xr.DataArray:
         with h5py.File(path) as file:
-            return xr.DataArray(written(file[name.replace(".", "/")]).T)
+            return xr.DataArray(read_written(file[name.replace(".", "/")]).T)
 
     names = [
         name.replace("/", ".") for name in names_in_hdf5(path) if not name.startswith("#refs#")

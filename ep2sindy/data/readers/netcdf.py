@@ -140,7 +140,7 @@ class _Header:
 
     def skip(self, n_bytes: int) -> None:
         """Over some bytes, and what fills them up to four."""
-        self._file.seek(_padded(n_bytes), 1)
+        self._file.seek(_pad(n_bytes), 1)
 
     def attributes(self) -> None:
         for _ in range(self.count()):
@@ -174,11 +174,11 @@ def _blocks(header: _Header) -> list[tuple[int, int]]:
     if not by_record or not n_records:
         return blocks
     alone = len(by_record) == 1
-    step = sum(n if alone else _padded(n) for _, n in by_record)
+    step = sum(n if alone else _pad(n) for _, n in by_record)
     blocks += [(begin, begin + n) for begin, n in by_record]
     first, (last, n_last) = min(by_record)[0], max(by_record)
     return [*blocks, (first + step, max(first + step, last + (n_records - 1) * step + n_last))]
 
 
-def _padded(n_bytes: int) -> int:
+def _pad(n_bytes: int) -> int:
     return -(-n_bytes // 4) * 4

@@ -31,7 +31,7 @@ def is_grouped(cell: str, decimal: str) -> bool:
     return bool(GROUPED[decimal].fullmatch(cell))
 
 
-def ungrouped(cell: str, decimal: str) -> str:
+def remove_grouping(cell: str, decimal: str) -> str:
     """A number without its marks of thousands."""
     found = GROUPED[decimal].fullmatch(cell)
     return cell.replace(found["mark"], "") if found else cell

@@ -48,18 +48,18 @@ def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
     if any(claims):
         return readers[claims.index(max(claims))]
     if look.form == "folder":
-        folders = _listed([e for r in readers if r.form == "folder" for e in r.endings])
+        folders = _join_names([e for r in readers if r.form == "folder" for e in r.endings])
         raise ValueError(
             f"a file must come, or a folder that ends in {folders}: {path} is a folder"
         )
     by_ending = [r for r in readers if r.form in ("other", "folder")]
-    kinds = _listed([r.name for r in readers if r not in by_ending])
-    endings = _listed([ending for r in by_ending for ending in r.endings])
+    kinds = _join_names([r.name for r in readers if r not in by_ending])
+    endings = _join_names([ending for r in by_ending for ending in r.endings])
     raise ValueError(
         f"a file must be {kinds}, or end in {endings}: "
         f"{path} begins with {look.head!r}; its ending may be wrong, or its content damaged"
     )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     return " or ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

@@ -63,19 +63,19 @@ def layout_of(lines: Sequence[str]) -> Layout:
     """
     rows = [line for line in lines if line.strip() and not is_comment(line)]
     last = rows[-max(2, min(N_JUDGED, len(rows) // 4)) :]
-    judged = [(*_judged(last, s, d), s, d) for d in PLAIN for s in SEPARATORS]
+    judged = [(*_rate_separator(last, s, d), s, d) for d in PLAIN for s in SEPARATORS]
     share, _, columns, separator, decimal = max(judged, key=lambda option: option[:2])
     if not share:
         raise ValueError("it holds no rows of numbers")
     table = [split(line, separator) for line in rows]
     cells = [row[j] for row in table for j in columns if j < len(row)]
     decimal = _decimal(cells, separator, decimal)
-    columns = _judged(last, separator, decimal)[2]
+    columns = _rate_separator(last, separator, decimal)[2]
     first = _first_row(lines, columns, separator, decimal)
-    below = [_trimmed(split(line, separator)) for line in lines[first:] if not is_comment(line)]
+    below = [_trim(split(line, separator)) for line in lines[first:] if not is_comment(line)]
     n_columns = max(map(len, below))
     above = [
-        Line(k + 1, _trimmed(split(without_mark(line), separator)), is_comment(line))
+        Line(k + 1, _trim(split(without_mark(line), separator)), is_comment(line))
         for k, line in enumerate(lines[:first])
         if line.strip() and not _is_rule(line)
     ]
@@ -112,14 +112,14 @@ def without_mark(line: str) -> str:
     return line.strip().lstrip("#%!/").strip() if is_comment(line) else line
 
 
-def _trimmed(cells: list[str]) -> list[str]:
+def _trim(cells: list[str]) -> list[str]:
     """Without the empty cells at the end, which a separator there makes."""
     while cells and not cells[-1]:
         cells = cells[:-1]
     return cells
 
 
-def _judged(
+def _rate_separator(
     rows: Sequence[str], separator: str | None, decimal: str
 ) -> tuple[float, int, tuple[int, ...]]:
     """Share of the cells that are numbers, number of columns of numbers, and which they are."""
@@ -166,7 +166,7 @@ def _first_row(
     first = next((k for k in range(last_other + 1, len(lines)) if is_row[k]), None)
     whole = [
         k for k in range(last_other)
-        if is_row[k] and not is_blank[k] and len(_trimmed(table[k])) > max(columns)
+        if is_row[k] and not is_blank[k] and len(_trim(table[k])) > max(columns)
     ]  # fmt: skip
     if first is None or whole:
         wrong = next(k for k in others if k > whole[0]) if whole else last_other
@@ -267,7 +267,7 @@ class Line:
 
     @property
     def begins_with_time(self) -> bool:
-        return bool(self.cells) and _parted(self.cells[0])[0].lower() in TIMES
+        return bool(self.cells) and _split_name(self.cells[0])[0].lower() in TIMES
 
 
 def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
@@ -281,7 +281,7 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
     numbered = Header(tuple(map(str, range(n_columns))), ("",) * n_columns, step_s)
     if not above:
         return numbered
-    if (counted := _counted(cells, n_columns)) is not None:
+    if (counted := _rigol_header(cells, n_columns)) is not None:
         return counted
     has_units = len(above) > 1 and _are_units(cells[-1], cells[-2])
     names, units = (cells[-2], cells[-1]) if has_units else (cells[-1], [])
@@ -295,7 +295,7 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
         return numbered
     if not has_units:
         _check_names(above, n_columns)
-    parted = [_parted(name) for name in names]
+    parted = [_split_name(name) for name in names]
     units = [_unit(cell) for cell in units] or [unit for _, unit in parted]
     units = [*units, *[""] * n_columns][:n_columns]
     return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)), step_s)
@@ -332,7 +332,7 @@ def _step_s(above: Sequence[Sequence[str]]) -> float | None:
     return None
 
 
-def _parted(name: str) -> tuple[str, str]:
+def _split_name(name: str) -> tuple[str, str]:
     """A name and its unit; a text in brackets that is no unit stays with the name."""
     for pattern in WITH_UNIT:
         found = pattern.fullmatch(name)
@@ -371,7 +371,7 @@ def _are_units(cells: Sequence[str], names: Sequence[str]) -> bool:
     return is_time and all(not _unit(cell) or unit_like(_plain(cell)) for cell in cells)
 
 
-def _counted(above: Sequence[Sequence[str]], n_columns: int) -> Header | None:
+def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | None:
     """Rigol's: samples are counted, and the last cells of two lines say their start and step."""
     for k, cells in enumerate(above):
         words = [cell.lower() for cell in cells]

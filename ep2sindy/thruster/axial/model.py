@@ -16,7 +16,7 @@ from ep2sindy.thruster.propellants import PropellantTable
 from ep2sindy.thruster.walls import AnodeSheath
 
 CFL = 0.8
-FEWEST_CELLS = 10
+MIN_CELLS = 10
 CENTRE_M, WIDTH_M = 12e-3, 4e-3  # beyond the exit; of the passage from short to long cells
 
 
@@ -28,9 +28,9 @@ def cell_faces(thruster: Thruster, n_cells: int, stretch: float) -> Float[np.nda
     take fewer steps for as many cells in all.
     Raises ValueError for fewer than ten cells, or a stretch below 1.
     """
-    if n_cells < FEWEST_CELLS:
+    if n_cells < MIN_CELLS:
         raise ValueError(
-            f"n_cells must be {FEWEST_CELLS} or more to resolve the channel, got {n_cells}"
+            f"n_cells must be {MIN_CELLS} or more to resolve the channel, got {n_cells}"
         )
     if not 1.0 <= stretch <= 10.0:
         raise ValueError(f"stretch must be between 1 (cells of one length) and 10, got {stretch!r}")

@@ -40,7 +40,7 @@ from ep2sindy.thruster.axial.state_kernels import (
 )
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.propellants import uncovered
+from ep2sindy.thruster.propellants import describe_uncovered
 from ep2sindy.thruster.recording import CHUNK_ROWS, March, record_samples, warm_up
 from ep2sindy.thruster.verdict import outcome
 
@@ -242,7 +242,7 @@ def _attributes(
         if "dn_n_dt" in field:
             attributes["mass_balance"] = mass_balance(field, model, seconds)
     hottest = float(record.state.hottest_eV[0])
-    attributes["rates"] = uncovered(thruster.propellant, hottest) or "covered"
+    attributes["rates"] = describe_uncovered(thruster.propellant, hottest) or "covered"
     attributes["end_I_d"] = float(record.state.instant[CURRENT])
     return attributes
 

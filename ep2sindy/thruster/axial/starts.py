@@ -141,7 +141,7 @@ class Restart:
     run: xr.Dataset | str | Path
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "run", _ended(self.run))
+        object.__setattr__(self, "run", _ended_run(self.run))
 
     @property
     def _end(self) -> xr.Dataset:
@@ -222,7 +222,7 @@ def stored_energy(state: State, model: Model) -> float:
     return E_CHARGE * model.area * float(state.energy[1:-1] @ model.dz[1:-1])
 
 
-def _ended(run: xr.Dataset | str | Path) -> xr.Dataset:
+def _ended_run(run: xr.Dataset | str | Path) -> xr.Dataset:
     if not isinstance(run, xr.Dataset):
         path = Path(run)
         if not path.is_file():

@@ -158,7 +158,7 @@ def spread_field(state, model, columns):
 
 
 @compiled(inline="always")
-def fitted(conduction, convection):
+def exponential_weights(conduction, convection):
     """Weights of the temperatures before and behind a face: exact between two fixed values.
 
     The flux is conduction * (B(-p) T_before - B(p) T_behind), p = convection/conduction,
@@ -176,7 +176,7 @@ def heat(state, model, dt, columns):
     T, n, last, edge = state.T_e_eV, columns.n, columns.n.size - 1, model.boundary_T_e_eV
     s, factor = dt / model.dz, model.conduction_factor / model.dz
     flux, conductance = columns.electron_flux, columns.conductance
-    before, behind = fitted(2.0 * factor * conductance[0] * edge, 2.5 * flux[0])
+    before, behind = exponential_weights(2.0 * factor * conductance[0] * edge, 2.5 * flux[0])
     c, d = 0.0, 0.0
     for i in range(last + 1):
         diagonal = 1.5 * n[i] + dt * columns.loss_slope[i] + s * behind
@@ -187,9 +187,11 @@ def heat(state, model, dt, columns):
             right, lower = right - lower * edge, 0.0
         if i < last:
             kappa = 0.5 * factor * (conductance[i] * T[i] + conductance[i + 1] * T[i + 1])
-            before, behind = fitted(kappa, 1.25 * (flux[i] + flux[i + 1]))
+            before, behind = exponential_weights(kappa, 1.25 * (flux[i] + flux[i + 1]))
         else:
-            before, behind = fitted(2.0 * factor * conductance[i] * edge, 2.5 * flux[i])
+            before, behind = exponential_weights(
+                2.0 * factor * conductance[i] * edge, 2.5 * flux[i]
+            )
             right += s * behind * edge
         inverse = 1.0 / (diagonal + s * before - lower * c)
         c = -s * behind * inverse if i < last else 0.0

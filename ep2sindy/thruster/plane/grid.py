@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.thruster.parameters import Thruster
 
 CHANNEL_SHARE = 25 / 49  # of the rows
-FEWEST_CELLS = 10
+MIN_CELLS = 10
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class MaskedGrid:
 
     def __post_init__(self) -> None:
         for name in ("n_z", "n_r"):
-            if getattr(self, name) < FEWEST_CELLS:
+            if getattr(self, name) < MIN_CELLS:
                 raise ValueError(
-                    f"{name} must be {FEWEST_CELLS} or more to resolve the channel, got "
+                    f"{name} must be {MIN_CELLS} or more to resolve the channel, got "
                     f"{getattr(self, name)}"
                 )
         if self.r_faces[0] <= 0.0:

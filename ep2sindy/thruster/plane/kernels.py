@@ -64,7 +64,7 @@ def thrust(state, model):
 
 
 @compiled(**FAST)
-def held(state, model):
+def count_heavy(state, model):
     """Atoms and ions in the domain."""
     total = 0.0
     for i in range(state.gas.n.shape[0]):
@@ -140,5 +140,5 @@ def advance(state, model, sample_s, averaged, n_i, n_n, u_iz, u_ir, profiles, se
         profiles[row] = profile
         series[row, 0], series[row, 1] = numbers
         series[row, 2] = model.ion_mass * state.left[0]
-        series[row, 3] = model.ion_mass * held(state, model)
+        series[row, 3] = model.ion_mass * count_heavy(state, model)
     return series.shape[0], steps

@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.gaps import MissingSamples, gap_words, present_rows
+from ep2sindy.data.gaps import MissingSamples, describe_gaps, present_rows
 from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
@@ -98,7 +99,7 @@ def _from_table(table: pd.DataFrame) -> Trajectory:
     if np.isnan(values).any():
         present = present_rows(dict(zip(states, values.T, strict=True)))
         t, values = t[present], values[present]
-        warnings.warn(gap_words(t, len(table)), MissingSamples, stacklevel=5)
+        warnings.warn(describe_gaps(t, len(table)), MissingSamples, stacklevel=5)
     return Trajectory(t, values, states)
 
 
@@ -154,7 +155,7 @@ def check_domain(runs: Sequence[Trajectory], library: Library) -> None:
             )
 
 
-def kept_inside(
+def keep_inside(
     library: Library,
     moved: Float[np.ndarray, "samples variables"],
     samples: Float[np.ndarray, "samples variables"],
@@ -171,3 +172,56 @@ def kept_inside(
             kept = kept.copy() if kept is moved else kept
             kept[wrong, v] = samples[wrong, v]
     return kept
+
+
+# What came twice: a state that is another one, and samples that two runs share.
+
+
+SAME = 1e-12  # of a state's variance, that rounding leaves of an exact copy
+MIN_SHARED = 8  # samples in a row: rounded ones come again by chance
+
+
+def check_repeats(runs: Sequence[Trajectory]) -> None:
+    """Raise ValueError for a state that is another one, but for its scale and zero, and for runs
+    that share samples: coefficients of the one are arbitrary, intervals of the other too small."""
+    _check_states(runs)
+    begin = np.array([run.states[0, 0] for run in runs])
+    for i, run in enumerate(runs):
+        for start in np.flatnonzero(np.isin(run.states[:, 0], np.delete(begin, i))).tolist():
+            for j in np.flatnonzero(begin == run.states[start, 0]).tolist():
+                if j == i or not (shared := _common_start(run.states[start:], runs[j].states)):
+                    continue
+                names = [runs[k].label or f"run {k}" for k in (i, j)]
+                raise ValueError(
+                    f"every sample must come once: {shared} samples in a row stand in {names[0]!r} "
+                    f"and in {names[1]!r}, which would make intervals too small; leave one run "
+                    "out, or cut what they share"
+                )
+
+
+def _check_states(runs: Sequence[Trajectory]) -> None:
+    names = runs[0].state_names
+    if any(run.state_names != names for run in runs):
+        return  # that is said where states are compared
+    states = np.concatenate([run.states for run in runs])
+    unit = (states - states.mean(axis=0)) / states.std(axis=0)
+    alike = unit.T @ unit / len(unit)
+    for i, j in combinations(range(len(names)), 2):
+        sign = 1.0 if alike[i, j] > 0.0 else -1.0
+        # The correlation has lost half the digits: what is left of a copy tells.
+        if abs(alike[i, j]) < 0.999 or np.square(unit[:, j] - sign * unit[:, i]).mean() > SAME:
+            continue
+        factor = sign * states[:, j].std() / states[:, i].std()
+        offset = states[:, j].mean() - factor * states[:, i].mean()
+        shift = "" if abs(offset) < 1e-6 * states[:, j].std() else f" {offset:+.6g}"
+        raise ValueError(
+            f"states must differ: {names[j]} is {factor:.6g} {names[i]}{shift} at every sample, "
+            f"and no data tell which of them a term holds; leave {names[j]} out"
+        )
+
+
+def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m d"]) -> int:
+    """How many samples both begin with, if that is all that the shorter one has; else none."""
+    n = min(len(first), len(second))
+    same = n >= MIN_SHARED and np.array_equal(first[:MIN_SHARED], second[:MIN_SHARED])
+    return n if same and np.array_equal(first[:n], second[:n]) else 0

@@ -19,7 +19,7 @@ from ep2sindy.signals.attractor import (
     waveform_errors,
 )
 from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
-from ep2sindy.signals.wander import statistics_wander
+from ep2sindy.signals.stationarity import quarter_distances
 
 LONG = 8.0  # periods of a record whose first half may be left out as a transient
 REPEATS = 0.9  # of the variance, that the waveform of a cycle explains; of chaos 0.5 to 0.75
@@ -63,7 +63,7 @@ class FreeRunBounds:
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness:
+class Comparison:
     """How one run compares to a record; the fields are those of `FreeRun`."""
 
     verdict: Verdict
@@ -88,7 +88,7 @@ def deviation(
     )
 
 
-def against_cycle(
+def compare_cycles(
     cycle: Cycle, t: Float[np.ndarray, " samples"], states: Float[np.ndarray, "samples n_states"]
 ) -> tuple[float, Float[np.ndarray, " n_states"], Float[np.ndarray, " n_states"]]:
     """Relative error of the frequency, amplitude ratios, waveform errors; NaN without a cycle."""
@@ -119,12 +119,14 @@ class Record:
     def excursion(self, states: Float[np.ndarray, "_ n_states"]) -> float:
         return float((np.abs(states - self.states.mean(axis=0)) / self.std).max())
 
-    def likeness(self, states: Float[np.ndarray, "_ n_states"], bounds: FreeRunBounds) -> Likeness:
+    def likeness(
+        self, states: Float[np.ndarray, "_ n_states"], bounds: FreeRunBounds
+    ) -> Comparison:
         """Of a run at the times t; one with fewer samples has diverged."""
         nothing = np.full(states.shape[1], np.nan)
         by_state = dict.fromkeys(("amplitude_ratio", "waveform_error", "distribution"), nothing)
         if len(states) < len(self.t) or not np.isfinite(states).all():
-            return Likeness(Verdict.DIVERGES, np.nan, np.nan, by_state)
+            return Comparison(Verdict.DIVERGES, np.nan, np.nan, by_state)
         half = len(states) // 2 if self._is_long else 0
         late = states[half:]
         by_state["distribution"] = distribution_distances(self.states[half:], late)
@@ -132,17 +134,17 @@ class Record:
         spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
         middle = len(states) // 2
         if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
-            return Likeness(Verdict.DIES_OUT, np.nan, spectrum, by_state)
+            return Comparison(Verdict.DIES_OUT, np.nan, spectrum, by_state)
         if not self._repeats and self._is_alike(by_state["distribution"], spectrum, bounds):
-            return Likeness(Verdict.LIVES, np.nan, spectrum, by_state)
+            return Comparison(Verdict.LIVES, np.nan, spectrum, by_state)
         if self.cycle is None:
-            return Likeness(Verdict.WRONG_CYCLE, np.nan, spectrum, by_state)
-        f_error, amplitude, waveform = against_cycle(self.cycle, self.t[half:], late)
+            return Comparison(Verdict.WRONG_CYCLE, np.nan, spectrum, by_state)
+        f_error, amplitude, waveform = compare_cycles(self.cycle, self.t[half:], late)
         if np.isnan(f_error):
-            return Likeness(Verdict.WRONG_CYCLE, f_error, spectrum, by_state)
+            return Comparison(Verdict.WRONG_CYCLE, f_error, spectrum, by_state)
         by_state |= {"amplitude_ratio": amplitude, "waveform_error": waveform}
         verdict = self._with_period(f_error, amplitude, waveform, bounds)
-        return Likeness(verdict, f_error, spectrum, by_state)
+        return Comparison(verdict, f_error, spectrum, by_state)
 
     @property
     def _repeats(self) -> bool:
@@ -163,7 +165,7 @@ class Record:
 
     def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: FreeRunBounds) -> bool:
         """Whether a run is about as near to the record as its quarters are to each other."""
-        apart, apart_spectrum = statistics_wander(self.t, self.states)
+        apart, apart_spectrum = quarter_distances(self.t, self.states)
         near = (distribution <= np.maximum(bounds.distribution, apart)).all()
         alike = spectrum <= max(bounds.spectrum, SPECTRUM_WANDERS * apart_spectrum)
         return bool(near and alike)

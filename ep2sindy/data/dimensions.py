@@ -12,7 +12,7 @@ import xarray as xr
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Problems, Variable, read_array
-from ep2sindy.data.numbers import evened
+from ep2sindy.data.numbers import even_grid
 from ep2sindy.data.readers.source import Source
 
 
@@ -25,7 +25,7 @@ def read_axis(source: Source, axis: str, variable: Variable) -> xr.DataArray:
         raise ValueError(
             f"{axis} must be a vector: {variable.name!r} has shape {points.shape} in {source.path}"
         )
-    points = points.copy(data=evened(points.values)) if axis == "time" else points
+    points = points.copy(data=even_grid(points.values)) if axis == "time" else points
     return to_si(points.astype(np.float64), axis, variable.unit)
 
 
@@ -107,7 +107,7 @@ def _may_be_time(shape: Sequence[int], space: Sequence[int]) -> set[int]:
     return found
 
 
-def place(
+def assign_dims(
     array: xr.DataArray,
     ours: str,
     dims: Sequence[str] | None,

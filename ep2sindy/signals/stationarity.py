@@ -13,7 +13,7 @@ from ep2sindy.signals.spectrum import dominant_frequency
 N_PARTS, TURNS = 4, 2.0  # parts of a record, and turns that each must hold; else there are two
 
 
-def statistics_wander(
+def quarter_distances(
     t: Float[np.ndarray, " samples"], states: Float[np.ndarray, "samples n_states"]
 ) -> tuple[Float[np.ndarray, " n_states"], float]:
     """Mean distance of distributions, by state, and of spectra, between quarters of a record.
