@@ -24,7 +24,7 @@ from ep2sindy.thruster.plane.simulate import (
     initial_state,
     state_of,
 )
-from ep2sindy.thruster.plane.state_kernels import Model, State
+from ep2sindy.thruster.plane.state_kernels import PlaneModel, PlaneState
 
 SAMPLE_S = 1.5e-6
 WARM_UP_S, DURATION_S = 3e-3, 3e-3  # what a run shows before 4 ms may die
@@ -50,7 +50,7 @@ class Cycle:
         )
 
 
-def cold_state(grid: MaskedGrid, model: Model) -> State:
+def cold_state(grid: MaskedGrid, model: PlaneModel) -> PlaneState:
     """A thin, cold, resting plasma in the whole neutral flow: nothing of the cycle in it."""
     shape = (grid.n_z, grid.n_r)
     neutrals = np.full(shape, model.neutral_inflow / model.neutral_speed)

@@ -1,6 +1,7 @@
 """The house rule: imports go one way, rooms stay small, and heavy guests stay in their rooms."""
 
 import ast
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -224,6 +225,38 @@ def test_nothing_is_dug_out_of_values_of_ours() -> None:
             if asks and module not in FOREIGN:
                 dug.append(f"{module}, line {node.lineno}: {ast.unparse(node)}; pass the value")
     assert not dug, "\n".join(dug)
+
+
+def test_a_class_name_stands_once() -> None:
+    """But for the two that every study has."""
+    names = Counter(
+        node.name
+        for path in PATHS.values()
+        for node in tree(path).body
+        if isinstance(node, ast.ClassDef)
+    )
+    twice = {name for name, count in names.items() if count > 1}
+    assert twice == {"Study", "Outcome"}
+
+
+def test_few_modules_serve_one_neighbour_alone() -> None:
+    """Such a module belongs into the one that imports it, unless one of the reasons holds.
+
+    Kernels are compiled anew where their file changes, so they stand apart; readers, commands and
+    studies are siblings that one register names; the others would make a file of over 500 lines.
+    """
+    importers: dict[str, set[str]] = {module: set() for module in PATHS}
+    for module, path in PATHS.items():
+        for name in own(imports(path, at_once=False)) - {module}:
+            importers[name].add(module)
+    lonely = {
+        module
+        for module, users in importers.items()
+        if len(users) == 1 and next(iter(users)).split(".")[0] == module.split(".")[0]
+    }
+    siblings = ("data.readers.", "app.", "studies.")
+    lonely = {m for m in lonely if not m.endswith("kernels") and not m.startswith(siblings)}
+    assert len(lonely) <= 10, sorted(lonely)
 
 
 def test_the_drawing_of_the_house_is_what_the_imports_say() -> None:

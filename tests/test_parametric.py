@@ -21,10 +21,10 @@ from ep2sindy.operating.point_fits import (
     search_shared,
 )
 from ep2sindy.operating.quantities import (
-    Estimate,
     Fitted,
     PointResult,
     Quantity,
+    QuantityEstimate,
     estimates_of_covariance,
     estimates_of_draws,
 )
@@ -419,7 +419,7 @@ def power_law(V: float, m: float, status: str = "fitted") -> PointResult:
         model_of(),
         status,
         {"x": 1.0, "y": 1.0},
-        estimates={"L": Estimate(value, 0.9 * value, 1.1 * value)},
+        estimates={"L": QuantityEstimate(value, 0.9 * value, 1.1 * value)},
         draws={"L": value * np.linspace(0.9, 1.1, 41)} if status == "fitted" else {},
     )
     return PointResult({"V": float(V), "m": float(m)}, "oscillating", fits={"free": fitted})

@@ -11,7 +11,7 @@ from ep2sindy.studies.pysindy_variants import (
     PySINDyStlsq,
     PySINDyVariant,
     PySINDyWeakForm,
-    Rows,
+    SINDyRows,
     best_of_each_size,
     pysindy_library,
 )
@@ -95,7 +95,7 @@ def test_r2_is_that_of_a_least_squares_refit() -> None:
 
 def test_the_triangle_keeps_the_gram_matrix() -> None:
     rng = np.random.default_rng(4)
-    rows = Rows(rng.normal(size=(50, 4)), rng.normal(size=(50, 2)))
+    rows = SINDyRows(rng.normal(size=(50, 4)), rng.normal(size=(50, 2)))
     theta, x_dot = rows.triangle
     np.testing.assert_allclose(theta.T @ theta, rows.theta.T @ rows.theta, atol=1e-12)
     np.testing.assert_allclose(theta.T @ x_dot, rows.theta.T @ rows.x_dot, atol=1e-12)

@@ -13,10 +13,10 @@ from ep2sindy.data.conversion import to_si
 from ep2sindy.data.fields import DIMS
 from ep2sindy.data.mapping import Problems, Variable, read_array
 from ep2sindy.data.numbers import even_grid
-from ep2sindy.data.readers.source import Source
+from ep2sindy.data.readers.source import FileSource
 
 
-def read_axis(source: Source, axis: str, variable: Variable) -> xr.DataArray:
+def read_axis(source: FileSource, axis: str, variable: Variable) -> xr.DataArray:
     """Coordinate of one axis as a float64 vector in SI."""
     points = read_array(source, axis, str(variable.name))
     if points.ndim != 1:
@@ -30,7 +30,7 @@ def read_axis(source: Source, axis: str, variable: Variable) -> xr.DataArray:
 
 
 def read_axes(
-    source: Source,
+    source: FileSource,
     axes: Mapping[str, Variable],
     dt_s: float | None,
     arrays: Mapping[str, xr.DataArray],
@@ -58,7 +58,7 @@ def read_axes(
 
 
 def time_length(
-    source: Source,
+    source: FileSource,
     arrays: Mapping[str, xr.DataArray],
     variables: Mapping[str, Variable],
     points: Mapping[str, xr.DataArray],

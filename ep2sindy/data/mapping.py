@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.source import Source, damage_named
+from ep2sindy.data.readers.source import FileSource, damage_named
 from ep2sindy.library.names import check_variable
 
 N_LISTED = 100  # names in an error
@@ -54,7 +54,7 @@ class Problems:
         except ValueError as error:
             self.found.append(str(error))
 
-    def check(self, source: Source) -> None:
+    def check(self, source: FileSource) -> None:
         """Raise ValueError if there are any, with what the file holds where a name is missing."""
         if not self.found:
             return
@@ -68,7 +68,7 @@ class Problems:
             f"{self._held(source, '. It')}"
         )
 
-    def _held(self, source: Source, joined: str) -> str:
+    def _held(self, source: FileSource, joined: str) -> str:
         """What the file holds, where a name that it does not hold was asked for."""
         if not any(" no variable " in each for each in self.found):
             return ""
@@ -96,7 +96,7 @@ def in_file(
     return found
 
 
-def read_array(source: Source, ours: str, name: str) -> xr.DataArray:
+def read_array(source: FileSource, ours: str, name: str) -> xr.DataArray:
     """One array of the file, or part of one, as real numbers, in the file's unit and shape."""
     whole, part = _split_selection(source, name)
     if whole is None:
@@ -119,7 +119,7 @@ def read_array(source: Source, ours: str, name: str) -> xr.DataArray:
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
 
-def _split_selection(source: Source, name: str) -> tuple[str | None, tuple[int | slice, ...]]:
+def _split_selection(source: FileSource, name: str) -> tuple[str | None, tuple[int | slice, ...]]:
     """The array that a name means, and the part of it; None where there is no such array."""
     if name in source.known:
         return name, ()
@@ -132,7 +132,7 @@ def _split_selection(source: Source, name: str) -> tuple[str | None, tuple[int |
     return found[1], tuple(slice(None) if part == ":" else int(part) for part in parts)
 
 
-def list_arrays(source: Source) -> str:
+def list_arrays(source: FileSource) -> str:
     """Names with shapes and units: `ni (6, 4, 3) cm^-3, t (6)`."""
     texts = []
     for name in source.names[:N_LISTED]:

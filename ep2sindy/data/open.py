@@ -20,7 +20,7 @@ from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
 from ep2sindy.data.readers.netcdf import NETCDF
 from ep2sindy.data.readers.registry import open_source, reader_of
-from ep2sindy.data.readers.source import UNDECODED, Source, damage_named, file_named
+from ep2sindy.data.readers.source import UNDECODED, FileSource, damage_named, file_named
 from ep2sindy.data.recognition import recognise
 
 
@@ -77,7 +77,7 @@ def open_field(
 
 
 def _field(
-    source: Source,
+    source: FileSource,
     variables: Mapping[str, Variable | Keys],
     coordinates: Mapping[str, Variable | Keys | None],
     dt_s: float | None,
@@ -121,7 +121,7 @@ def _field(
 
 
 def _assign_dims(
-    source: Source,
+    source: FileSource,
     arrays: Mapping[str, xr.DataArray],
     wanted: Mapping[str, Variable],
     points: Mapping[str, xr.DataArray],

@@ -18,7 +18,7 @@ class DoubtfulUnit(UserWarning):
 
 
 @dataclass(frozen=True)
-class Quantity:
+class KnownQuantity:
     """A quantity of a thruster.
 
     low, high: where the median of its size lies, in its unit. others: units that files often count
@@ -41,48 +41,48 @@ def _names(*texts: str) -> frozenset[tuple[str, ...]]:
 
 
 _SI = COORDINATE_UNITS | KNOWN_UNITS
-QUANTITIES: dict[str, Quantity] = {
-    "n_i": Quantity(
+QUANTITIES: dict[str, KnownQuantity] = {
+    "n_i": KnownQuantity(
         _SI["n_i"], 1e14, 1e21, ("cm^-3",),
         _names("n i", "ni", "i n0 n", "i dens", "n_i", "nion", "n plasma", "dens plasma"),
     ),
-    "n_n": Quantity(
+    "n_n": KnownQuantity(
         _SI["n_n"], 1e15, 1e24, ("cm^-3",),
         _names("n n", "nn", "n neutral", "nneutral", "neutral dens", "na", "n a", "ng", "n g"),
     ),
-    "u_iz": Quantity(
+    "u_iz": KnownQuantity(
         _SI["u_iz"], 50.0, 2e5, ("km/s",),
         _names("u i z", "uiz", "u i", "ui", "viz", "vi", "u z", "uz", "vz", "i z u", "i vel z"),
     ),
-    "u_ir": Quantity(
+    "u_ir": KnownQuantity(
         _SI["u_ir"], 1.0, 2e5, ("km/s",),
         _names("u i r", "uir", "vir", "u r", "ur", "vr"),
     ),
-    "T_e_eV": Quantity(
+    "T_e_eV": KnownQuantity(
         "eV", 0.1, 300.0, ("K",),
         _names("t e", "te", "tev", "t electron", "e temp", "electron temp", "temp e"),
     ),
-    "R_ion": Quantity(
+    "R_ion": KnownQuantity(
         _SI["R_ion"], 0.0, 1e-11, ("cm^3/s",),
         _names("r i", "rion", "kion", "k i", "rate", "i rate", "kiz", "k iz", "iz rate"),
     ),
-    "I_d": Quantity(
+    "I_d": KnownQuantity(
         _SI["I_d"], 1e-3, 300.0, ("mA",),
         _names("i d", "id", "d current", "current", "d i", "idis", "i discharge"),
     ),
-    "V_d": Quantity(
+    "V_d": KnownQuantity(
         _SI["V_d"], 1.0, 2e4, ("kV", "mV"),
         _names("u d", "vd", "ud", "d voltage", "voltage", "vdis", "udis"),
     ),
 }  # fmt: skip
 
-AXES: dict[str, Quantity] = {
-    "time": Quantity(
+AXES: dict[str, KnownQuantity] = {
+    "time": KnownQuantity(
         "s", 0.0, np.inf, ("us", "ms", "ns"),
         _names("t", "time", "times", "timestamp", "tvec", "seconds", "sec"),
     ),
-    "z": Quantity("m", 1e-4, 1.0, ("mm", "cm"), _names("z", "axial", "zz")),
-    "r": Quantity("m", 1e-4, 1.0, ("mm", "cm"), _names("r", "radial", "rr")),
+    "z": KnownQuantity("m", 1e-4, 1.0, ("mm", "cm"), _names("z", "axial", "zz")),
+    "r": KnownQuantity("m", 1e-4, 1.0, ("mm", "cm"), _names("r", "radial", "rr")),
 }  # fmt: skip
 
 # How a variable is had that a file lacks: from another one, by a step of `prepare`.

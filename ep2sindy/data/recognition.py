@@ -17,14 +17,14 @@ from ep2sindy.data.mapping import Keys, Problems, Variable, in_file, read_array
 from ep2sindy.data.quantities import (
     AXES,
     QUANTITIES,
-    Quantity,
+    KnownQuantity,
     likely_time_unit,
     meant_by,
     split_unit,
     step_said,
     typical,
 )
-from ep2sindy.data.readers.source import Source
+from ep2sindy.data.readers.source import FileSource
 from ep2sindy.library.units import unit_like
 
 MAX_COLUMNS = 32  # of an array whose columns are taken as signals of their own
@@ -46,7 +46,7 @@ class Recognised:
     questions: Sequence[str] = ()
     n_samples: int | None = None
 
-    def check(self, source: Source) -> None:
+    def check(self, source: FileSource) -> None:
         """Raise ValueError unless a field can be made of it without doubt."""
         problems = [each.problem for each in self.held if each.problem not in ("", TEXT)]
         problems += self.guesses.values()
@@ -63,7 +63,7 @@ class Recognised:
 
 
 def recognise(
-    source: Source,
+    source: FileSource,
     *,
     dt_s: float | None = None,
     given: Mapping[str, Variable | Keys] | None = None,
@@ -103,7 +103,7 @@ def _of(held: Sequence[ArrayInfo], name: str | None) -> ArrayInfo | None:
 
 
 def _axis(
-    axis: str, held: Sequence[ArrayInfo], source: Source, questions: list[str]
+    axis: str, held: Sequence[ArrayInfo], source: FileSource, questions: list[str]
 ) -> Variable | None:
     """The vector that is this coordinate: by its name, for time also by its unit or its place."""
     unit = AXES[axis].unit
@@ -123,7 +123,7 @@ def _axis(
 
 
 def _step_s(
-    source: Source, axes: Mapping[str, Variable], held: Sequence[ArrayInfo]
+    source: FileSource, axes: Mapping[str, Variable], held: Sequence[ArrayInfo]
 ) -> float | None:
     """The time step that a preamble says, unless the time has a unit: a count of samples has none.
 
@@ -146,7 +146,7 @@ def _stated_step_s(held: Sequence[ArrayInfo]) -> float | None:
 def _lengths(
     axes: Mapping[str, Variable],
     held: Sequence[ArrayInfo],
-    source: Source,
+    source: FileSource,
     rest: Sequence[ArrayInfo],
     dt_s: float | None,
     questions: list[str],
@@ -174,7 +174,7 @@ def _dim(variable: Variable, held: Sequence[ArrayInfo], axis: str) -> str:
 
 
 def _variables(
-    source: Source,
+    source: FileSource,
     rest: Sequence[ArrayInfo],
     axes: Mapping[str, Variable],
     held: Sequence[ArrayInfo],
@@ -273,7 +273,9 @@ def is_of(unit: str, like: str) -> bool:
     return bool(unit) and unit != "1" and unit_like(unit, like=like)
 
 
-def with_unit(ours: str, one: ArrayInfo, quantity: Quantity, guesses: dict[str, str]) -> Variable:
+def with_unit(
+    ours: str, one: ArrayInfo, quantity: KnownQuantity, guesses: dict[str, str]
+) -> Variable:
     """The unit that the file says, its name's ending, ours, or else the likely one."""
     stated = one.unit if is_of(one.unit, quantity.unit) or converts(ours, one.unit) else ""
     stated = stated or _ending(ours, one.name)
@@ -372,7 +374,7 @@ class ArrayInfo:
         return tuple(n for n in self.shape if n > 1)
 
 
-def describe_array(source: Source, name: str) -> ArrayInfo:
+def describe_array(source: FileSource, name: str) -> ArrayInfo:
     """What one array holds; reads it."""
     try:
         array = read_array(source, name, name)

@@ -19,7 +19,7 @@ from ep2sindy.library.names import check_state
 from ep2sindy.library.terms import (
     Factor,
     Term,
-    Variable,
+    VariableFactor,
     check_degrees,
     check_exponents,
     check_values,
@@ -73,7 +73,7 @@ class Library:
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:
-        factors: list[Factor] = [*map(Variable, self.variables), *self.functions]
+        factors: list[Factor] = [*map(VariableFactor, self.variables), *self.functions]
         return tuple(
             product({f: p for f, p in zip(factors, row, strict=True) if p}, self.variables)
             for row in self.exponents.tolist()
@@ -268,7 +268,7 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
     """A library of these terms, each once, in this order."""
     distinct = list(dict.fromkeys(terms))
     used = (factor for term in distinct for factor, _ in term.factors)
-    factors: list[Factor] = list(dict.fromkeys([*map(Variable, variables), *used]))
+    factors: list[Factor] = list(dict.fromkeys([*map(VariableFactor, variables), *used]))
     check_exponents(len(distinct), len(factors))
     places = {factor: k for k, factor in enumerate(factors)}
     exponents = np.zeros((len(distinct), len(factors)), dtype=np.int64)

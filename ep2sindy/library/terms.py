@@ -14,7 +14,7 @@ from ep2sindy.trust.memory import check_memory
 
 
 @dataclass(frozen=True)
-class Variable:
+class VariableFactor:
     """The factor that is the variable itself."""
 
     name: str
@@ -36,7 +36,7 @@ class Variable:
         return unit
 
 
-Factor = Variable | Function
+Factor = VariableFactor | Function
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _factors(name: str) -> list[tuple[Factor, int]]:
 
 def factor_of(part: Part) -> Factor:
     """A variable, or a function of one, as it is written."""
-    return function_of(part) if part.function else Variable(part.variable)
+    return function_of(part) if part.function else VariableFactor(part.variable)
 
 
 # How large a library may be: counted before it is made.

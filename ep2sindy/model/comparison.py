@@ -101,7 +101,7 @@ def compare_cycles(
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class ComparedRecord:
     """What runs are compared to: samples, and what they repeat.
 
     cycle: of the samples, or of a longer record that they are a part of; None without a period.
@@ -171,7 +171,7 @@ class Record:
         return bool(near and alike)
 
 
-def record_of(run: Trajectory, states: Sequence[str]) -> Record:
+def record_of(run: Trajectory, states: Sequence[str]) -> ComparedRecord:
     """A trajectory as what runs are compared to."""
     values = run.columns(states)
-    return Record(run.t, values, find_cycle(run.t, values))
+    return ComparedRecord(run.t, values, find_cycle(run.t, values))

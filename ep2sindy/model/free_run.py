@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.comparison import FreeRunBounds, Record, Verdict, record_of
+from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Verdict, record_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import phase_along
@@ -116,7 +116,7 @@ def samples_in(run: Trajectory, duration_s: float) -> int:
     return n
 
 
-def _periods_kept(record: Record, states: np.ndarray) -> float:
+def _periods_kept(record: ComparedRecord, states: np.ndarray) -> float:
     """Periods of the data until the run's phase is a quarter off; NaN for data without any."""
     if record.cycle is None:
         return float("nan")
@@ -136,7 +136,9 @@ def _periods_kept(record: Record, states: np.ndarray) -> float:
     return float((record.t[last] - record.t[0]) * frequency_Hz)
 
 
-def _frequencies(model: SparseModel, rollout: Rollout, record: Record) -> Mapping[str, float]:
+def _frequencies(
+    model: SparseModel, rollout: Rollout, record: ComparedRecord
+) -> Mapping[str, float]:
     found = {}
     for k, (name, column) in enumerate(zip(model.states, rollout.states.T, strict=True)):
         alive = column[len(column) // 2 :].std() > DIED_OUT * record.std[k]
@@ -145,7 +147,7 @@ def _frequencies(model: SparseModel, rollout: Rollout, record: Record) -> Mappin
     return MappingProxyType(found)
 
 
-def _nrmse(rollout: Rollout, record: Record) -> float:
+def _nrmse(rollout: Rollout, record: ComparedRecord) -> float:
     if rollout.diverged:
         return float("nan")
     off = (rollout.states - record.states) / zero_to_one(record.states.std(axis=0))

@@ -34,7 +34,7 @@ MIN_STEPS, STEP_TIMES_RATE = 64, 1.0
 BLOW_UP, PATIENCE = 30.0, 4.0
 
 
-class Stability(StrEnum):
+class CycleStability(StrEnum):
     """What becomes of a small departure from a cycle: it dies out, stays, or grows."""
 
     ATTRACTING = "attracting"
@@ -69,12 +69,12 @@ class LimitCycle:
             )
 
     @property
-    def stability(self) -> Stability:
+    def stability(self) -> CycleStability:
         """By the largest modulus of the multipliers but the flow's: neutral within 1e-3 of one."""
         largest = float(np.abs(self.multipliers[1:]).max(initial=0.0))
         if abs(largest - 1.0) <= NEUTRAL_WITHIN:
-            return Stability.NEUTRAL
-        return Stability.ATTRACTING if largest < 1.0 else Stability.REPELLING
+            return CycleStability.NEUTRAL
+        return CycleStability.ATTRACTING if largest < 1.0 else CycleStability.REPELLING
 
 
 def limit_cycle(
@@ -107,7 +107,7 @@ def limit_cycle(
         cycle = _cycle(model, late, period_s=period_s, n_samples=n_samples)
     if cycle is None:
         return _backwards(model, start, period_s=period_s, n_samples=n_samples)
-    if cycle.stability is not Stability.REPELLING:
+    if cycle.stability is not CycleStability.REPELLING:
         return cycle
     # Forwards, such an orbit magnifies the solver's errors: backwards, it forgets them.
     start, period_s = cycle.states[0], cycle.period_s

@@ -12,7 +12,7 @@ from scipy.optimize import root
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.stability import Stability, limit_cycle
+from ep2sindy.model.stability import CycleStability, limit_cycle
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.records import OperatingRecord, values_of
 from ep2sindy.signals.oscillation import SIMULATED, relative_amplitude
@@ -78,7 +78,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
     fate, late = _run(model, start, period_s)
     if fate is Fate.OSCILLATES:
         cycle = limit_cycle(model, late, period_s=period_s)
-        if cycle is None or cycle.stability is Stability.REPELLING:
+        if cycle is None or cycle.stability is CycleStability.REPELLING:
             fate = Fate.RESTS if cycle is None else Fate.DIVERGES
         else:
             mean = cycle.states.mean(axis=0)

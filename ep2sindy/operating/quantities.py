@@ -69,7 +69,7 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class QuantityEstimate:
     """A quantity with the ends of its 95 % interval."""
 
     value: float
@@ -91,7 +91,7 @@ class Fitted:
     status: str
     r2: Mapping[str, float]
     loss: float = float("nan")
-    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    estimates: Mapping[str, QuantityEstimate] = field(default_factory=dict)
     draws: Mapping[str, Float[np.ndarray, " draws"]] = field(default_factory=dict)
 
 
@@ -123,7 +123,7 @@ def estimates_of_draws(
     quantities: Mapping[str, Quantity],
     constraint: Constraint,
     library: Library,
-) -> tuple[dict[str, Estimate], dict[str, Float[np.ndarray, " draws"]]]:
+) -> tuple[dict[str, QuantityEstimate], dict[str, Float[np.ndarray, " draws"]]]:
     """Estimates whose intervals are percentiles of draws, and the draws of every quantity.
 
     The reciprocal of a coefficient whose own interval holds zero may be anything.
@@ -137,7 +137,9 @@ def estimates_of_draws(
         low, high = np.percentile(drawn[name], ends)
         if quantity.power < 0 and np.prod(np.sign(np.percentile(draws[:, k], ends))) <= 0:
             low, high = -np.inf, np.inf
-        estimates[name] = Estimate(float(quantity.of(coef[k : k + 1])[0]), float(low), float(high))
+        estimates[name] = QuantityEstimate(
+            float(quantity.of(coef[k : k + 1])[0]), float(low), float(high)
+        )
     return estimates, drawn
 
 
@@ -146,7 +148,7 @@ def estimates_of_covariance(
     quantities: Mapping[str, Quantity],
     constraint: Constraint,
     library: Library,
-) -> dict[str, Estimate]:
+) -> dict[str, QuantityEstimate]:
     """Estimates whose intervals are those of the model's covariance, carried by the slope."""
     estimates = {}
     for name, quantity in quantities.items():
@@ -155,5 +157,5 @@ def estimates_of_covariance(
         low, _ = model.intervals(state, level=LEVEL)[term]
         reach = abs(quantity.slope(coef)) * (coef - low)
         value = float(quantity.of(np.array([coef]))[0])
-        estimates[name] = Estimate(value, value - reach, value + reach)
+        estimates[name] = QuantityEstimate(value, value - reach, value + reach)
     return estimates

@@ -33,7 +33,7 @@ from ep2sindy.selection.systems import (
     Fold,
     Records,
     Stretch,
-    System,
+    TrialSystem,
     budget,
     folds_of,
     records_of,
@@ -72,7 +72,7 @@ class Trial:
     waveform: largest error of the waveform. loss: of the windows it was refined on.
     """
 
-    system: System
+    system: TrialSystem
     error: float
     waveform: float
     loss: float
@@ -170,7 +170,7 @@ class FreeRunScore:
         self,
         records: Records,
         cycles: Sequence[Cycle],
-        systems: Sequence[System],
+        systems: Sequence[TrialSystem],
         progress: Progress,
     ) -> list[Trial]:
         """Every system refined and run, fold by fold; one that lacks an equation cannot live."""
@@ -190,7 +190,7 @@ class FreeRunScore:
         self,
         records: Records,
         cycles: Sequence[Cycle],
-        systems: Sequence[System],
+        systems: Sequence[TrialSystem],
         fold: Fold,
         progress: Progress,
     ) -> Float[np.ndarray, "systems 3"]:

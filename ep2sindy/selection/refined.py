@@ -27,7 +27,7 @@ from ep2sindy.selection.rule import (
     joint_scores,
     smallest,
 )
-from ep2sindy.selection.systems import Records, System, budget, records_of, systems_of
+from ep2sindy.selection.systems import Records, TrialSystem, budget, records_of, systems_of
 
 # Pairs of windows that the records are cut into at least, where nobody sets the length.
 MIN_PAIRS = 3
@@ -115,7 +115,7 @@ class RefinedScore:
         return Decision(scores, found, self.label)
 
     def _judge(
-        self, systems: Sequence[System], records: Records, progress: Progress
+        self, systems: Sequence[TrialSystem], records: Records, progress: Progress
     ) -> tuple[Float[np.ndarray, " combinations"], float]:
         """Error of every combination on windows it was not refined on, and the limit."""
         coef = np.stack([system.model.coef for system in systems], axis=2)

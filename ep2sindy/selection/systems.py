@@ -24,7 +24,7 @@ BATCH_STEPS = 6000
 
 
 @dataclass(frozen=True, eq=False)
-class System:
+class TrialSystem:
     """One candidate per equation as a model whose coefficients obey the constraint."""
 
     model: SparseModel
@@ -69,7 +69,7 @@ def systems_of(
     library: Library,
     runs: Sequence[Trajectory],
     relations: Sequence[Relation] = (),
-) -> list[System]:
+) -> list[TrialSystem]:
     """Every combination as a system, in the units of the runs."""
     units = runs[0].units if runs else {}
     return [_system(fronts, choice, library, units, relations) for choice in places]
@@ -81,7 +81,7 @@ def _system(
     library: Library,
     units: Mapping[str, str],
     relations: Sequence[Relation],
-) -> System:
+) -> TrialSystem:
     """A combination: free coefficients from the candidates, the others as the relations say."""
     states = [front.equation for front in fronts]
     chosen = [front.candidates[k] for front, k in zip(fronts, choice, strict=True)]
@@ -91,7 +91,7 @@ def _system(
     held = constraint(library, support, binding(relations, support) or ())
     places = [(model.library.index(term), states.index(state)) for state, term in held.coefficients]
     free = np.array([coef[places[k]] for k in held.free])
-    return System(with_coef(model, held, held.coef(free))[0], held)
+    return TrialSystem(with_coef(model, held, held.coef(free))[0], held)
 
 
 def budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:

@@ -30,7 +30,7 @@ Candidates = dict[str, list[tuple[tuple[str, ...], float]]]
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class SINDyRows:
     """The regression a method solves: x_dot = theta coef, columns of theta in library order."""
 
     theta: Float[np.ndarray, "rows terms"]
@@ -85,7 +85,7 @@ class PySINDySmoothing:
     window: int = 25
     order: int = 3
 
-    def rows(self, runs: Sequence[Trajectory], library: Library) -> Rows:
+    def rows(self, runs: Sequence[Trajectory], library: Library) -> SINDyRows:
         theta, x_dot = [], []
         for run in runs:
             differentiation = pysindy.SmoothedFiniteDifference(
@@ -95,7 +95,7 @@ class PySINDySmoothing:
             features, order = pysindy_library(library, run.state_names)
             smoothed = np.asarray(differentiation.smoothed_x_)
             theta.append(np.asarray(features.fit_transform(smoothed))[:, order])
-        return Rows(np.concatenate(theta), np.concatenate(x_dot))
+        return SINDyRows(np.concatenate(theta), np.concatenate(x_dot))
 
 
 @dataclass(frozen=True)
@@ -180,14 +180,14 @@ class PySINDyWeakForm:
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> Candidates:
         parts = [self._rows(run, library, rng) for run in runs]
-        rows = Rows(
+        rows = SINDyRows(
             np.concatenate([part.theta for part in parts]),
             np.concatenate([part.x_dot for part in parts]),
         )
         masks = threshold_masks(rows, rows.thresholds(self.n_thresholds, self.smallest))
         return rows.candidates(masks, library, runs[0].state_names)
 
-    def _rows(self, run: Trajectory, library: Library, rng: np.random.Generator) -> Rows:
+    def _rows(self, run: Trajectory, library: Library, rng: np.random.Generator) -> SINDyRows:
         # The bias belongs to the inner library: the outer one's is not integrated against phi.
         features, order = pysindy_library(library, run.state_names)
         with legacy_random(rng):
@@ -200,7 +200,7 @@ class PySINDyWeakForm:
         states = pysindy.AxesArray(run.states, {"ax_time": 0, "ax_coord": 1})
         with expected_warnings():
             theta = np.asarray(weak.fit_transform(states))[:, order]
-        return Rows(theta, np.asarray(weak.convert_u_dot_integral(run.states)))
+        return SINDyRows(theta, np.asarray(weak.convert_u_dot_integral(run.states)))
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def stlsq(threshold: float) -> pysindy.STLSQ:
 
 
 def threshold_masks(
-    rows: Rows, thresholds: Float[np.ndarray, " n"]
+    rows: SINDyRows, thresholds: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, "n states terms"]:
     """Supports of STLSQ at every threshold, the same for all equations."""
     with expected_warnings():

@@ -13,7 +13,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.data.readers.notation import remove_grouping
-from ep2sindy.data.readers.source import Reader, Source
+from ep2sindy.data.readers.source import FileSource, Reader
 from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, SEPARATORS, Layout, layout_of
 
 # Lines that tell the layout, for longer preambles there are none, and characters in them.
@@ -25,7 +25,7 @@ LONGEST_LINE, MAX_COLUMNS = 1_000_000, 10_000
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
-def read_csv(path: Path) -> Source:
+def read_csv(path: Path) -> FileSource:
     """Text with one row per sample, its columns parted by , ; | tabs or blanks.
 
     Decimal commas, marks of thousands, a preamble and a line of units are told from the content; a
@@ -46,7 +46,7 @@ def read_csv(path: Path) -> Source:
         return xr.DataArray(values, attrs={"units": header.units[j]})
 
     aliases = tuple(number for number in numbered if number not in names)
-    return Source(
+    return FileSource(
         path, [*names], read, aliases=aliases, words=layout.words, step_s=header.step_s,
         is_table=True,
     )  # fmt: skip

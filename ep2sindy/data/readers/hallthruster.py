@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.source import Reader, Source, leaves
+from ep2sindy.data.readers.source import FileSource, Reader, leaves
 from ep2sindy.runtime.files import read_json
 
 UNITS = {
@@ -21,7 +21,7 @@ UNITS = {
 }  # fmt: skip
 
 
-def read_hallthruster(path: Path) -> Source:
+def read_hallthruster(path: Path) -> FileSource:
     """Time-resolved JSON output of HallThruster.jl, SI but for Tev in eV; or columns by name.
 
     A name is a path inside a frame, counted from 0: `ions.Xe.0.n` is the density of Xe+,
@@ -50,7 +50,7 @@ def read_hallthruster(path: Path) -> Source:
     names = [*inside, *(name for name in columns if name not in inside)]
     channel_m = _channel_m(content) if isinstance(content, dict) else None
     words = f"{len(frames)} frames" if frames else "columns, no frames"
-    return Source(path, names, read, words=words, channel_m=channel_m, units=_units(names))
+    return FileSource(path, names, read, words=words, channel_m=channel_m, units=_units(names))
 
 
 def _split_frames(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.readers.source import PACKED_BY, UNDECODED, Reader, Source, check_packing
+from ep2sindy.data.readers.source import PACKED_BY, UNDECODED, FileSource, Reader, check_packing
 
 if TYPE_CHECKING:
     import h5py
@@ -21,7 +21,7 @@ UNITS = ("units", "Units", "UNITS", "unit", "Unit", "UNIT")
 PACKING = (*PACKED_BY, "_FillValue", "missing_value")
 
 
-def read_hdf5(path: Path) -> Source:
+def read_hdf5(path: Path) -> FileSource:
     """HDF5; a name is the path of a data set, such as "group/n_i".
 
     Numbers packed by `scale_factor` and `add_offset` are unpacked; those that `_FillValue` marks,
@@ -37,7 +37,7 @@ def read_hdf5(path: Path) -> Source:
         plain = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
         return xr.DataArray(plain.values, attrs={"units": attrs["units"]})
 
-    return Source(path, names_in_hdf5(path), read)
+    return FileSource(path, names_in_hdf5(path), read)
 
 
 def names_in_hdf5(path: Path) -> list[str]:

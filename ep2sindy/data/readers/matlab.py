@@ -9,19 +9,19 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.readers.hdf5 import names_in_hdf5, read_written
-from ep2sindy.data.readers.source import Reader, Source, leaves
+from ep2sindy.data.readers.source import FileSource, Reader, leaves
 from ep2sindy.trust.limits import check_declared
 
 V73 = b"MATLAB 7.3"
 
 
-def read_matlab(path: Path) -> Source:
+def read_matlab(path: Path) -> FileSource:
     """MATLAB of either kind; a struct's field is "data.n_i"."""
     with path.open("rb") as file:
         return read_matlab73(path) if file.read(len(V73)) == V73 else read_matlab5(path)
 
 
-def read_matlab73(path: Path) -> Source:
+def read_matlab73(path: Path) -> FileSource:
     """MATLAB v7.3, which is HDF5 with axes reversed; a struct's field is "data.n_i"."""
     import h5py
 
@@ -32,10 +32,10 @@ def read_matlab73(path: Path) -> Source:
     names = [
         name.replace("/", ".") for name in names_in_hdf5(path) if not name.startswith("#refs#")
     ]
-    return Source(path, names, read)
+    return FileSource(path, names, read)
 
 
-def read_matlab5(path: Path) -> Source:
+def read_matlab5(path: Path) -> FileSource:
     """MATLAB up to v7; a struct's field is "data.n_i"."""
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
@@ -45,7 +45,7 @@ def read_matlab5(path: Path) -> Source:
     except MatReadError as error:
         raise ValueError(str(error)) from error
     arrays = leaves({name: value for name, value in content.items() if not name.startswith("__")})
-    return Source(path, list(arrays), lambda name: xr.DataArray(np.asarray(arrays[name])))
+    return FileSource(path, list(arrays), lambda name: xr.DataArray(np.asarray(arrays[name])))
 
 
 MATLAB = Reader("MATLAB (v5, v7.3)", read_matlab, first_bytes=(b"MATLAB 5.0", V73))
@@ -54,7 +54,7 @@ MATLAB = Reader("MATLAB (v5, v7.3)", read_matlab, first_bytes=(b"MATLAB 5.0", V7
 # NumPy archives.
 
 
-def read_npz(path: Path) -> Source:
+def read_npz(path: Path) -> FileSource:
     """NumPy arrays saved with `numpy.savez`; pickled objects are refused."""
 
     def read(name: str) -> xr.DataArray:
@@ -65,7 +65,7 @@ def read_npz(path: Path) -> Source:
         for member in archive.infolist():
             check_declared(repr(member.filename), member.file_size, path)
     with np.load(path, allow_pickle=False) as arrays:
-        return Source(path, list(arrays), read)
+        return FileSource(path, list(arrays), read)
 
 
 NPZ = Reader("npz", read_npz, first_bytes=(b"PK",))

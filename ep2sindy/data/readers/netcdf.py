@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.readers.hdf5 import holes_of
-from ep2sindy.data.readers.source import Reader, Source, dataset_source
+from ep2sindy.data.readers.source import FileSource, Reader, dataset_source
 
 # What the netCDF library reads where nothing was written and no attribute says otherwise; bytes
 # have none. Source: netcdf.h, NC_FILL_SHORT and its kin.
@@ -25,7 +25,7 @@ FILLS = {
 }  # fmt: skip
 
 
-def read_netcdf(path: Path) -> Source:
+def read_netcdf(path: Path) -> FileSource:
     """NetCDF 3 and 4, read when asked for; samples that were never written are NaN.
 
     Raises ValueError for a classic file whose header does not fit it.
@@ -63,7 +63,7 @@ def _with_holes(path: Path) -> frozenset[str]:
     return frozenset(found)
 
 
-def _without_holes(source: Source, holes: Collection[str]) -> Source:
+def _without_holes(source: FileSource, holes: Collection[str]) -> FileSource:
     def read(name: str) -> xr.DataArray:
         if name in holes:
             raise ValueError(

@@ -10,7 +10,7 @@ from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
 from ep2sindy.data.readers.hdf5 import HDF5
 from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF
-from ep2sindy.data.readers.source import Reader, Source, damage_named, look_at
+from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
 from ep2sindy.data.readers.zarr import ZARR
 from ep2sindy.trust.guard import look_through_first
 from ep2sindy.trust.limits import check_kind
@@ -23,7 +23,7 @@ READERS = (NETCDF, HDF5, MATLAB, NPZ, CSV, HALLTHRUSTER, ZARR)
 IN_C = (b"MATLAB 5.0", b"CDF\x05")
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path) -> FileSource:
     """Open a file with the reader for its kind."""
     reader = reader_of(path)
     look = look_at(path)

@@ -25,7 +25,7 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
-class Source:
+class FileSource:
     """A file opened: the names it holds, and the array of one name.
 
     dims_named: whether the arrays' dimension names are the file's own. aliases: further names that
@@ -81,7 +81,7 @@ class Reader:
     """
 
     name: str
-    open: Callable[[Path], Source]
+    open: Callable[[Path], FileSource]
     first_bytes: tuple[bytes, ...] = ()
     form: Literal["folder", "hdf5", "other"] | None = None
     endings: tuple[str, ...] = ()
@@ -156,7 +156,7 @@ def check_packing(name: str, attributes: Mapping[str, Any]) -> None:
             )
 
 
-def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
+def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
     """Variables of a dataset as it is stored, whose dimensions the file names; unpacked here."""
     stored = {str(name): dict(variable.attrs) for name, variable in dataset.variables.items()}
     for variable in dataset.variables.values():
@@ -176,7 +176,7 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> Source:
         return array
 
     said = {str(k): v for k, v in dataset.attrs.items() if isinstance(v, str | int | float)}
-    return Source(path, [*stored], read, dims_named=True, channel_m=length, attributes=said)
+    return FileSource(path, [*stored], read, dims_named=True, channel_m=length, attributes=said)
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import xarray as xr
 
-from ep2sindy.data.readers.source import Reader, Source, dataset_source
+from ep2sindy.data.readers.source import FileSource, Reader, dataset_source
 from ep2sindy.runtime.files import read_json
 
 # Compressors and filters that turn bytes into bytes or numbers. Others may make objects of them,
@@ -25,7 +25,7 @@ METADATA = (".zarray", "zarr.json")
 LARGEST_METADATA = 10_000_000  # bytes
 
 
-def read_zarr(path: Path) -> Source:
+def read_zarr(path: Path) -> FileSource:
     """Zarr store in a folder, with named dimensions as xarray writes it; read when asked for.
 
     Raises ValueError for an array of objects or with a codec that is not on the list, before

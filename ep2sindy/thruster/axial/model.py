@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.axial.state_kernels import Model
+from ep2sindy.thruster.axial.state_kernels import AxialModel
 from ep2sindy.thruster.closures import DRIFT_EVENTS, TABLE_STEP_EV, closure_table
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
@@ -51,13 +51,13 @@ def build_model(
     cfl: float = CFL,
     reconstruct: bool = True,
     coldest_eV: float = 0.0,
-) -> Model:
+) -> AxialModel:
     """Gather every constant of one run; arrays hold one ghost cell at each end."""
     distance = lengths_and_centres(faces)[1] - thruster.channel_length
     omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
     mass, anode, wall = thruster.propellant.mass, thruster.anode, thruster.wall
     table = closure_table(thruster)
-    return Model(
+    return AxialModel(
         **_lengths(faces),
         reconstruct=reconstruct,
         area=thruster.area,

@@ -10,7 +10,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from ep2sindy.thruster.axial import state_kernels as recorded
-from ep2sindy.thruster.axial.state_kernels import Model
+from ep2sindy.thruster.axial.state_kernels import AxialModel
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.thruster.recording import as_dataset, notes
 
@@ -70,7 +70,7 @@ def field_columns(*, charges: int, averaged: bool) -> dict[str, tuple[int, str, 
 
 
 def series_of(
-    sums: Float[np.ndarray, "samples series"], model: Model, *, voltage: float, sample_s: float
+    sums: Float[np.ndarray, "samples series"], model: AxialModel, *, voltage: float, sample_s: float
 ) -> dict[str, Float[np.ndarray, " samples"]]:
     """The named series of a run; voltage: of the supply, in V."""
     current = sums[:, recorded.CURRENT]

@@ -35,8 +35,8 @@ from ep2sindy.thruster.axial.state_kernels import (
     CURRENT,
     PER_CHARGE,
     SERIES_SUMS,
-    Model,
-    State,
+    AxialModel,
+    AxialState,
 )
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
@@ -145,7 +145,7 @@ class Record:
 
     fields: Float[np.ndarray, "sums samples cells"]
     series: Float[np.ndarray, "samples series"]
-    state: State
+    state: AxialState
     stored_J: tuple[float, float]
     diverged: bool
 
@@ -158,7 +158,7 @@ def sample_counts(beginning: Beginning, settings: Settings) -> tuple[int, int, i
     return n_hold, n_warm_up, n_recorded + 1
 
 
-def run(model: Model, beginning: Beginning, settings: Settings, advance: Advance) -> Record:
+def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Advance) -> Record:
     """Hold, warm up and record; a run that breaks ends with its last whole sample."""
     state = beginning.state
     n_fields = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1)
@@ -182,7 +182,7 @@ def run(model: Model, beginning: Beginning, settings: Settings, advance: Advance
     )
 
 
-def first_fields(state: State, model: Model) -> bool:
+def first_fields(state: AxialState, model: AxialModel) -> bool:
     """Field, rates and current of profiles, for the first step to see; False where it breaks."""
     start_density(state)
     rows, work = np.zeros(state.n_n.size, np.uint64), np.zeros((26, state.n_n.size))
@@ -190,7 +190,7 @@ def first_fields(state: State, model: Model) -> bool:
 
 
 def _march(
-    model: Model, state: State, settings: Settings, fields: np.ndarray, series: np.ndarray
+    model: AxialModel, state: AxialState, settings: Settings, fields: np.ndarray, series: np.ndarray
 ) -> March:
     """How samples of a run get into the rows of these arrays."""
 
@@ -202,7 +202,7 @@ def _march(
 
 
 def _room(
-    n_fields: int, n_rows: int, state: State
+    n_fields: int, n_rows: int, state: AxialState
 ) -> tuple[Float[np.ndarray, "sums samples cells"], Float[np.ndarray, "samples series"]]:
     """Arrays for the fields and series of so many samples."""
     fields = np.empty((n_fields, n_rows, state.n_n.size - 2), np.float32)
@@ -211,7 +211,7 @@ def _room(
 
 def _dataset(
     record: Record,
-    model: Model,
+    model: AxialModel,
     settings: Settings,
     point: OperatingPoint,
     faces: Float[np.ndarray, " faces"],
@@ -228,7 +228,7 @@ def _dataset(
 def _attributes(
     field: xr.Dataset,
     record: Record,
-    model: Model,
+    model: AxialModel,
     point: OperatingPoint,
     thruster: Thruster,
     sample_s: float,
@@ -247,7 +247,7 @@ def _attributes(
     return attributes
 
 
-def mass_balance(field: xr.Dataset, model: Model, seconds: float) -> float:
+def mass_balance(field: xr.Dataset, model: AxialModel, seconds: float) -> float:
     """Propellant that left plus propellant that accumulated, over propellant that entered."""
     heavy = [name for name in field.data_vars if str(name).startswith("dn_")]
     gained = sum(field[name].mean("time").astype(float) for name in heavy)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.readers.source import damage_named
 from ep2sindy.runtime.files import read_json
-from ep2sindy.thruster.axial.state_kernels import CURRENT, SERIES_SUMS, Model, State
+from ep2sindy.thruster.axial.state_kernels import CURRENT, SERIES_SUMS, AxialModel, AxialState
 from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.trust.guard import look_through_first
@@ -45,7 +45,7 @@ class Beginning(NamedTuple):
     first hold_s, before the run begins; None has the thruster's. note: what became of a start.
     """
 
-    state: State
+    state: AxialState
     whole: bool = False
     hold_s: float = 0.0
     resistance: float | None = None
@@ -62,7 +62,7 @@ class Start(Protocol):
     @property
     def label(self) -> str: ...
 
-    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning: ...
+    def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning: ...
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class GuessedStart:
     def label(self) -> str:
         return "guessed profiles"
 
-    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
+    def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning:
         channel_length = json.loads(parameters)["thruster"]["channel_length"]
         place = z / channel_length  # 1 at the exit
         n_i = np.full(z.size, 5e17)
@@ -101,7 +101,7 @@ class ColdStart:
     def label(self) -> str:
         return f"a uniform plasma of {self.n_i} m^-3, {self.T_e_eV} eV, {self.u_i} m/s"
 
-    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
+    def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning:
         n_i, T_e = np.full(z.size, self.n_i), np.full(z.size, self.T_e_eV)
         n_n = np.full(z.size, model.neutral_inflow / model.neutral_speed)
         return Beginning(_state(parameters, [n_i], [self.u_i * n_i], n_n, T_e))
@@ -124,7 +124,7 @@ class SoftStart:
     def label(self) -> str:
         return f"a discharge kept quiet by {self.resistance} ohm for {self.hold_s} s"
 
-    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
+    def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning:
         guessed = GuessedStart().begin(model, z, parameters)
         return guessed._replace(hold_s=self.hold_s, resistance=self.resistance)
 
@@ -155,7 +155,7 @@ class Restart:
             digest.update(self._end[name].values.tobytes())
         return f"the end of another run ({digest.hexdigest()[:12]})"
 
-    def begin(self, model: Model, z: Profile, parameters: str) -> Beginning:
+    def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning:
         _check_same_thruster(self._end.attrs["parameters"], parameters)
         points = self._end["z"].values
         same = np.array_equal(points, z[1:-1])
@@ -183,7 +183,7 @@ def _of(name: str, k: int) -> str:
     return name if k == 0 else f"{name}{k + 1}"
 
 
-def end_of(state: State) -> dict[str, tuple[Profile, str]]:
+def end_of(state: AxialState) -> dict[str, tuple[Profile, str]]:
     """What `Restart` takes up, with units, by the names of a Dataset's variables."""
     charges = len(state.n_i)
     cells = (state.n_n, state.T_e_eV, state.energy, state.drift_eV, state.E, state.wall_loss)
@@ -200,7 +200,7 @@ def _state(
     flux_i: Sequence[Profile],
     n_n: Profile,
     T_e_eV: Profile,
-) -> State:
+) -> AxialState:
     """A state of these profiles; one profile of ions stands for singly charged ones."""
     size, charges = n_n.size, json.loads(parameters)["thruster"]["charge_states"]
     n, g = np.array(n_i), np.array(flux_i)
@@ -209,7 +209,7 @@ def _state(
         g = np.concatenate([0.99 * g, 0.005 * np.sqrt(2.0) * g])
     n_e = n.T @ np.arange(1.0, charges + 1.0)
     zeros = np.zeros((6, size))
-    return State(
+    return AxialState(
         n_i=n, flux_i=g, n_n=n_n.copy(), T_e_eV=T_e_eV.copy(), energy=1.5 * n_e * T_e_eV,
         drift_eV=zeros[0], n_e=n_e, flux_q=zeros[1], log_n=np.ones((2, size)), E=zeros[2],
         rates=zeros[3:], wall_loss=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
@@ -217,7 +217,7 @@ def _state(
     )  # fmt: skip
 
 
-def stored_energy(state: State, model: Model) -> float:
+def stored_energy(state: AxialState, model: AxialModel) -> float:
     """Heat of the electrons in J."""
     return E_CHARGE * model.area * float(state.energy[1:-1] @ model.dz[1:-1])
 

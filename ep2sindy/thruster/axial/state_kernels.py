@@ -55,7 +55,7 @@ def faces(values):
     return range(np.uint64(0), np.uint64(values.size) - ONE)
 
 
-class Model(NamedTuple):
+class AxialModel(NamedTuple):
     """Everything the compiled loop needs that does not change in time."""
 
     dz: np.ndarray  # (n + 2,), m: lengths of the cells
@@ -93,7 +93,7 @@ class Model(NamedTuple):
     second_thresholds_eV: tuple[float, float]  # of X -> X2+ and X+ -> X2+
 
 
-class State(NamedTuple):
+class AxialState(NamedTuple):
     """Cell arrays that the loop advances in place."""
 
     n_i: np.ndarray  # (charges, n + 2), m^-3

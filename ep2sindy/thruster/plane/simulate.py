@@ -21,7 +21,7 @@ from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plane import state_kernels as kernels
 from ep2sindy.thruster.plane.grid import MaskedGrid
 from ep2sindy.thruster.plane.kernels import advance
-from ep2sindy.thruster.plane.state_kernels import Model, State
+from ep2sindy.thruster.plane.state_kernels import PlaneModel, PlaneState
 from ep2sindy.thruster.propellants import XenonFits
 from ep2sindy.thruster.recording import (
     CHUNK_ROWS,
@@ -151,7 +151,7 @@ class Rows:
         planes = [plane[:n_rows] for plane in self.planes]
         return Rows(planes, self.profiles[:n_rows], self.series[:n_rows])
 
-    def march(self, state: State, model: Model, sample_s: float, averaged: bool) -> March:
+    def march(self, state: PlaneState, model: PlaneModel, sample_s: float, averaged: bool) -> March:
         """How samples of a run get into these rows."""
 
         def march(rows: slice) -> int:
@@ -164,7 +164,7 @@ class Rows:
 
 def warmed_up_run(
     grid: MaskedGrid,
-    model: Model,
+    model: PlaneModel,
     n_warm_up: int,
     n_samples: int,
     sample_s: float,
@@ -264,12 +264,12 @@ def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
     return table
 
 
-def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> kernels.Model:
+def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> kernels.PlaneModel:
     """Gather every constant of one run."""
     distance = grid.z - thruster.channel_length
     omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
     mass = thruster.propellant.mass
-    return kernels.Model(
+    return kernels.PlaneModel(
         dz=grid.dz,
         dr=grid.dr,
         exit_column=grid.exit_column,
@@ -297,7 +297,7 @@ def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> 
     )
 
 
-def initial_state(grid: MaskedGrid, model: kernels.Model) -> kernels.State:
+def initial_state(grid: MaskedGrid, model: kernels.PlaneModel) -> kernels.PlaneState:
     """A gentle guess, uniform in r but for a thin plasma beside the beam."""
     shape = (grid.n_z, grid.n_r)
     z = grid.z / grid.thruster.channel_length  # 1 at the exit
@@ -317,7 +317,7 @@ def state_of(
     flux_z: Float[np.ndarray, "z r"],
     n_n: Float[np.ndarray, "z r"],
     T_e_eV: Float[np.ndarray, " z"],
-) -> kernels.State:
+) -> kernels.PlaneState:
     """State of given densities, axial ion flux and temperature, without radial motion."""
     shape = (grid.n_z, grid.n_r)
     inside = (n_i * grid.area).sum(axis=1, where=grid.plasma)
@@ -327,7 +327,7 @@ def state_of(
 
     gas = empty()
     gas.n[:], gas.flux_z[:], gas.neutrals[:] = n_i, flux_z, n_n
-    return kernels.State(
+    return kernels.PlaneState(
         gas=gas,
         stage=empty(),
         E=np.zeros(shape),

@@ -31,7 +31,7 @@ ONE = np.uint64(1)
 ) = range(8)
 
 
-class Model(NamedTuple):
+class PlaneModel(NamedTuple):
     """Everything the compiled loops need that does not change in time."""
 
     dz: float  # m
@@ -71,7 +71,7 @@ class Gas(NamedTuple):
     u_r: np.ndarray
 
 
-class State(NamedTuple):
+class PlaneState(NamedTuple):
     """Arrays that the loops advance in place."""
 
     gas: Gas
