@@ -159,7 +159,7 @@ def test_choices_and_modules_that_a_page_names_are_there() -> None:
 def lost_names(text: str) -> Iterator[str]:
     """Experiments, choices of groups, benchmarks and files that a page names and nobody has."""
     groups = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir())
-    for name in set(re.findall(r"\+exp=(\w+)", text)) - {"my_study", *EXPERIMENTS}:
+    for name in set(re.findall(r"\+exp=(\w+)", text)) - {"my_study", "my_spread", *EXPERIMENTS}:
         yield f"+exp={name}"
     for group, name in re.findall(rf"`(?:[^`\n]* )?({'|'.join(groups)})=(\w+)(?=[` ])", text):
         if not (CONF / group / f"{name}.yaml").is_file() and name not in ("NAME", "mine"):

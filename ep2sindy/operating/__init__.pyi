@@ -12,6 +12,6 @@ from ep2sindy.operating.quantity_law import control_law as control_law
 from ep2sindy.operating.quantity_law import ControlLaw as ControlLaw
 from ep2sindy.operating.map import law_map as law_map
 from ep2sindy.operating.map import MapPoint as MapPoint
-from ep2sindy.data.quantities import KnownQuantity as KnownQuantity  # for configs
+from ep2sindy.operating.quantities import Quantity as Quantity  # for configs
 from ep2sindy.operating.point_fits import TimeBootstrap as TimeBootstrap  # for configs
 from ep2sindy.operating.point_fits import Refining as Refining  # for configs
