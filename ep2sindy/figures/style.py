@@ -49,8 +49,8 @@ def make_panels(
     *,
     sharex: Sharing = False,
     sharey: Sharing = False,
-    widths: Sequence[float] | None = None,
-    heights: Sequence[float] | None = None,
+    widths: Sequence[int | float] | None = None,
+    heights: Sequence[int | float] | None = None,
 ) -> tuple[Figure, np.ndarray]:
     """A figure of this width and height in inches, and its panels by row and column.
 
