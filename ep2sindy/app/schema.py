@@ -1,4 +1,7 @@
-"""From a config to a study: the study's signature is the schema of its config."""
+"""From a config to a study: the study's signature is the schema of its config.
+
+Holds the one type checker of configs, for fields of studies and arguments of `_target_`s.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""What people have in hand, as trajectories: tables and arrays."""
+"""Tables and arrays as trajectories, and what trajectories are checked for when they come in.
+
+Checked are samples outside the domain of a library's functions, and states or samples that come
+twice.
+"""
 
 from __future__ import annotations
 

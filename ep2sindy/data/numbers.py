@@ -1,4 +1,4 @@
-"""What comes as samples and times, as float64: only what has one meaning is converted."""
+"""Samples and times as float64, where they have one meaning; and sizes to scale columns by."""
 
 from __future__ import annotations
 

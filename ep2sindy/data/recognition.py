@@ -1,4 +1,7 @@
-"""What a file's arrays are, told by their names, units, shapes and sizes, without a mapping."""
+"""What the arrays of a file are, told by their names, units, shapes and sizes, without a mapping.
+
+Holds the description of one array (`ArrayInfo`) and the choice of its unit.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From fields to trajectories: averages over a zone, and single grid points."""
+"""From fields to trajectories: zones of a grid, averages over them, and single grid points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The library: candidate terms for the right-hand side, all of them evaluated at once."""
+"""The library of candidate terms: how it is built, evaluated, scaled, and shown on a screen."""
 
 from __future__ import annotations
 

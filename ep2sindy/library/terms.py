@@ -1,4 +1,7 @@
-"""Terms: products of factors, each a variable or a function of one, to whole powers."""
+"""Terms: products of factors, each a variable or a function of one, to whole powers.
+
+And how many terms a library of some degree has, which is counted before it is built.
+"""
 
 from __future__ import annotations
 

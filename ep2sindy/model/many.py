@@ -1,4 +1,4 @@
-"""Many models of the same states at once: integrated together over the same windows."""
+"""Many models of the same states, integrated together over the same windows by Runge-Kutta."""
 
 from __future__ import annotations
 

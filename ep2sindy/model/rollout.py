@@ -1,4 +1,4 @@
-"""Models integrated over time: along the data, or freely from one state."""
+"""Models integrated over time, along the data or freely; right-hand sides of the terms in use."""
 
 from __future__ import annotations
 

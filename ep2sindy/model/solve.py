@@ -1,4 +1,7 @@
-"""Integration in time with a budget: compiled, by SciPy for functions, implicit where stiff."""
+"""Integration in time with a budget: compiled, by SciPy for functions, implicit where stiff.
+
+A run ends at the border of the domain of its model's functions, which `Border` finds.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cycle that a free model oscillates on: whether it attracts, and which starts reach it."""
+"""The limit cycle of a free model: closed orbit, Floquet multipliers, starts that reach it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Integral least squares beside base, weak and constrained models: `+exp=ils`."""
+"""Integral least squares beside base, weak and constrained models: `+exp=ils`.
+
+Also how far the result of a refinement depends on the windows that were drawn.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MATLAB files, up to v7 and v7.3."""
+"""Readers of MATLAB files, up to v7 and v7.3, and of NumPy's archives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NetCDF 3 and 4."""
+"""Readers of NetCDF 3 and 4, and where the samples of the classic format stand in its file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""How a text file holds its table: separator, decimal sign, preamble, names and units."""
+"""How a text file holds its table: separator, decimal sign, preamble, and a header.
+
+The header stands above the rows and gives names and units of the columns.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run the (z, r) fluid model and return what it did as an xarray.Dataset."""
+"""Run the (z, r) fluid model and return its record as an xarray.Dataset."""
 
 from __future__ import annotations
 
