@@ -1,7 +1,7 @@
-"""Tables and arrays as trajectories, and what trajectories are checked for when they come in.
+"""Conversion of tables and arrays to trajectories, and checks of the trajectories that come in.
 
-Checked are samples outside the domain of a library's functions, and states or samples that come
-twice.
+The checks look for samples outside the domain of a library's functions, for states that repeat
+another state, and for samples that two runs share.
 """
 
 from __future__ import annotations
@@ -24,24 +24,26 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-TIMES = ("time", "t", "time_s", "t_s")  # what a table calls its time, in seconds
+TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time column, in seconds
 
 if TYPE_CHECKING:
     Run: TypeAlias = Trajectory | pd.DataFrame | tuple[np.ndarray, np.ndarray]
     Runs: TypeAlias = Run | Sequence[Run]
-else:  # pandas is not imported for a name
+else:  # pandas is not imported only to name a type
     Run = Runs = object
 
 
 def trajectories_of(runs: object) -> list[Trajectory]:
-    """One run or a list of them as trajectories.
+    """Convert one run, or a list of runs, to trajectories.
 
-    A run is a Trajectory; a pandas DataFrame with a column of times in s (`time`, `t`, `time_s`,
-    `t_s`) or an index of that name, its other columns being states (numbered ones are called x0,
-    x1 ... by their numbers), and rows that hold a NaN left out with the warning `MissingSamples`;
-    or a tuple (t, x) of times
-    (samples,) and states (samples,) or (samples, n_states), which are then called x, or x0, x1 ...
-    Raises ValueError for anything else, and as Trajectory does.
+    A run is one of the following.
+    - A Trajectory.
+    - A pandas DataFrame with a column of times in s (`time`, `t`, `time_s`, `t_s`) or an index of
+      that name. Its other columns are states; columns labelled by a number are called x0, x1 ...
+      Rows that hold a NaN are left out, with the warning `MissingSamples`.
+    - A tuple (t, x) of times (samples,) and states (samples,) or (samples, n_states). The states
+      are then called x, or x0, x1 ...
+    Raises ValueError for anything else, and for whatever Trajectory refuses.
     """
     if isinstance(runs, Sequence) and not isinstance(runs, tuple | str):
         if not runs:
@@ -51,14 +53,14 @@ def trajectories_of(runs: object) -> list[Trajectory]:
 
 
 def is_run(value: object) -> bool:
-    """Whether a value is samples with their times: a trajectory or a table."""
-    pandas = sys.modules.get("pandas")  # who has a table has imported it
+    """True if a value holds samples together with their times: a trajectory or a table."""
+    pandas = sys.modules.get("pandas")  # a caller who has a table has imported pandas already
     table = pandas is not None and isinstance(value, pandas.DataFrame)
     return table or isinstance(value, Trajectory)
 
 
 def trajectory_of(run: object) -> Trajectory:
-    """One run as a trajectory; see `trajectories_of`."""
+    """Convert one run to a trajectory; see `trajectories_of`."""
     return _trajectory(run, "")
 
 
@@ -108,12 +110,12 @@ def _from_table(table: pd.DataFrame) -> Trajectory:
 
 
 def _word(label: object) -> str:
-    """A column's label as a name: that of a number could not be told from a constant term."""
+    """Name for a column. A bare number gets an x, or it would look like a constant term."""
     return f"x{label}" if isinstance(label, int | np.integer) else str(label)
 
 
 def _times(column: pd.Series) -> np.ndarray:
-    """Dates of any zone as dates alone; numbers as they are stored."""
+    """Times of a column: dates without their time zone; numbers as they are stored."""
     kind = column.dtype.kind
     return column.to_numpy(dtype="datetime64[ns]") if kind == "M" else column.to_numpy()
 
@@ -135,7 +137,7 @@ def _from_arrays(t: object, x: object) -> Trajectory:
     return Trajectory(seconds(times), columns, names)
 
 
-# Where the functions of a library are defined, along trajectories.
+# Check that the functions of a library are defined along the trajectories.
 
 
 def check_domain(runs: Sequence[Trajectory], library: Library) -> None:
@@ -164,9 +166,10 @@ def keep_inside(
     moved: Float[np.ndarray, "samples variables"],
     samples: Float[np.ndarray, "samples variables"],
 ) -> Float[np.ndarray, "samples variables"]:
-    """Values moved off samples, by a smoother say, where every function of them is still defined.
+    """Return `moved`, with the samples put back where a function of the library is undefined.
 
-    Where one is not, those of `samples` stand. Columns: the library's variables, and more.
+    moved: modified samples, such as smoothed ones. A value that leaves a function's domain is
+    replaced by the one in `samples`. Columns: first the library's variables, then any others.
     """
     kept = moved
     for function in library.functions:
@@ -178,16 +181,19 @@ def keep_inside(
     return kept
 
 
-# What came twice: a state that is another one, and samples that two runs share.
+# Repeated data: a state that is a copy of another one, and samples that two runs share.
 
 
-SAME = 1e-12  # of a state's variance, that rounding leaves of an exact copy
-MIN_SHARED = 8  # samples in a row: rounded ones come again by chance
+SAME = 1e-12  # residual of an exact copy due to rounding, as a fraction of the state's variance
+MIN_SHARED = 8  # consecutive samples; shorter matches of rounded samples can occur by chance
 
 
 def check_repeats(runs: Sequence[Trajectory]) -> None:
-    """Raise ValueError for a state that is another one, but for its scale and zero, and for runs
-    that share samples: coefficients of the one are arbitrary, intervals of the other too small."""
+    """Raise ValueError for repeated states or samples.
+
+    A state that equals another one up to scale and offset makes the coefficients arbitrary. Runs
+    that share samples make the confidence intervals too small.
+    """
     _check_states(runs)
     begin = np.array([run.states[0, 0] for run in runs])
     for i, run in enumerate(runs):
@@ -206,13 +212,13 @@ def check_repeats(runs: Sequence[Trajectory]) -> None:
 def _check_states(runs: Sequence[Trajectory]) -> None:
     names = runs[0].state_names
     if any(run.state_names != names for run in runs):
-        return  # that is said where states are compared
+        return  # `check_agreement` reports this
     states = np.concatenate([run.states for run in runs])
     unit = (states - states.mean(axis=0)) / states.std(axis=0)
     alike = unit.T @ unit / len(unit)
     for i, j in combinations(range(len(names)), 2):
         sign = 1.0 if alike[i, j] > 0.0 else -1.0
-        # The correlation has lost half the digits: what is left of a copy tells.
+        # Near 1 the correlation has lost half its digits, so the residual of the fit decides.
         if abs(alike[i, j]) < 0.999 or np.square(unit[:, j] - sign * unit[:, i]).mean() > SAME:
             continue
         factor = sign * states[:, j].std() / states[:, i].std()
@@ -225,7 +231,7 @@ def _check_states(runs: Sequence[Trajectory]) -> None:
 
 
 def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m d"]) -> int:
-    """How many samples both begin with, if that is all that the shorter one has; else none."""
+    """Number of shared samples if the shorter array is the beginning of the longer one, else 0."""
     n = min(len(first), len(second))
     same = n >= MIN_SHARED and np.array_equal(first[:MIN_SHARED], second[:MIN_SHARED])
     return n if same and np.array_equal(first[:n], second[:n]) else 0

@@ -1,4 +1,4 @@
-"""From the unit that a file counts in to the one that our name for the quantity means."""
+"""Conversion from the unit used in a file to the unit that our name for the quantity implies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ep2sindy.library.units import (
     unit_product,
 )
 
-# What our usual names mean: a unit of another kind is a mistake in the mapping.
+# Units of our usual names. A unit of another dimension is a mistake in the mapping.
 KNOWN_UNITS = {
     "n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s",
     "I_d": "A", "V_d": "V",
@@ -26,14 +26,15 @@ KNOWN_UNITS = {
 
 NAMED_UNITS = ("V", "A", "W", "N", "Pa", "J", "T")
 
-# Names that end so keep this unit; all others are SI.
+# Names with one of these suffixes keep this unit; all others are SI.
 SUFFIX_UNITS = {"eV": "eV", "kHz": "kHz", "MHz": "MHz", "mg_s": "mg/s", "mN": "mN", "us": "us"}
 
 
 def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = False) -> xr.DataArray:
-    """Convert to SI, or to the unit of the name's suffix; a unit that fits already costs nothing.
+    """Convert an array to SI, or to the unit of its name's suffix.
 
-    is_variable: a z is then a quantity of one's own, not the coordinate.
+    No arithmetic is done if the unit is already right.
+    is_variable: `ours` names a variable; a variable called z is then not the coordinate.
     Raises ValueError for an unknown unit, one that the suffix cannot hold, or one that
     contradicts the file's own attribute.
     """
@@ -50,7 +51,7 @@ def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = Fals
 
 
 def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[float, float, str]:
-    """Factor, offset and target unit that take numbers in `unit` to the unit our name means."""
+    """Factor, offset and target unit that convert numbers in `unit` to the unit of our name."""
     suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
     known = KNOWN_UNITS if is_variable else COORDINATE_UNITS | KNOWN_UNITS
     target = known.get(ours) or next(suffixes, None)
@@ -59,7 +60,7 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
     try:
         given = _ruler(unit)
         given = given.to("kelvin") if target and given.check("[temperature]") else given
-        # k_B T for a temperature that counts in eV
+        # A temperature in eV means k_B T.
         ruler = given.to(target, "boltzmann") if target else given.to_base_units()
     except unit_errors() as error:
         raise ValueError(
@@ -83,7 +84,7 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
 
 
 def same_unit(unit: str, stated: str) -> bool:
-    """Whether both texts mean one unit; a text that is no unit says nothing against."""
+    """True if both texts mean the same unit, or if one of them is not a unit at all."""
     try:
         a, b = _ruler(unit).to_base_units(), _ruler(counted_in(stated)).to_base_units()
     except unit_errors():
@@ -92,12 +93,12 @@ def same_unit(unit: str, stated: str) -> bool:
 
 
 def counted_in(stated: str) -> str:
-    """The unit that times count: days, of `days since 1970-01-01`, as NetCDF says it."""
+    """Unit of a NetCDF time attribute: `days` for `days since 1970-01-01`."""
     return re.split(r"\s+since\s", stated, maxsplit=1)[0].strip()
 
 
 def _ruler(unit: str) -> Any:
-    """0, 1 and 2 of a unit, which show its factor, its offset and whether it is linear."""
+    """The values 0, 1 and 2 in a unit: they reveal its factor, its offset and any nonlinearity."""
     check_unit(unit)
     one: Any = registry().Quantity(netcdf_powers(unit))
     return registry().Quantity(np.arange(3.0) * one.magnitude, one.units)

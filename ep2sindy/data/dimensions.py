@@ -1,4 +1,7 @@
-"""Which axis of an array is time, z or r, by the file's names, the user's, or the lengths."""
+"""Assignment of an array's axes to time, z and r.
+
+The dimension names of the user or of the file decide, or else the lengths of the axes.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from ep2sindy.data.readers.source import FileSource
 
 
 def read_axis(source: FileSource, axis: str, variable: Variable) -> xr.DataArray:
-    """Coordinate of one axis as a float64 vector in SI."""
+    """Read the coordinate of one axis as a float64 vector in SI."""
     points = read_array(source, axis, str(variable.name))
     if points.ndim != 1:
         points = points.squeeze() if points.size > 1 else xr.DataArray(points.values.ravel())
@@ -37,7 +40,7 @@ def read_axes(
     variables: Mapping[str, Variable],
     problems: Problems,
 ) -> dict[str, xr.DataArray]:
-    """Coordinates the file has, in SI; the time is counted in steps where they are given."""
+    """Read the file's coordinates, in SI; with `dt_s`, times are built from equal steps."""
     points = {}
     for axis, variable in axes.items():
         if axis != "time" or dt_s is None:
@@ -63,10 +66,10 @@ def time_length(
     variables: Mapping[str, Variable],
     points: Mapping[str, xr.DataArray],
 ) -> tuple[int, str]:
-    """Number of samples, and the file's name of their dimension, without a time to count.
+    """Number of samples and the file's name of the time dimension, for a file without times.
 
-    By the user's dims, by the dimension that the file names and no coordinate has, or by the
-    length that remains in most arrays when those of z and r are taken away.
+    The user's dims decide first. Otherwise it is the file's named dimension that belongs to no
+    coordinate, or the length that remains in most arrays once those of z and r are removed.
     """
     votes: Counter[tuple[int, str]] = Counter()
     known = {str(p.dims[0]) for p in points.values()} if source.dims_named else set()
@@ -97,7 +100,7 @@ def time_length(
 
 
 def _may_be_time(shape: Sequence[int], space: Sequence[int]) -> set[int]:
-    """Lengths of the axes whose fellows are all axes of space."""
+    """Lengths of the axes that could be time: all other axes of the array are axes of space."""
     longer = [n for n in shape if n > 1]
     found = set()
     for k, n in enumerate(longer):
@@ -116,8 +119,8 @@ def assign_dims(
 ) -> xr.DataArray:
     """Name the dimensions of an array and bring them into the order time, z, r.
 
-    dims: as the user gave them, or None: as the file names them, or by their lengths. Axes of
-    length 1, which MATLAB adds and drops, may be missing on either side.
+    dims: dimensions in the file's order, as the user gave them. None: the file's names decide, or
+    else the lengths. Axes of length 1, which MATLAB adds and drops, may be missing on either side.
     """
     shape = tuple(n for n in array.shape if n > 1)
     if dims is None and array.dims and all(d in file_dims for d in array.dims):
@@ -140,7 +143,7 @@ def assign_dims(
 
 
 def fitting(shape: Sequence[int], lengths: Mapping[str, int]) -> list[tuple[str, ...]]:
-    """The orders of dimensions in which these lengths give the shape."""
+    """All orders of the dimensions whose lengths give this shape."""
     longer = tuple(n for n in shape if n > 1)
     return [
         option

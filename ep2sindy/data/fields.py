@@ -1,10 +1,10 @@
-"""Fields on a (time, z, r) grid as xarray datasets; zone averages and grid points of them.
+"""Fields on a (time, z, r) grid as xarray datasets: checks, grid values, masks, NetCDF output.
 
 A field has the dimension `time` and may have `z` and `r`, each with a coordinate in s or m.
 Its variables may use fewer dimensions than the field: T_e_eV(time, z), I_d(time), B(z).
 Values are SI unless the name carries a suffix (`T_e_eV`); the attribute `units` names the unit.
-A cell outside the plasma is NaN at all times; a value that is missing only now and then is
-refused, since an average over a changing set of cells is no observable.
+A cell outside the plasma is NaN at all times. A value that is missing only at some times is
+refused, since an average over a changing set of cells is not an observable.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ DIMS = ("time", "z", "r")
 
 SPACE = ("z", "r")
 
-CLOCK = "read_in"  # attribute of the time: the unit that people read it in
+CLOCK = "read_in"  # attribute of the time coordinate: the unit in which times are displayed
 
 COORDINATE_UNITS = {"time": "s", "z": "m", "r": "m"}
 
 
 def check_field(field: xr.Dataset) -> None:
-    """Raise ValueError unless `field` is one: dimensions, coordinates, names, types, units.
+    """Raise ValueError unless `field` has a field's dimensions, coordinates, names, types, units.
 
-    Values are not looked at, so a lazy field stays on disk.
+    The variables' values are not read, so a lazy field stays on disk.
     """
     unknown = set(map(str, field.dims)) - set(DIMS)
     if unknown or "time" not in field.dims:
@@ -51,14 +51,14 @@ def check_field(field: xr.Dataset) -> None:
     for name, variable in field.data_vars.items():
         if not str(name).isidentifier():
             raise ValueError(f"a variable's name must be letters, digits and _: {name!r} came")
-        if variable.dtype.kind not in "fiu":  # what counts is read as real numbers
+        if variable.dtype.kind not in "fiu":  # integers are accepted and read as real numbers
             raise ValueError(f"{name} must hold real numbers: its type is {variable.dtype}")
         if "units" not in variable.attrs:
             raise ValueError(f"{name} must name its unit in the attribute 'units' ('1' for none)")
 
 
 def clock_of(field: xr.Dataset) -> Clock:
-    """The unit that people read the field's times in: the one that its file counts them in."""
+    """Unit in which the field's times are displayed: the one that its file uses."""
     return Clock.of(str(field["time"].attrs.get(CLOCK, "s")))
 
 
@@ -73,7 +73,10 @@ def _check_axis(axis: str, points: Float[np.ndarray, " points"]) -> None:
 
 
 def channel_length_m(attributes: Mapping[str, Any]) -> float | None:
-    """Of a field that says it: one opened with `channel_m`, or a simulation's own."""
+    """Channel length in m from a field's attributes, or None.
+
+    A field has one if it was opened with `channel_m` or comes from one of our simulations.
+    """
     if "channel_m" in attributes:
         return float(attributes["channel_m"])
     try:
@@ -95,7 +98,7 @@ def grid_values(array: xr.DataArray) -> Float[np.ndarray, "time z r"]:
 
 
 def mask_cells(array: xr.DataArray) -> Bool[np.ndarray, "1 z r"]:
-    """Cells that hold no plasma: NaN in the first sample (`check_samples` sees to the others)."""
+    """Cells without plasma: NaN in the first sample (`check_samples` checks the other samples)."""
     return np.isnan(grid_values(array.isel(time=[0], missing_dims="ignore")))
 
 
@@ -106,7 +109,8 @@ def check_samples(
 ) -> None:
     """Raise ValueError unless each cell is finite at all times, or masked at all times.
 
-    values: `array` as `grid_values` returns it. Names the variable, the time and the place.
+    values: `array` as `grid_values` returns it.
+    The error names the variable, the time and the place.
     """
     bad = np.argwhere(np.isfinite(values) == masked)
     if bad.size:
@@ -137,7 +141,7 @@ def mask_outside(field: xr.Dataset, inside: xr.DataArray) -> xr.Dataset:
 
 
 def cell_edges(points: Float[np.ndarray, " points"]) -> Float[np.ndarray, " edges"]:
-    """Edges of the cells around grid points: midpoints, and the end cells symmetric."""
+    """Edges of the cells around grid points: midpoints inside, end cells symmetric."""
     middle = (points[1:] + points[:-1]) / 2
     return np.concatenate([[2 * points[0] - middle[0]], middle, [2 * points[-1] - middle[-1]]])
 
@@ -158,17 +162,17 @@ def cell_sizes(field: xr.Dataset, axis: str, *, axisymmetric: bool) -> Float[np.
     return np.diff(edges)
 
 
-# Data sets as NetCDF files, by way of memory: HDF5 must never meet a disk that is full.
+# NetCDF output by way of memory, because HDF5 must never write to a full disk itself.
 
 
 def write_netcdf(
     dataset: xr.Dataset, path: Path, *, encoding: Mapping[str, Mapping[str, Any]] | None = None
 ) -> None:
-    """Write NetCDF under `path`, whole or not at all.
+    """Write a NetCDF file to `path`, completely or not at all.
 
-    The file is made in memory, which must hold it: where HDF5 itself cannot write to the end, it
-    ends the whole program when it closes. Raises OSError, naming the file, where the disk takes it
-    not.
+    The file is built in memory, which must be large enough. If HDF5 itself runs out of disk space,
+    it ends the whole program on closing the file.
+    Raises OSError, naming the file, if it cannot be written.
     """
     content = dataset.to_netcdf(None, engine="h5netcdf", encoding=encoding)
     write_bytes(path, content)

@@ -1,4 +1,4 @@
-"""Missing samples: rows that hold a NaN, and a word on how many there are."""
+"""Missing samples: rows that hold a NaN, and a message that says how many there are."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 class MissingSamples(UserWarning):
-    """Samples that are NaN, and were left out."""
+    """Warns that samples are NaN and were left out."""
 
 
 def present_rows(columns: Mapping[str, Float[np.ndarray, " _"]]) -> Bool[np.ndarray, " _"]:
-    """Which samples every column has; a NaN is a sample that is missing.
+    """Mask of the samples that are present in every column; NaN marks a missing sample.
 
-    Raises ValueError for a column without a number, and where fewer than two samples are left.
+    Raises ValueError for a column without any number, or if fewer than two samples are left.
     """
     lacking = {name: np.isnan(values) for name, values in columns.items()}
     for name, absent in lacking.items():
@@ -40,7 +40,10 @@ def present_rows(columns: Mapping[str, Float[np.ndarray, " _"]]) -> Bool[np.ndar
 
 
 def without_gaps(field: xr.Dataset) -> xr.Dataset:
-    """The samples that all variables of time alone have; others must not be missing at times."""
+    """Drop the samples at which a variable that depends on time alone is NaN.
+
+    Variables on a grid play no part in this; `check_samples` refuses their gaps later.
+    """
     alone = {
         str(name): array.values.astype(np.float64)
         for name, array in field.data_vars.items()
@@ -52,7 +55,10 @@ def without_gaps(field: xr.Dataset) -> xr.Dataset:
 
 
 def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
-    """How many of `n_samples` are missing at the times that are left, and how long at most."""
+    """Message with the number of missing samples and the longest gap.
+
+    t: times of the samples that are left, in s. n_samples: number of samples before.
+    """
     longest, usual = float(np.diff(t).max()), float(np.median(np.diff(t)))
     return (
         f"{n_samples - len(t)} of {n_samples} samples are missing (NaN) and left out; the longest "

@@ -1,7 +1,7 @@
-"""Preparation of fields along time: plain functions, field -> field.
+"""Preparation steps that act along time: plain functions, field -> field.
 
-A config lists them as steps. None changes its argument, and units stay with the variables. Cells
-that are NaN at all times stay so; variables without time stay as they are.
+A config lists them as steps. No step changes its argument, and variables keep their units. Cells
+that are NaN at all times stay NaN; variables without time stay as they are.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ep2sindy.library.units import unit_product
 def crop(
     field: xr.Dataset, *, start_s: float | None = None, stop_s: float | None = None
 ) -> xr.Dataset:
-    """Keep the samples from `start_s` to `stop_s`, ends included; None is the field's own end."""
+    """Keep the samples from `start_s` to `stop_s`, both included; None: the end of the record."""
     t = grid_points(field, "time")
     start = t[0] if start_s is None else start_s
     stop = t[-1] if stop_s is None else stop_s
@@ -43,8 +43,8 @@ def crop(
 def decimate(field: xr.Dataset, *, factor: int) -> xr.Dataset:
     """Keep every `factor`-th sample, from the first on.
 
-    Plain subsampling: what oscillates faster than half the new rate is folded onto lower
-    frequencies, so apply `low_pass` below that rate first.
+    This is plain subsampling: oscillations faster than half the new sampling rate are aliased to
+    lower frequencies. Apply `low_pass` with a cutoff below half the new rate first.
     """
     n_samples = field.sizes["time"]
     if factor < 1 or n_samples <= factor:
@@ -56,9 +56,9 @@ def decimate(field: xr.Dataset, *, factor: int) -> xr.Dataset:
 
 
 def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Dataset:
-    """Remove what oscillates faster than `cutoff_Hz`, without shifting phases.
+    """Remove oscillations faster than `cutoff_Hz` without shifting phases.
 
-    A Butterworth filter of the given order run forwards and backwards: amplitudes halve at
+    A Butterworth filter of the given order runs forwards and backwards: amplitudes halve at
     the cutoff and fall by 12 * order dB per octave above it. Variables without time and masked
     cells stay as they are. Loads the field.
     Raises ValueError for unequal time steps (beyond 1e-3 of a step), a cutoff not between 0
@@ -85,7 +85,7 @@ def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Datas
 
 
 def _uniform_step(field: xr.Dataset) -> float:
-    """Time step in s."""
+    """Time step in s; raises ValueError if the steps are unequal."""
     steps = np.diff(grid_points(field, "time"))
     dt_s = float(steps.mean())
     if np.ptp(steps) > 1e-3 * dt_s:
@@ -98,12 +98,12 @@ def _uniform_step(field: xr.Dataset) -> float:
 
 
 def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
-    """Bring the field to equal steps of `dt_s`.
+    """Resample the field to equal time steps of `dt_s`.
 
-    Steps no longer than the usual one: cubic splines through the samples, from the first on.
-    Longer ones: means over a step, at its middle, of the straight lines between samples, so that
-    little of what is faster is folded in. Loads the field.
-    Raises ValueError for a step that leaves fewer than two samples, or samples that are missing.
+    If `dt_s` is at most the median step, cubic splines through the samples are evaluated from the
+    first sample on. If it is longer, each new sample is the mean over one step, placed at its
+    middle, of the piecewise linear interpolant; this reduces aliasing. Loads the field.
+    Raises ValueError for a step that leaves fewer than two samples, or for missing samples.
     """
     t = grid_points(field, "time")
     if not 0 < dt_s <= 0.5 * (t[-1] - t[0]):
@@ -128,7 +128,7 @@ def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
 
 
 def _means(t: np.ndarray, values: np.ndarray, at: np.ndarray, width: float) -> np.ndarray:
-    """Of the straight lines between samples, over `width` around each time."""
+    """Means of the piecewise linear interpolant over `width` around each time in `at`."""
     steps = np.diff(t)[:, None, None]
     areas = np.concatenate(
         [
@@ -147,11 +147,11 @@ def _means(t: np.ndarray, values: np.ndarray, at: np.ndarray, width: float) -> n
 
 
 def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Dataset:
-    """Fill samples that are missing (NaN) by straight lines between their neighbours in time.
+    """Fill missing samples (NaN) by linear interpolation in time.
 
-    max_gap_s: the longest time between two neighbours that is filled; None fills all. Loads the
-    field.
-    Raises ValueError for a longer gap, and for one at an end of the record.
+    max_gap_s: longest gap to fill, measured between the samples on either side; None fills all.
+    Loads the field.
+    Raises ValueError for a longer gap, and for a gap at an end of the record.
     """
     t = grid_points(field, "time")
     filled = {}
@@ -188,10 +188,10 @@ def _check_gaps(name: str, t: np.ndarray, present: np.ndarray, max_gap_s: float 
 def delay(
     field: xr.Dataset, *, variable: str, delay_s: float, name: str | None = None
 ) -> xr.Dataset:
-    """Add a variable's own past, x(t - delay_s), by straight lines between samples.
+    """Add the delayed variable x(t - delay_s), interpolated linearly between samples.
 
-    name: by default `<variable>_delayed`. Samples without that past, at the beginning, are left
-    out.
+    name: by default `<variable>_delayed`. The first samples, for which the delayed value is not
+    known, are left out.
     Raises ValueError for a delay that is not positive or as long as the record.
     """
     array = _variable(field, variable)
@@ -215,7 +215,8 @@ def delay(
 def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> xr.Dataset:
     """Add a variable's rate of change, by central differences of second order.
 
-    name: by default `d<variable>_dt`. Noise grows with it: `low_pass` first. Steps may differ.
+    name: by default `d<variable>_dt`. Steps may be unequal. Differentiation amplifies noise, so
+    apply `low_pass` first.
     """
     array = _variable(field, variable)
     t = grid_points(field, "time")
@@ -230,9 +231,9 @@ def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> 
 def detrend(
     field: xr.Dataset, *, variables: Sequence[str] | None = None, degree: int = 1
 ) -> xr.Dataset:
-    """Take out what drifts: a polynomial in time, fitted by least squares; the mean stays.
+    """Subtract a drift: a polynomial in time, fitted by least squares; the mean stays.
 
-    variables: None takes all that have time.
+    variables: names to detrend; None: all variables that depend on time.
     """
     names = _of_time(field) if variables is None else list(variables)
     t = grid_points(field, "time")
@@ -270,7 +271,7 @@ def _new_name(field: xr.Dataset, name: str) -> str:
 
 
 def _samples(field: xr.Dataset, name: str) -> Float[np.ndarray, "time z r"]:
-    """Values of a variable, none of them missing at times."""
+    """Values of a variable; raises ValueError for a cell that is missing only at some times."""
     values = grid_values(field[name])
     check_samples(field[name], values, mask_cells(field[name]))
     return values
@@ -279,7 +280,7 @@ def _samples(field: xr.Dataset, name: str) -> Float[np.ndarray, "time z r"]:
 def _like(
     array: xr.DataArray, values: np.ndarray, *, times: xr.DataArray | None = None
 ) -> xr.DataArray:
-    """New values (time, z, r) in the place of a variable's, with its dimensions and unit."""
+    """Array of new values (time, z, r) with the dimensions and the unit of `array`."""
     dims = [axis for axis in DIMS if axis in array.dims]
     sizes = [array.sizes[axis] for axis in dims[1:]]
     coords = {axis: array[axis] for axis in dims if axis in array.coords}

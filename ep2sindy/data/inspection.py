@@ -1,4 +1,4 @@
-"""What a file holds, what it was taken for, and what is lacking."""
+"""Inspection of a file: its arrays, the quantities recognised in them, and what is missing."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ HEADER = ["", "shape", "unit", "from", "to", "missing", "taken as"]
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """A file looked into, and the mapping by which `open_field` opens it.
+    """Result of inspecting a file, with the mapping by which `open_field` opens it.
 
-    kind: of file; words: how it was read. found: what was recognised.
+    kind: kind of file. words: notes on how it was read. found: the recognised mapping.
+    channel_m: length of the channel in m, if the file gives one.
     """
 
     path: Path
@@ -33,7 +34,7 @@ class Inspection:
 
     @property
     def variables(self) -> dict[str, Variable]:
-        """The mapping of what was recognised, with units that are only likely."""
+        """Mapping of the recognised variables; some of their units may be only likely."""
         return dict(self.found.variables)
 
     @property
@@ -50,12 +51,12 @@ class Inspection:
 
     @property
     def dt_s(self) -> float | None:
-        """Time step that the file says elsewhere than in an array."""
+        """Time step in s that the file gives outside its time array, or None."""
         return self.found.dt_s
 
     @property
     def prepare(self) -> dict[str, str]:
-        """Variables that the file lacks and a step of `prepare` makes: name -> step."""
+        """Variables that the file lacks but a step of `prepare` can compute: name -> step."""
         have = self.found.variables
         return {
             name: step
@@ -64,12 +65,12 @@ class Inspection:
         }
 
     def lacking(self, needed: Iterable[str]) -> tuple[str, ...]:
-        """Those of some variables that the file neither holds nor yields by a step of `prepare`."""
+        """Names in `needed` that the file lacks and that no step of `prepare` can compute."""
         have = {*self.found.variables, *self.prepare}
         return tuple(name for name in needed if name not in have)
 
     def is_trace(self, variable: Variable) -> bool:
-        """Whether a variable has only time, varies, and does not rise all along."""
+        """True if a variable depends on time alone, varies, and does not increase throughout."""
         held = {each.name: each for each in self.found.held}
         one = held.get(str(variable.name)) or held[str(variable.name).rpartition("[")[0]]
         n_axes = 1 + (one.name != variable.name)
@@ -77,7 +78,7 @@ class Inspection:
         return of_time and one.step is None and one.low < one.high
 
     def notes(self) -> list[str]:
-        """What is to be decided, what is only likely, and what is lacking, in words."""
+        """Messages about open decisions, units that are only likely, and missing information."""
         texts = []
         if self.time is None and self.dt_s is None:
             texts.append("no time: give the step between samples, data.dt_s=STEP in s")
@@ -96,7 +97,7 @@ class Inspection:
         return texts
 
     def lines(self, more_notes: Sequence[str] = ()) -> list[str]:
-        """The file, its arrays, and what is to be known of them, in lines of a screen's width."""
+        """Summary of the file, its arrays and the notes on them, in lines of a screen's width."""
         words = f"; {self.words}" if self.words else ""
         texts = map(in_line, (*self.notes(), *more_notes))
         notes = [
@@ -134,7 +135,7 @@ class Inspection:
 
     @cached_property
     def _roles(self) -> dict[str, list[str]]:
-        """What arrays of the file, or parts of one, are for us."""
+        """Our names and units for the arrays of the file and their parts: file name -> texts."""
         roles: dict[str, list[str]] = {}
         for ours, variable in {**self.found.axes, **self.found.variables}.items():
             name = str(variable.name)
@@ -144,12 +145,12 @@ class Inspection:
 
 
 def inspect_file(path: str | Path) -> Inspection:
-    """Look into a file: what it holds, and what that is by names, units, shapes and sizes.
+    """List the arrays of a file and recognise quantities by names, units, shapes and sizes.
 
-    Reads every array once. The result prints as a table, with what is only likely and what is
-    lacking; `ep2sindy.open_field(path, variables=found.variables, time=found.time, z=found.z,
-    r=found.r, dt_s=found.dt_s)` opens what it found.
-    Raises ValueError for a file that is missing, empty, damaged or of no known kind.
+    Reads every array once. The result prints as a table, followed by notes on units that are only
+    likely and on missing information. `ep2sindy.open_field(path, variables=found.variables,
+    time=found.time, z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
+    Raises ValueError for a file that is missing, empty, damaged or of an unknown kind.
 
     >>> found = ep.inspect_file("run.nc")
     >>> found.variables["n_i"].unit
@@ -163,7 +164,7 @@ def inspect_file(path: str | Path) -> Inspection:
 
 
 def check_alike(found: Sequence[Inspection]) -> None:
-    """Raise ValueError for files that hold other names than the first: one mapping must fit all."""
+    """Raise ValueError unless all files hold the same names, so that one mapping fits all."""
     names = [{v.name for v in each.variables.values()} for each in found]
     for each, held in zip(found, names, strict=True):
         if held != names[0]:

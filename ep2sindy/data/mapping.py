@@ -1,4 +1,4 @@
-"""Where each quantity sits in a file: names, units and orders of dimensions, and their reading."""
+"""Mapping from our quantities to the arrays of a file: names, units, dimensions, and reading."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import xarray as xr
 from ep2sindy.data.readers.source import FileSource, damage_named
 from ep2sindy.library.names import check_variable
 
-N_LISTED = 100  # names in an error
+N_LISTED = 100  # largest number of names listed in an error
 
 # `probe[:, 1]`: part of an array, counted from 0.
 PART = re.compile(r"(.+?)\s*\[([\d:,\s-]+)\]")
@@ -23,14 +23,14 @@ PART = re.compile(r"(.+?)\s*\[([\d:,\s-]+)\]")
 
 @dataclass(frozen=True)
 class Variable:
-    """Where one quantity sits in a file.
+    """Location and unit of one quantity in a file.
 
-    name: in the file; a path in HDF5 ("group/n_i"), a struct field in MATLAB ("data.n_i"), a
-        column's number in a table ("2"), part of an array ("probe[:, 1]"), counted from 0.
-        None: the file has it not.
-    unit: what the file's numbers count: "cm^-3", "km/s", "degC"; with a factor, "1e19 m^-3".
+    name: name in the file. It may be a path in HDF5 ("group/n_i"), a struct field in MATLAB
+        ("data.n_i"), a column's number in a table ("2") or part of an array ("probe[:, 1]"); both
+        count from 0. None: the file does not hold the quantity.
+    unit: unit of the numbers in the file: "cm^-3", "km/s", "degC"; with a factor, "1e19 m^-3".
     dims: dimensions in the file's order, such as ("r", "z", "time"). None: as the file names
-        them, or the one order in which the lengths fit.
+        them, or else the only order that fits the lengths.
     """
 
     name: str | None
@@ -43,7 +43,7 @@ Keys = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Problems:
-    """What is wrong with a mapping, gathered so that one answer names all of it."""
+    """Errors found in a mapping, collected so that one message names them all."""
 
     found: list[str] = field(default_factory=list)
 
@@ -55,7 +55,7 @@ class Problems:
             self.found.append(str(error))
 
     def check(self, source: FileSource) -> None:
-        """Raise ValueError if there are any, with what the file holds where a name is missing."""
+        """Raise ValueError if there are errors; if a name is missing, list the file's arrays."""
         if not self.found:
             return
         if len(self.found) == 1:
@@ -69,7 +69,7 @@ class Problems:
         )
 
     def _held(self, source: FileSource, joined: str) -> str:
-        """What the file holds, where a name that it does not hold was asked for."""
+        """List of the file's arrays if a missing name was asked for, else an empty text."""
         if not any(" no variable " in each for each in self.found):
             return ""
         return f"{joined} holds {list_arrays(source)}; set the name, or null if the file has it not"
@@ -78,7 +78,7 @@ class Problems:
 def in_file(
     variables: Mapping[str, Variable | Keys | None], problems: Problems
 ) -> dict[str, Variable]:
-    """Those that the file has; a config's keys become a `Variable`."""
+    """Select the variables that the file holds; keys from a config become a `Variable`."""
     found = {}
     for ours, value in variables.items():
         with problems.noted():
@@ -97,7 +97,7 @@ def in_file(
 
 
 def read_array(source: FileSource, ours: str, name: str) -> xr.DataArray:
-    """One array of the file, or part of one, as real numbers, in the file's unit and shape."""
+    """Read one array of the file, or part of one, as real numbers in the file's unit and shape."""
     whole, part = _split_selection(source, name)
     if whole is None:
         near = get_close_matches(name, source.names, n=1)
@@ -120,7 +120,7 @@ def read_array(source: FileSource, ours: str, name: str) -> xr.DataArray:
 
 
 def _split_selection(source: FileSource, name: str) -> tuple[str | None, tuple[int | slice, ...]]:
-    """The array that a name means, and the part of it; None where there is no such array."""
+    """Split a name into an array of the file and an index; the array is None if there is none."""
     if name in source.known:
         return name, ()
     found = PART.fullmatch(name)
@@ -133,12 +133,12 @@ def _split_selection(source: FileSource, name: str) -> tuple[str | None, tuple[i
 
 
 def list_arrays(source: FileSource) -> str:
-    """Names with shapes and units: `ni (6, 4, 3) cm^-3, t (6)`."""
+    """List the file's arrays with shapes and units: `ni (6, 4, 3) cm^-3, t (6)`."""
     texts = []
     for name in source.names[:N_LISTED]:
         try:
             array = source.read(name)
-        except Exception:  # a library's, of a damaged array: it is named all the same
+        except Exception:  # raised by a library for a damaged array; list its name all the same
             texts.append(name)
             continue
         unit = array.attrs.get("units") or source.units.get(name, "")

@@ -1,4 +1,7 @@
-"""Samples and times as float64, where they have one meaning; and sizes to scale columns by."""
+"""Conversion of samples and times to float64, checks of their size, and norms to scale by.
+
+Values without a single clear meaning as real numbers are refused.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Shaped
 
-# Below it products of three, squared in a Gram matrix, vanish. Terms that overflow name themselves.
+# Below this size a product of three variables, squared in a Gram matrix, underflows to zero.
+# Terms that overflow raise their own error.
 LEAST = 1e-50
 
 
 def real_numbers(values: object, what: str) -> np.ndarray:
-    """A copy in float64; a masked value is NaN, which means missing everywhere here.
+    """Copy values to float64; a masked value becomes NaN, which always means missing.
 
     Raises ValueError for complex numbers, truth values, text, dates and other objects.
     """
@@ -33,10 +37,10 @@ def real_numbers(values: object, what: str) -> np.ndarray:
 
 
 def seconds(t: object) -> np.ndarray:
-    """Times in s: numbers are taken so; dates are counted from the first of them.
+    """Convert times to s: numbers are taken as s, dates are counted from the first one.
 
-    Times in single precision that lie on an even grid but for their rounding are put on it.
-    Raises ValueError for what is neither.
+    Single-precision times that lie on an even grid within their rounding are moved onto that grid.
+    Raises ValueError for anything but numbers and dates.
     """
     array = t if isinstance(t, np.ma.MaskedArray) else np.asarray(t)
     if array.dtype.kind == "M" and array.size:
@@ -48,7 +52,10 @@ def seconds(t: object) -> np.ndarray:
 
 
 def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """Times in float64: those of a shorter type, even but for its rounding, are on an even grid."""
+    """Convert times to float64; in a shorter type, times even within rounding become exactly even.
+
+    Other times keep their values.
+    """
     times = real_numbers(t, "t")
     if len(times) < 3 or t.dtype not in (np.float16, np.float32):
         return times
@@ -57,18 +64,18 @@ def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"
     step = grid[1] - grid[0]
     if not (np.isfinite(largest) and step > 0):
         return times
-    rounding = 2.0 * float(np.spacing(largest))  # of a sample, and of the ends of the grid
+    rounding = 2.0 * float(np.spacing(largest))  # rounding of a sample plus that of the grid's ends
     is_rounded = rounding <= 0.5 * step and np.abs(times - grid).max() <= rounding
     return grid if is_rounded else times
 
 
 def rounding_s(t: Float[np.ndarray, " samples"]) -> float:
-    """How far a time may be off for float64 alone: epoch seconds are told apart by 2e-7 s."""
+    """Largest error of a time due to float64 rounding, in s; epoch seconds resolve 2e-7 s."""
     return 2.0 * float(np.spacing(np.abs(t).max()))
 
 
 def check_magnitude(values: Float[np.ndarray, "samples variables"], names: tuple[str, ...]) -> None:
-    """Raise ValueError for a variable so small that products of it vanish in float64."""
+    """Raise ValueError for a variable so small that its products underflow in float64."""
     levels = np.abs(values).max(axis=0, initial=0.0)
     for name, level in zip(names, levels, strict=True):
         if level and level < LEAST:
@@ -78,14 +85,17 @@ def check_magnitude(values: Float[np.ndarray, "samples variables"], names: tuple
             )
 
 
-# Sizes to divide by, so that columns of different units compare.
+# Norms to divide by, so that columns in different units become comparable.
 
 
 def zero_to_one(sizes: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """The same with one in place of zero: what is all zeros stays so when divided."""
+    """Replace zero sizes by one, so that a column of zeros stays zero when divided."""
     return np.where(sizes == 0.0, 1.0, sizes)
 
 
 def column_norms(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, " columns"]:
-    """L2 norms to divide by, of values of moderate size: squares beyond 1e308 overflow."""
+    """L2 norms of the columns, with one in place of zero.
+
+    Values must be of moderate size, since squares beyond 1e308 overflow.
+    """
     return zero_to_one(np.linalg.norm(values, axis=0))

@@ -1,7 +1,7 @@
 """Open files of many kinds as fields, and write fields as NetCDF.
 
-One mapping says where each quantity sits in the file, in which unit and dimension order;
-values become SI on the way in and nowhere else.
+One mapping gives the name, unit and dimension order of each quantity in the file. Values are
+converted to SI when a file is opened and nowhere else.
 """
 
 from __future__ import annotations
@@ -38,21 +38,22 @@ def open_field(
 ) -> xr.Dataset:
     """Open a file as a field, with our names, dimensions and units.
 
-    The kind of file shows in its content: NetCDF, HDF5, MATLAB v5 and v7.3, npz, Zarr; text
-    is a table or HallThruster.jl's JSON by its ending.
-    variables: our name -> where it is in the file, as a `Variable` or the same keys from a
-        config; those with name None are left out. None: all that the file's names, units and
-        shapes say without doubt, see `ep2sindy.inspect_file`; so are then time, z and r.
-    time, z, r: the coordinates; None, or name None, where the file has none.
-    dt_s: time step, for a file without time; taken instead of `time` where given.
-    mask: nonzero where there is plasma; elsewhere values become NaN.
-    channel_m: length of the channel from z = 0, for the field's attributes; None: the file's.
-    chunks: our dimension -> length, to stream what exceeds memory (needs dask; NetCDF, Zarr).
-    NetCDF and Zarr are read when values are asked for, variables in SI without a mask even
-    without dask; the other kinds are read at once.
-    Warns with `DoubtfulUnit` where numbers look like another unit.
-    Raises ValueError, in one answer, for all names that the file does not hold, shapes that do
-    not fit their dimensions, and units that cannot be converted; for a file that is missing,
+    NetCDF, HDF5, MATLAB v5 and v7.3, npz and Zarr are recognised by content; text is a table or
+    HallThruster.jl's JSON, depending on the file's ending.
+    variables: our name -> location in the file, as a `Variable` or the same keys from a config;
+        those with name None are left out. None: every quantity that names, units and shapes
+        identify without doubt, see `ep2sindy.inspect_file`; time, z and r are then found as well.
+    time, z, r: the coordinates; None, or name None, if the file has none.
+    dt_s: time step in s, for a file without times; it replaces `time` if both are given.
+    mask: array that is nonzero where there is plasma; elsewhere values become NaN.
+    channel_m: length of the channel from z = 0, stored in the field's attributes; None: the
+        length that the file gives.
+    chunks: our dimension -> length, to stream data that exceed memory (needs dask; NetCDF, Zarr).
+    Values from NetCDF and Zarr are read when they are used; without dask, this holds for variables
+    in SI without a mask. Other kinds of file are read at once.
+    Warns with `DoubtfulUnit` if numbers look like another unit.
+    Raises one ValueError for all names that the file does not hold, all shapes that do not fit
+    their dimensions, and all units that cannot be converted; also for a file that is missing,
     damaged or of another kind.
 
     >>> field = ep.open_field("run.nc")  # its names, units and shapes leave no doubt
@@ -84,7 +85,7 @@ def _field(
     mask: Variable | Keys | None,
     chunks: Mapping[str, int] | None,
 ) -> xr.Dataset:
-    """The field that a mapping describes; all that is wrong with it is told at once."""
+    """Build the field that a mapping describes; one error reports all faults of the mapping."""
     problems, arrays = Problems(), {}
     wanted = in_file(variables, problems)
     if not wanted and not problems.found:
@@ -127,7 +128,7 @@ def _assign_dims(
     points: Mapping[str, xr.DataArray],
     problems: Problems,
 ) -> dict[str, xr.DataArray]:
-    """Arrays with our dimensions, in our order."""
+    """Give arrays our dimension names, in our order."""
     file_dims = {str(p.dims[0]): axis for axis, p in points.items()} if source.dims_named else {}
     lengths = {axis: points[axis].size for axis in DIMS if axis in points}
     placed = {}
@@ -138,9 +139,9 @@ def _assign_dims(
 
 
 def files_of(path: object) -> list[str]:
-    """The files that a path means: itself, a pattern such as `runs/*.csv`, or a list of either.
+    """Expand a path, a pattern such as `runs/*.csv`, or a list of either, to a list of files.
 
-    Raises ValueError for a pattern that no file fits, and for anything else.
+    Raises ValueError for a pattern that matches no file, and for any other value.
     """
     if isinstance(path, list | tuple) and path:
         return [file for each in path for file in files_of(each)]
@@ -155,9 +156,10 @@ def files_of(path: object) -> list[str]:
 
 
 def write_field(field: xr.Dataset, path: str | Path) -> None:
-    """Write a field as NetCDF; the final name appears only when the file is whole.
+    """Write a field as NetCDF; the file appears under its name only once it is complete.
 
-    It is made in memory, which must hold it. Raises OSError where it cannot be written.
+    The file is built in memory, which must be large enough.
+    Raises OSError if it cannot be written.
     """
     check_field(field)
     if Path(path).suffix != ".nc":
@@ -166,7 +168,7 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
 
 
 def read_field(path: str | Path) -> xr.Dataset:
-    """Open what `write_field` wrote; values are read when asked for."""
+    """Open a field that `write_field` wrote; values are read when they are used."""
     if reader_of(Path(path)) is not NETCDF:
         raise ValueError(f"a written field is NetCDF: {path} is not; open others with open_field")
     with damage_named(Path(path)):

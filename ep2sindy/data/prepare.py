@@ -1,7 +1,7 @@
-"""Preparation of fields, of their variables and places: plain functions, field -> field.
+"""Preparation steps that act on variables and cells: plain functions, field -> field.
 
-`in_time` has those that work along time.
-A config lists them as steps. None changes its argument, and units stay with the variables.
+Steps that act along time are in `in_time`. A config lists the steps to apply. No step changes its
+argument, and variables keep their units.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OPERATORS: Mapping[type, Callable] = {
     ast.BitOr: np.logical_or,
 }
 
-LONGEST = 1000  # characters of an expression
+LONGEST = 1000  # largest number of characters in an expression
 
 FUNCTIONS: Mapping[str, Callable] = {"abs": np.abs, "exp": np.exp, "log": np.log, "sqrt": np.sqrt}
 
@@ -40,10 +40,11 @@ FUNCTIONS: Mapping[str, Callable] = {"abs": np.abs, "exp": np.exp, "log": np.log
 def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.Dataset:
     """Add the variable `name`, computed from others: "n_i*u_iz", "sqrt(u_iz^2 + u_ir^2)".
 
-    Operators + - * / ^, functions abs, exp, log, sqrt; names are the field's variables and
-    coordinates (time, z, r), all in SI or the unit of their suffix, and `units` says what comes
-    out. Computed in float64.
-    Raises ValueError for an unknown name, one that is taken, or any other syntax.
+    expression: may use the operators + - * / ^ and the functions abs, exp, log, sqrt. Its names
+    are the field's variables and coordinates (time, z, r), all in SI or the unit of their suffix.
+    units: unit of the result. Computed in float64.
+    Raises ValueError for an unknown name in the expression, a new name that is already taken, or
+    any other syntax.
     """
     check_variable(name)
     if name in field:
@@ -57,10 +58,10 @@ def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.D
 
 
 def radial_from_middle(field: xr.Dataset, *, middle_m: float | None = None) -> xr.Dataset:
-    """Turn the sign of u_ir below mid radius: positive is then away from it on both sides.
+    """Flip the sign of u_ir below mid radius, so that positive points away from it on both sides.
 
-    Equations that are alike on both sides get coefficients of one sign, and maps of them become
-    symmetric. middle_m: mid radius; None is the middle of the grid.
+    Equations that are alike on both sides then get coefficients of the same sign, and maps of the
+    coefficients become symmetric. middle_m: mid radius in m; None: the middle of the grid.
     Raises ValueError for a field without u_ir on r.
     """
     if "u_ir" not in field or "r" not in field["u_ir"].dims:
@@ -80,8 +81,9 @@ def radial_from_middle(field: xr.Dataset, *, middle_m: float | None = None) -> x
 def keep_where(field: xr.Dataset, *, condition: str) -> xr.Dataset:
     """Mask the cells where `condition` does not hold, such as the inside of a wall.
 
-    condition: as in `derive`, with comparisons joined by & and |, in brackets:
-    "(z > 0.025) | ((r > 0.035) & (r < 0.05))". Variables without its dimensions stay as they are.
+    condition: expression as in `derive`, with bracketed comparisons joined by & and |:
+    "(z > 0.025) | ((r > 0.035) & (r < 0.05))". Variables that lack a dimension of the condition
+    stay as they are.
     """
     inside = evaluate(field, condition)
     if inside.dtype != bool or not set(inside.dims) & set(SPACE) or "time" in inside.dims:
@@ -93,7 +95,7 @@ def keep_where(field: xr.Dataset, *, condition: str) -> xr.Dataset:
 
 
 def evaluate(field: xr.Dataset, expression: str) -> xr.DataArray:
-    """Value of an arithmetic expression of a field's variables and coordinates, in float64."""
+    """Evaluate an arithmetic expression of a field's variables and coordinates, in float64."""
     shown = cut(repr(expression))
     if len(expression) > LONGEST:
         raise ValueError(

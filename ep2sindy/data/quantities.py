@@ -1,4 +1,4 @@
-"""What our usual names mean: their units, the sizes they have in a thruster, and their aliases."""
+"""Known quantities of a thruster: units, typical sizes and aliases of our usual names."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ep2sindy.data.fields import COORDINATE_UNITS
 
 
 class DoubtfulUnit(UserWarning):
-    """Numbers that look like another unit than the one they are said to count."""
+    """Warns that numbers look like another unit than the stated one."""
 
 
 @dataclass(frozen=True)
 class KnownQuantity:
-    """A quantity of a thruster.
+    """One quantity of a thruster.
 
-    low, high: where the median of its size lies, in its unit. others: units that files often count
-    in. words: its names, as `words_of` gives them, ordered.
+    low, high: range of the median magnitude, in `unit`. others: further units that files often
+    use. words: aliases, each a sorted tuple of words as `words_of` returns it.
     """
 
     unit: str
@@ -32,7 +32,7 @@ class KnownQuantity:
     words: frozenset[tuple[str, ...]]
 
     def fits(self, size: float, factor: float = 1.0) -> bool:
-        """Whether a size may be this quantity's; what is all zeros may be anything's."""
+        """True if a median magnitude is plausible for this quantity; 0 (all zeros) always is."""
         return size == 0.0 or self.low <= factor * size <= self.high
 
 
@@ -85,13 +85,13 @@ AXES: dict[str, KnownQuantity] = {
     "r": KnownQuantity("m", 1e-4, 1.0, ("mm", "cm"), _names("r", "radial", "rr")),
 }  # fmt: skip
 
-# How a variable is had that a file lacks: from another one, by a step of `prepare`.
+# Variables that can be computed if a file lacks them: name -> (source variable, step of `prepare`).
 MADE_FROM = {"R_ion": ("T_e_eV", "ep2sindy.thruster.ionization_rate")}
 
 PLASMA = frozenset({"n_i", "n_n", "u_iz", "u_ir", "T_e_eV", "R_ion"})
-LONGEST_STEP_S = 1e-3  # of their records: ten periods of breathing
+LONGEST_STEP_S = 1e-3  # longest plausible time step of plasma records: ten breathing periods
 
-# A word of a name and what it says; "" says nothing.
+# Words found in names -> their meaning; "" marks a word without meaning.
 WORDS = {
     **dict.fromkeys(("density", "densities", "number"), "dens"),
     **dict.fromkeys(("ion", "ions", "plus"), "i"),
@@ -110,7 +110,7 @@ WORDS = {
     **dict.fromkeys(("avg", "mean", "average", "averaged", "data", "field", "si"), ""),
 }  # fmt: skip
 
-# HallThruster.jl's names, of the lowest charge state.
+# HallThruster.jl's names, for the lowest charge state.
 HALLTHRUSTER = {
     r"ions\.\w+\.0\.n|ni\.0|ni_1": "n_i",
     r"ions\.\w+\.0\.u|ui\.0|ui_1": "u_iz",
@@ -118,11 +118,11 @@ HALLTHRUSTER = {
     r"grid|grid\.(z|cell_centers|cellcenters)": "z",
 }
 
-# Scalars that say the time step in s, or its inverse in Hz.
+# Names of scalars that give the time step in s, or the sampling rate in Hz.
 STEPS = frozenset({"dt", "dts", "deltat", "timestep", "sampletime", "samplinginterval"})
 RATES = frozenset({"fs", "samplingrate", "samplerate", "samplingfrequency", "fshz"})
 
-# A unit at the end of a name.
+# Units written at the end of a name.
 ENDINGS = {
     "s": "s", "ms": "ms", "us": "us", "ns": "ns", "m": "m", "cm": "cm", "mm": "mm", "ev": "eV",
     "k": "K", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "kv": "kV", "m3": "m^-3", "cm3": "cm^-3",
@@ -131,7 +131,7 @@ ENDINGS = {
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """`t_us` as `t` and `us`; a name that ends in no unit with None."""
+    """Split a unit off the end of a name: `t_us` gives `t` and `us`; the unit is None if absent."""
     for ending in sorted(ENDINGS, key=len, reverse=True):
         if name.lower().endswith(f"_{ending}") and len(name) > len(ending) + 1:
             return name[: -len(ending) - 1], ENDINGS[ending]
@@ -139,14 +139,14 @@ def split_unit(name: str) -> tuple[str, str | None]:
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """What the words of a name say, ordered: `ionDensity` and `density_ion` are one."""
+    """Meanings of the words in a name, sorted: `ionDensity` and `density_ion` give the same."""
     parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
     said = [WORDS.get(part.lower(), part.lower()) for part in parts]
     return tuple(sorted(word for word in said if word))
 
 
 def step_said(name: str, value: float) -> float | None:
-    """The time step in s that a scalar of this name says."""
+    """Time step in s that a scalar of this name gives, or None if it is no step or rate."""
     *_, last = re.split(r"[/.]", name)
     plain = re.sub(r"[^a-z]", "", last.lower())
     if not (np.isfinite(value) and value > 0):
@@ -155,7 +155,7 @@ def step_said(name: str, value: float) -> float | None:
 
 
 def meant_by(name: str) -> set[str]:
-    """Our names for what a name in a file may mean, by its last words or by its whole path."""
+    """Our names that a name in a file may stand for, judged by its last part or its whole path."""
     known = QUANTITIES | AXES
     if name in known:
         return {name}
@@ -174,15 +174,16 @@ def meant_by(name: str) -> set[str]:
 
 
 def typical(values: np.ndarray) -> float:
-    """Median size of what is neither zero nor missing; 0 where there is none."""
+    """Median magnitude of the values that are neither zero nor missing; 0 if there are none."""
     sizes = np.abs(values[np.isfinite(values) & (values != 0)])
     return float(np.median(sizes)) if sizes.size else 0.0
 
 
 def likely_time_unit(step: float, names: Iterable[str]) -> str | None:
-    """The unit in which a plasma's record has steps near a microsecond; None where seconds will do.
+    """Unit of time in which a plasma's record has steps near 1 us; None if seconds are plausible.
 
-    names: of its variables. A current alone may be logged once a second.
+    step: time step in the file's numbers. names: variables of the record. Without a plasma
+    variable the result is None, since a current alone may be logged once a second.
     """
     if step <= LONGEST_STEP_S or not PLASMA & {*names}:
         return None
@@ -191,9 +192,10 @@ def likely_time_unit(step: float, names: Iterable[str]) -> str | None:
 
 
 def unit_doubts(field: xr.Dataset) -> list[str]:
-    """Quantities of a field whose numbers look like another unit; looks at one sample of many.
+    """Messages about quantities whose numbers look like another unit.
 
-    Densities of 1e12 m^-3, say, are those of a file that counts in cm^-3.
+    Densities of 1e12 m^-3, for example, suggest that the file uses cm^-3. On a grid only the
+    middle sample in time is examined.
     """
     found = []
     step = float(np.diff(field["time"].values[:2])[0])

@@ -1,6 +1,6 @@
-"""What the arrays of a file are, told by their names, units, shapes and sizes, without a mapping.
+"""Recognition of a file's arrays by names, units, shapes and sizes, without a mapping.
 
-Holds the description of one array (`ArrayInfo`) and the choice of its unit.
+Contains the description of one array (`ArrayInfo`) and the choice of its unit.
 """
 
 from __future__ import annotations
@@ -30,15 +30,17 @@ from ep2sindy.data.quantities import (
 from ep2sindy.data.readers.source import FileSource
 from ep2sindy.library.units import unit_like
 
-MAX_COLUMNS = 32  # of an array whose columns are taken as signals of their own
+MAX_COLUMNS = 32  # an array of at most so many columns is split into separate signals
 
 
 @dataclass(frozen=True)
 class Recognised:
-    """A mapping of a file as far as it can be told.
+    """Mapping of a file, as far as it could be recognised.
 
-    variables, axes: our name -> where it is. guesses: our name -> a unit that is only likely, in
-    words. questions: what is left open, in words. n_samples: None where they cannot be counted.
+    held: all arrays of the file. variables, axes: our name -> location in the file. dt_s: time
+    step in s if the file gives it outside its time array. guesses: our name -> message about a
+    unit that is only likely. questions: messages about open decisions. n_samples: number of
+    samples in time, None if it cannot be determined.
     """
 
     held: Sequence[ArrayInfo]
@@ -50,7 +52,7 @@ class Recognised:
     n_samples: int | None = None
 
     def check(self, source: FileSource) -> None:
-        """Raise ValueError unless a field can be made of it without doubt."""
+        """Raise ValueError unless this mapping gives a field without any doubt."""
         problems = [each.problem for each in self.held if each.problem not in ("", TEXT)]
         problems += self.guesses.values()
         if "time" not in self.axes and self.dt_s is None:
@@ -71,7 +73,7 @@ def recognise(
     dt_s: float | None = None,
     given: Mapping[str, Variable | Keys] | None = None,
 ) -> Recognised:
-    """What the arrays of a file are. given: coordinates that the user names."""
+    """Recognise the arrays of a file. given: coordinates that the user named."""
     problems = Problems()
     named = in_file(given or {}, problems)
     problems.check(source)
@@ -80,7 +82,7 @@ def recognise(
     questions: list[str] = []
     guesses: dict[str, str] = {}
     axes = dict(named)
-    for axis in DIMS[:1] if source.is_table else DIMS:  # a column z is a state of one's own
+    for axis in DIMS[:1] if source.is_table else DIMS:  # in a table, a column z is a state
         if axis not in axes and (found := _axis(axis, usable, source, questions)) is not None:
             axes[axis] = found
     if dt_s is None:
@@ -108,7 +110,7 @@ def _of(held: Sequence[ArrayInfo], name: str | None) -> ArrayInfo | None:
 def _axis(
     axis: str, held: Sequence[ArrayInfo], source: FileSource, questions: list[str]
 ) -> Variable | None:
-    """The vector that is this coordinate: by its name, for time also by its unit or its place."""
+    """Find the vector of one coordinate by its name; for time, also by its unit or position."""
     unit = AXES[axis].unit
     rising = [each for each in held if each.step is not None]
     options = [each for each in rising if axis in meant_by(each.name)]
@@ -116,7 +118,7 @@ def _axis(
     if not options and axis == "time":
         options = [each for each in rising if is_of(each.unit, unit)]
         if not options and source.is_table and rising and rising[0] is held[0]:
-            options = rising[:1]  # the first column of a table, where it rises, is its time
+            options = rising[:1]  # an increasing first column of a table is its time
     exact = [each for each in options if each.name == axis] or options
     if len(exact) > 1:
         names = " or ".join(repr(each.name) for each in exact)
@@ -128,9 +130,10 @@ def _axis(
 def _step_s(
     source: FileSource, axes: Mapping[str, Variable], held: Sequence[ArrayInfo]
 ) -> float | None:
-    """The time step that a preamble says, unless the time has a unit: a count of samples has none.
+    """Time step in s from outside the time array, or None.
 
-    Without a time, that of a scalar such as dt or fs.
+    A step from the preamble counts unless the time array has a unit of time; without one, the
+    array merely numbers the samples. If there is no time array, a scalar such as dt or fs counts.
     """
     time = axes.get("time")
     one = _of(held, time.name) if time is not None else None
@@ -140,7 +143,7 @@ def _step_s(
 
 
 def _stated_step_s(held: Sequence[ArrayInfo]) -> float | None:
-    """The time step that scalars such as dt or fs say, if they say one."""
+    """Time step in s given by scalars such as dt or fs; None if there is none or they disagree."""
     scalars = [step_said(e.name, e.low) for e in held if not e.lengths and not e.dims]
     said = {step for step in scalars if step is not None}
     return said.pop() if len(said) == 1 else None
@@ -154,7 +157,7 @@ def _lengths(
     dt_s: float | None,
     questions: list[str],
 ) -> dict[str, int]:
-    """Points of the axes; without a time, its samples are what is left of the arrays."""
+    """Number of points of each axis; without a time array, samples are counted from the others."""
     found = {axis: one.shape for axis, v in axes.items() if (one := _of(held, v.name))}
     lengths = {axis: int(np.prod(shape)) for axis, shape in found.items()}
     if "time" in axes or not rest:
@@ -185,7 +188,7 @@ def _variables(
     questions: list[str],
     guesses: dict[str, str],
 ) -> dict[str, Variable]:
-    """Arrays that fit the axes in one way, under our names where theirs are known."""
+    """Arrays that fit the axes in exactly one way, under our names if theirs are known."""
     fit = [each for each in rest if _fits(each, axes, held, lengths, questions)]
     found: dict[str, Variable] = {}
     meant = {each.name: meant_by(each.name) for each in fit}
@@ -221,7 +224,10 @@ def _fits(
     lengths: Mapping[str, int],
     questions: list[str],
 ) -> bool:
-    """Whether an array has one place on the axes; asks where it might have several, or none."""
+    """True if an array fits the axes in exactly one way.
+
+    Adds a question for an array that fits in several ways, or has an axis without a coordinate.
+    """
     if not one.lengths or one.low != one.low:
         return False
     known = {_dim(variable, held, axis) for axis, variable in axes.items()}
@@ -241,13 +247,13 @@ def _fits(
 
 
 def _has_columns(one: ArrayInfo, lengths: Mapping[str, int]) -> bool:
-    """Whether an array is a few signals side by side."""
+    """True if an array consists of a few signals side by side."""
     n = lengths.get("time", 0)
     return len(one.shape) == 2 and sorted(one.shape)[-1] == n and min(one.shape) <= MAX_COLUMNS
 
 
 def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dict[str, Variable]:
-    """The signals of such an array, one by one."""
+    """Separate variables for the signals of an array that holds several side by side."""
     if fitting(one.shape, lengths) or not _has_columns(one, lengths) or len(one.lengths) < 2:
         return {}
     samples_first = one.shape[0] == lengths["time"]
@@ -260,7 +266,7 @@ def _columns(one: ArrayInfo, lengths: Mapping[str, int], taken: set[str]) -> dic
 
 
 def _own_name(name: str, taken: set[str]) -> str:
-    """A name in a file as one of ours."""
+    """Turn a name in a file into a valid variable name that is not yet taken."""
     *_, last = re.split(r"[/.]", name)
     ours = re.sub(r"\W+", "_", name if last.isdigit() and last != name else last).strip("_")
     ours = f"column_{ours}" if not ours or ours[0].isdigit() else ours
@@ -269,7 +275,7 @@ def _own_name(name: str, taken: set[str]) -> str:
     return ours
 
 
-# The unit that an array's numbers count: stated, named, ours, or only likely.
+# Unit of an array's numbers: stated by the file, in its name, our usual one, or only likely.
 
 
 def is_of(unit: str, like: str) -> bool:
@@ -279,7 +285,11 @@ def is_of(unit: str, like: str) -> bool:
 def with_unit(
     ours: str, one: ArrayInfo, quantity: KnownQuantity, guesses: dict[str, str]
 ) -> Variable:
-    """The unit that the file says, its name's ending, ours, or else the likely one."""
+    """Variable with its unit: the stated one, the one in its name, or ours.
+
+    If neither is given and the size does not fit our unit, the likely unit is taken and a message
+    is added to `guesses`.
+    """
     stated = one.unit if is_of(one.unit, quantity.unit) or converts(ours, one.unit) else ""
     stated = stated or _ending(ours, one.name)
     if not stated and not quantity.fits(one.size):
@@ -302,9 +312,11 @@ def with_time_unit(
     said_s: float | None,
     guesses: dict[str, str],
 ) -> Variable:
-    """The unit of time where the file names none: that in which its steps are those it says.
+    """Time variable with its unit, for a file that names none.
 
-    Else a plasma's record shows it in its steps. said_s: the step that a scalar such as fs says.
+    The unit is the one in which the array's step equals `said_s`, the step in s that a scalar such
+    as fs gives. Otherwise a plasma's record suggests a likely unit by its step; that unit comes
+    with a message in `guesses`.
     """
     if one.unit not in ("", "1") or _ending("time", one.name) or one.step is None:
         return time
@@ -322,7 +334,7 @@ def with_time_unit(
 
 
 def _ending(ours: str, name: str) -> str:
-    """The unit at the end of a name, if our name can have it."""
+    """Unit at the end of a name, if it converts to the unit of our name; else ""."""
     unit = split_unit(re.split(r"[/.]", name)[-1])[1]
     return unit if unit and converts(ours, unit) else ""
 
@@ -338,24 +350,26 @@ def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
 
 
 def own_unit(ours: str, one: ArrayInfo) -> str:
-    """The unit that the file says, if numbers can be converted from it; else none."""
+    """Unit that the file states, or that a name's ending gives, if it converts; else "1"."""
     suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
     options = (one.unit, split_unit(ours)[1] or "", *suffixes)
     return next((unit for unit in options if converts(ours, unit, is_variable=True)), "1")
 
 
-# One array of a file as it is looked at: shape, unit, range, what is missing, and its steps.
+# Summary of one array in a file: shape, unit, range, missing values, spacing.
 
 
-TEXT = "text or objects"  # what is not even tried
+TEXT = "text or objects"  # problem of arrays that are not numbers
 
 
 @dataclass(frozen=True)
 class ArrayInfo:
-    """One array of a file. unit: "" where the file says none. n_missing: NaN or infinite.
+    """Summary of one array in a file: shape, unit, range, missing values, spacing.
 
-    step: mean step of a vector that increases, else None. even: whether its steps are equal.
-    problem: why it cannot be used.
+    unit: "" if the file states none. low, high: range of the finite values. size: median magnitude
+    of the nonzero values. n_missing: number of NaN or infinite values. step: mean step of an
+    increasing vector, else None. even: True if the steps are equal. problem: reason why the array
+    cannot be used, or "".
     """
 
     name: str
@@ -373,12 +387,12 @@ class ArrayInfo:
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Of its axes, without those of one point."""
+        """Lengths of the axes that have more than one point."""
         return tuple(n for n in self.shape if n > 1)
 
 
 def describe_array(source: FileSource, name: str) -> ArrayInfo:
-    """What one array holds; reads it."""
+    """Read one array and summarise it."""
     try:
         array = read_array(source, name, name)
     except ValueError as error:

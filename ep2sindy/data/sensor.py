@@ -1,4 +1,4 @@
-"""What the range and the resolution of a sensor make of samples: intervals in place of values."""
+"""Clipped and coarsely rounded samples, described by intervals in place of exact values."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-# Samples at an end of the range that are no chance: where hardly a value comes twice, and, of
-# rounded samples, in multiples of how often the next values come. Of a sine they come 2.5 times as
-# often.
+# Number of samples at an end of the range that cannot be chance. FEWEST holds if hardly any value
+# repeats. Rounded samples need more than TIMES the largest count among the NEXT nearest levels; at
+# the crest of a sine that ratio is 2.5.
 FEWEST, TIMES, NEXT = 3, 5, 3
-REPEATS = 0.01  # share of the values that come more than once
-SAMPLES_PER_LEVEL = 3  # of rounded samples; the least
-EVEN = 0.01  # of a step, by which distances between levels may differ from whole steps
-DITHERED = 0.5  # noise in steps, from which on rounding is noise like any other
-ORDER = 3  # of differences: they leave little of a signal that the samples resolve
-ROUNDING = 1e-9  # of the range, below which differences are those of the number format
-FINE = 3e-3  # of the spread: no model is as exact
+REPEATS = 0.01  # samples count as rounded if a larger share of their values repeats
+SAMPLES_PER_LEVEL = 3  # least number of samples per level for samples that count as rounded
+EVEN = 0.01  # tolerance on distances between levels being whole steps, as a fraction of a step
+DITHERED = 0.5  # noise in units of the step, above which rounding acts like ordinary noise
+ORDER = 3  # order of the differences, high enough to suppress a signal that the samples resolve
+ROUNDING = 1e-9  # fraction of the range below which differences are rounding of the number format
+FINE = 3e-3  # fraction of the standard deviation; no model is accurate to a finer step
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Between what limits the truth of every sample lies, but for its noise.
+    """Limits between which the true value of each sample lies, apart from noise.
 
-    lower, upper: (samples, columns); both are the sample where it is a value. words: what was
-    found, by column. at: which samples are no values.
+    lower, upper: (samples, columns), infinite beyond a clipped end; both equal the sample where it
+    is an exact value. words: one message per affected column. at: mask of the inexact samples.
     """
 
     lower: Float[np.ndarray, "samples columns"]
@@ -40,11 +40,12 @@ class Bounds:
 
 
 def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]) -> Bounds | None:
-    """Limits of clipped samples, and of those that are rounded more coarsely than they scatter.
+    """Find the limits of clipped samples, and of samples rounded more coarsely than their noise.
 
-    Clipped is an end of the range that comes again and again, where the values beside it do not.
-    What rests there from the start, or to the end, is not, if the record has no noise that would
-    show. None where all are values.
+    A column is clipped if an end of its range occurs again and again while neighbouring values do
+    not. In a record without visible noise, samples that rest at the end of the range from the
+    start, or until the end, do not count as clipped.
+    Returns None if all samples are exact values.
     """
     lower, upper, words = values.copy(), values.copy(), []
     for j, name in enumerate(names):
@@ -56,7 +57,7 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
             lower[:, j] -= step / 2.0
             upper[:, j] += step / 2.0
             words.append(f"{name} is rounded to steps of {step:.3g}")
-            continue  # a signal that rests at its end looks clipped then
+            continue  # a rounded signal that rests at its end would look clipped
         ends = []
         for limit, end, level, others in (
             (upper, np.inf, levels[-1], counts[-2::-1]),
@@ -76,8 +77,10 @@ def _is_clipped(
     there: Bool[np.ndarray, " samples"],
     others: Int[np.ndarray, " levels"],
 ) -> bool:
-    """Whether an end of the range comes too often. others: how often other levels do, nearest
-    first."""
+    """True if an end of the range occurs too often. others: counts of other levels, nearest first.
+
+    there: mask of the samples at that end.
+    """
     rounded = len(others) < 2 or (others[:-1] > 1).mean() > REPEATS
     most = TIMES * int(others[:NEXT].max(initial=1)) if rounded else FEWEST - 1
     if there.sum() <= most:
@@ -90,8 +93,11 @@ def _is_clipped(
 
 
 def _has_noise(x: Float[np.ndarray, " samples"]) -> bool:
-    """Whether differences change their sign from one to the next: of white noise three in four do,
-    of a signal that the samples resolve hardly one, but for rounding."""
+    """True if more than half of consecutive third differences change sign.
+
+    For white noise about three in four do; for a signal that the samples resolve hardly any do,
+    apart from rounding.
+    """
     change = np.diff(x, ORDER)
     shown = np.abs(change) > ROUNDING * np.ptp(x)
     both = shown[1:] & shown[:-1]
@@ -100,7 +106,7 @@ def _has_noise(x: Float[np.ndarray, " samples"]) -> bool:
 
 
 def _coarse_step(x: Float[np.ndarray, " samples"], levels: Float[np.ndarray, " levels"]) -> float:
-    """The step that samples are rounded to; 0 where it is finer than their noise, or none."""
+    """Step that samples are rounded to; 0 if they are not rounded, or more finely than noise."""
     if len(levels) < 3 or SAMPLES_PER_LEVEL * len(levels) > len(x):
         return 0.0
     gaps = np.diff(levels)
@@ -113,6 +119,6 @@ def _coarse_step(x: Float[np.ndarray, " samples"], levels: Float[np.ndarray, " l
     return step if coarse and np.abs(ratio - np.round(ratio)).max() < EVEN else 0.0
 
 
-# Mean size of third differences of white noise of unit variance: sqrt(1 + 9 + 9 + 1), of a normal
-# variable times sqrt(2 / pi).
+# Mean magnitude of third differences of normal white noise of unit variance: their standard
+# deviation sqrt(1 + 9 + 9 + 1), times sqrt(2 / pi).
 NORMAL = float(np.sqrt(20.0 * 2.0 / np.pi))

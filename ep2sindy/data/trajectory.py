@@ -20,16 +20,16 @@ from ep2sindy.runtime.screen import html_table, one_screen, text_table
 
 
 def read_only_mapping(values: dict) -> MappingProxyType:
-    """A mapping that cannot be changed."""
+    """Wrap a dict in a mapping that cannot be changed."""
     return MappingProxyType(values)
 
 
-# Pickle does not know the kind, and trajectories and models go to other processes.
+# Pickle cannot handle this type, and trajectories and models are sent to other processes.
 copyreg.pickle(MappingProxyType, lambda kept: (read_only_mapping, (dict(kept),)))
 
 
 class ConstantStateError(ValueError):
-    """A state that never changes shows no dynamics."""
+    """A state never changes, so its dynamics cannot be identified."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +38,12 @@ class Trajectory:
 
     t: (samples,) in s, increasing; steps may be unequal. Dates are counted from the first, in s.
     states: (samples, n_states). inputs: (samples, n_inputs), by default none.
-    units: name -> unit for any of the variables; a missing one reads "1".
-    clock: the unit that people read its times in; t stays in s.
-    Raises ValueError for time that does not increase, unequal lengths, values that are
-    not finite (what is masked, too), not real numbers or of a size below 1e-50, repeated
-    names or names that are no words of letters, digits and _, fewer than two samples, or a state
-    that never changes.
+    units: name -> unit for any of the variables; the default is "1".
+    clock: unit in which times are displayed; t stays in s.
+    Raises ValueError for time that does not increase, unequal lengths, values that are masked, not
+    finite or not real numbers, a variable of magnitude below 1e-50, repeated names, names that
+    are not words of letters, digits and _ (or averages such as `<n_i*n_n>`), fewer than two
+    samples, or a state that never changes.
 
     >>> t = np.linspace(0.0, 1e-3, 101)
     >>> run = ep.Trajectory(t, np.sin(6e4 * t)[:, None], ["I_d"], units={"I_d": "A"})
@@ -51,7 +51,7 @@ class Trajectory:
     (101, (101, 1))
     """
 
-    # Lengths read `_`, since __post_init__ compares them and says what to do.
+    # Lengths are typed `_` because __post_init__ compares them and raises a clearer error.
     t: Float[np.ndarray, " _"]
     states: Float[np.ndarray, "_ n_states"]
     state_names: Sequence[str]
@@ -83,7 +83,7 @@ class Trajectory:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """States first, then inputs: the order of the library's variables."""
+        """Names of the states, then of the inputs: the order of the library's variables."""
         return (*self.state_names, *self.input_names)
 
     @property
@@ -101,9 +101,9 @@ class Trajectory:
         return float((self.t[-1] - self.t[0]) / (len(self.t) - 1))
 
     def columns(self, names: Sequence[str]) -> Float[np.ndarray, "samples columns"]:
-        """Samples of some states or inputs, in the order asked for.
+        """Samples of some states or inputs, in the order of `names`.
 
-        Raises ValueError for an unknown name, with those that exist.
+        Raises ValueError for an unknown name; the error lists the known ones.
         """
         for name in names:
             if name not in self.names:
@@ -117,7 +117,7 @@ class Trajectory:
         return columns
 
     def window(self, start: int, stop: int) -> Trajectory:
-        """Samples start to stop (exclusive) as a trajectory of their own."""
+        """Samples from `start` to `stop` (exclusive) as a new trajectory."""
         if not 0 <= start < stop <= self.n_samples:
             raise ValueError(
                 f"a window must lie inside the trajectory: [{start}, {stop}) was asked of "
@@ -183,11 +183,11 @@ class Trajectory:
             raise ValueError("a trajectory needs at least one state; name one in state_names")
 
     def _check_variation(self) -> None:
-        columns = np.ascontiguousarray(self.states.T)  # along rows of few columns this is slow
+        columns = np.ascontiguousarray(self.states.T)  # reductions over few columns are slow
         for name, width, level in zip(
             self.state_names, np.ptp(columns, axis=1), np.abs(columns).max(axis=1), strict=True
         ):
-            # Below rounding the derivative is noise of the number format, not of the system.
+            # A variation within rounding error says nothing about the system's derivative.
             if width <= 1e-12 * level:
                 raise ConstantStateError(
                     f"a state must vary: {name!r} stays at {level:.6g} over all "
@@ -230,7 +230,10 @@ def check_finite(
 
 
 def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
-    """One regression has one meaning per column: the same states, and units, everywhere."""
+    """Raise ValueError unless all trajectories have the same states, and agree in units.
+
+    Every column of a regression must mean the same thing in all trajectories.
+    """
     if not trajectories:
         raise ValueError("a regression needs at least one trajectory: none came")
     first = trajectories[0]

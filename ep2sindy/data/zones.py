@@ -1,4 +1,4 @@
-"""From fields to trajectories: zones of a grid, averages over them, and single grid points."""
+"""Trajectories from fields: zones of a grid, averages over zones, and single grid points."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.units import unit_product
 
-SLAB_VALUES = 2**22  # 32 MB of float64: what one variable may take while a zone is averaged
+SLAB_VALUES = 2**22  # 32 MB of float64: memory limit for one variable while averaging a zone
 
 
 def zone_average(
@@ -45,16 +45,17 @@ def zone_average(
 ) -> Trajectory:
     """Average variables over the grid points inside a zone (None: the whole field), at each time.
 
-    Weights are the sizes of the cells: length in z and, where the field has r, annulus area
-    (length if not axisymmetric). One set of cells serves all variables of the call: those
-    where none of them is masked. `products` such as "n_i*n_n*R_ion" add inputs named
-    `<n_i*n_n*R_ion>` with the average of the product, which is not the product of averages. A
-    variable whose attribute `average_of` names the product is taken for it: a simulation's samples
-    are averages in time, and so is that.
-    Sums run in float64 and slab by slab in time, whatever the storage. Samples that a variable
-    of time alone lacks (NaN) are left out for all.
+    Weights are the sizes of the cells: length in z and, if the field has r, annulus area (length
+    if not axisymmetric). All variables of the call are averaged over the same cells: those in
+    which none of them is masked.
+    products: each, such as "n_i*n_n*R_ion", adds an input named `<n_i*n_n*R_ion>` with the average
+    of the product, which is not the product of averages. If a variable's attribute `average_of`
+    names the product, that variable is used instead: a simulation's samples are averages in time,
+    and so is this variable.
+    Sums run in float64, slab by slab in time, whatever the storage type. Samples at which a
+    variable of time alone is missing (NaN) are left out for all variables.
     Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
-    value that is not finite in a cell that is not masked.
+    value that is not finite in an unmasked cell.
 
     >>> field = ep.read_field("run.nc")
     >>> run = ep.zone_average(field, ep.Zone(z=(0.01, 0.02)), states=["n_i", "n_n"])
@@ -87,7 +88,7 @@ def zone_average(
 
 @dataclass(frozen=True)
 class ZoneAverage:
-    """`zone_average` with everything chosen but the field: how a config says it."""
+    """Settings of `zone_average` without the field, for use in a config."""
 
     states: Sequence[str]
     zone: Zone | None = None
@@ -106,14 +107,14 @@ class ZoneAverage:
         )
 
     def place(self, field: xr.Dataset) -> str:
-        """What of the field's grid it averages over, in words."""
+        """Description of the part of the field's grid that is averaged over."""
         words = describe_zone(self.zone, field)
         return f"average over {words}" if words else ""
 
 
 @dataclass(frozen=True)
 class GridPoint:
-    """`point` with everything chosen but the field; it has no products."""
+    """Settings of `point_samples` without the field, for use in a config; it has no products."""
 
     states: Sequence[str]
     z: float | None = None
@@ -126,7 +127,7 @@ class GridPoint:
         )
 
     def place(self, field: xr.Dataset) -> str:
-        """The grid point that it takes, in words."""
+        """Description of the grid point that is used."""
         places = _nearest(field, z=self.z, r=self.r)
         texts = [f"{a} = {1e3 * grid_points(field, a)[k]:.4g} mm" for a, (k,) in places.items()]
         return f"the grid point at {', '.join(texts)}" if texts else ""
@@ -141,7 +142,9 @@ def point_samples(
     inputs: Sequence[str] = (),
     label: str = "",
 ) -> Trajectory:
-    """Samples at the grid point nearest to (z, r), in m; each axis of the field must be given.
+    """Samples at the grid point nearest to (z, r).
+
+    z, r: place in m; one is needed for each axis that the field has.
 
     Raises ValueError for a place outside the grid's cells or without plasma.
     """
@@ -151,7 +154,7 @@ def point_samples(
 
 
 def _nearest(field: xr.Dataset, *, z: float | None, r: float | None) -> dict[str, list[int]]:
-    """The grid point nearest to a place, by axis."""
+    """Index of the grid point nearest to a place, for each axis."""
     places = {axis: value for axis, value in (("z", z), ("r", r)) if value is not None}
     axes = [axis for axis in SPACE if axis in field.dims]
     if sorted(places) != sorted(axes):
@@ -173,7 +176,7 @@ Factors = list[tuple[str, int]]
 
 
 def _average_of(field: xr.Dataset, factors: Factors) -> Factors:
-    """A product, or the variable that holds its average in time, where the field has one."""
+    """Factors of a product, or the variable that holds its time average if the field has one."""
     for name, variable in field.data_vars.items():
         kept = variable.attrs.get("average_of")
         if kept is not None and sorted(split_factors(kept)) == sorted(factors):
@@ -206,7 +209,7 @@ def _zone_weights(
     *,
     axisymmetric: bool,
 ) -> Float[np.ndarray, "z r"]:
-    """Cell sizes inside the zone with sum one; zero where any variable is masked."""
+    """Cell sizes inside the zone, normalised to sum one; zero where any variable is masked."""
     sizes = [
         cell_sizes(field, axis, axisymmetric=axisymmetric)[slices.get(axis, slice(None))]
         if axis in field.dims
@@ -231,7 +234,7 @@ def _means(
     weights: Float[np.ndarray, "z r"],
     columns: Sequence[Sequence[tuple[str, int]]],
 ) -> Float[np.ndarray, "samples columns"]:
-    """Weighted means over the cells at all times, slab by slab."""
+    """Weighted means over the cells at all times, computed slab by slab."""
     n_slab = max(1, SLAB_VALUES // weights.size)
     slabs = (part.isel(time=slice(k, k + n_slab)) for k in range(0, part.sizes["time"], n_slab))
     return np.concatenate([_slab_means(slab, masks, weights, columns) for slab in slabs])
@@ -243,7 +246,7 @@ def _slab_means(
     weights: Float[np.ndarray, "z r"],
     columns: Sequence[Sequence[tuple[str, int]]],
 ) -> Float[np.ndarray, "samples columns"]:
-    """Weighted means of products of variables over the cells, for some samples of the zone."""
+    """Weighted means of products of variables over the cells, for one slab of samples."""
     values = {}
     for name, masked in masks.items():
         raw = grid_values(slab[name])
@@ -257,18 +260,18 @@ def _slab_means(
     return means
 
 
-# Part of a grid: a zone in z and r, by its ends or as the downstream part of a channel.
+# Zones: part of a grid in z and r, given by its ends or as the downstream part of a channel.
 
 
-DOWNSTREAM, SHARE = "downstream", 0.4  # of the channel, where the thesis averages
+DOWNSTREAM, SHARE = "downstream", 0.4  # share of the channel over which the thesis averages
 
 
 @dataclass(frozen=True)
 class Zone:
     """Part of the grid: (from, to) in z and r, in m, ends included; None is the whole axis.
 
-    z: "downstream" is the last 40 % of the thruster's channel, whose length the field's attributes
-    say; a field without z needs none.
+    z: "downstream" is the last 40 % of the thruster's channel. The channel's length comes from the
+    field's attributes; a field without z needs none.
     """
 
     z: Sequence[float] | str | None = None
@@ -287,9 +290,9 @@ class Zone:
 
 
 def resolve_zone(zone: Zone | None, field: xr.Dataset) -> Zone:
-    """The zone with its ends in m.
+    """Replace "downstream" by ends in m, and None by a zone that covers the whole field.
 
-    Raises ValueError for a downstream part of a channel whose length the field does not say.
+    Raises ValueError for a downstream zone if the field does not give the channel's length.
     """
     zone = zone or Zone()
     if zone.z != DOWNSTREAM:
@@ -309,7 +312,7 @@ def resolve_zone(zone: Zone | None, field: xr.Dataset) -> Zone:
 
 
 def describe_zone(zone: Zone | None, field: xr.Dataset) -> str:
-    """What of the grid a zone takes: `z 15 to 25 mm (20 of 100 points), ...`; "" without a grid."""
+    """Describe a zone as `z 15 to 25 mm (20 of 100 points), ...`; "" for a field without a grid."""
     ends = resolve_zone(zone, field)
     slices = zone_slices(field, ends)
     texts = []
@@ -330,7 +333,7 @@ def describe_zone(zone: Zone | None, field: xr.Dataset) -> str:
 
 
 def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
-    """Grid points inside the zone, per axis of the field.
+    """Slice of the grid points inside the zone, for each axis that the zone bounds.
 
     Raises ValueError if the zone bounds an axis the field lacks, holds no grid point, or
     reaches beyond the grid by more than one cell (a sign of cm taken for m).

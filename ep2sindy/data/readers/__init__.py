@@ -1,1 +1,1 @@
-"""Open files of many kinds: one file per kind, all giving a `Source`."""
+"""Readers of many kinds of file, in one module per family of formats; each gives a `FileSource`."""

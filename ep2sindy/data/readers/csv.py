@@ -1,4 +1,4 @@
-"""Tables as text: CSV and its kin, as programs and oscilloscopes write them."""
+"""Reader of text tables: CSV and similar formats, as programs and oscilloscopes write them."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from ep2sindy.data.readers.notation import remove_grouping
 from ep2sindy.data.readers.source import FileSource, Reader
 from ep2sindy.data.readers.table_layout import COMMENTS, MISSING, SEPARATORS, Layout, layout_of
 
-# Lines that tell the layout, for longer preambles there are none, and characters in them.
+# Lines and characters examined to find the layout; no known preamble is longer.
 N_LOOKED_AT, CHARACTERS_LOOKED_AT = 2000, 10_000_000
 
-# What pandas gets: it takes hundreds of bytes for every column.
+# Limits on what is passed to pandas, which needs hundreds of bytes for every column.
 LONGEST_LINE, MAX_COLUMNS = 1_000_000, 10_000
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def read_csv(path: Path) -> FileSource:
-    """Text with one row per sample, its columns parted by , ; | tabs or blanks.
+    """Read text with one row per sample and columns separated by , ; | tabs or blanks.
 
-    Decimal commas, marks of thousands, a preamble and a line of units are told from the content; a
-    header need not be. A name is the header's without its unit, or the column's number, from 0;
-    names that repeat are x.0, x.1. Columns of text are left out, and an empty cell is NaN.
+    Decimal commas, thousands separators, a preamble and a line of units are recognised from the
+    content; a header is optional. A column's name is the header's without its unit, or else its
+    number from 0; names that repeat become x.0, x.1. Columns of text are left out, and an empty
+    cell is NaN.
     """
     encoding = _encoding(path)
     layout = layout_of(_first_lines(path, encoding))
@@ -53,7 +54,7 @@ def read_csv(path: Path) -> FileSource:
 
 
 def _first_lines(path: Path, encoding: str) -> list[str]:
-    """Raises ValueError for lines, or numbers of columns, that no table has."""
+    """Read the first lines; raise ValueError if one is too long or has too many cells."""
     lines: list[str] = []
     n_characters = 0
     with path.open(encoding=encoding, newline=None) as file:
@@ -75,7 +76,7 @@ def _first_lines(path: Path, encoding: str) -> list[str]:
 
 
 def _encoding(path: Path) -> str:
-    """Raises ValueError for a file that is no text."""
+    """Detect the text encoding; raise ValueError for a file that is not text."""
     with path.open("rb") as file:
         head = file.read(2**16)
     if head.startswith(UTF_16):
@@ -90,10 +91,10 @@ def _encoding(path: Path) -> str:
 
 
 def _frame(path: Path, layout: Layout, encoding: str) -> pd.DataFrame:
-    """The rows; raises ValueError for one of more cells than the first."""
+    """Read the rows; raise ValueError for a row with more cells than the first."""
     missing = sorted({*MISSING, *map(str.upper, MISSING), "NaN", "Inf", "-Inf"} - {""})
     with path.open(encoding=encoding, newline=None) as file:
-        for _ in range(layout.first):  # lines of a preamble may hold quotes that pandas pairs
+        for _ in range(layout.first):  # skipped here: pandas would pair quotes in a preamble
             next(file)
         try:
             return pd.read_csv(
@@ -117,7 +118,7 @@ def _frame(path: Path, layout: Layout, encoding: str) -> pd.DataFrame:
 
 
 def _numbers(column: pd.Series, name: str, layout: Layout) -> Float[np.ndarray, " rows"]:
-    """A column as numbers; raises ValueError with the row of a cell that is none."""
+    """Convert a column to numbers; raise ValueError with the row of a cell that is not a number."""
     if column.dtype.kind in "fiu":
         return column.to_numpy(dtype=np.float64)
     text = column.astype("string").str.strip()

@@ -1,4 +1,4 @@
-"""Output of HallThruster.jl."""
+"""Reader of HallThruster.jl's output."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ UNITS = {
 
 
 def read_hallthruster(path: Path) -> FileSource:
-    """Time-resolved JSON output of HallThruster.jl, SI but for Tev in eV; or columns by name.
+    """Read time-resolved JSON output of HallThruster.jl, or JSON that holds plain columns.
 
-    A name is a path inside a frame, counted from 0: `ions.Xe.0.n` is the density of Xe+,
-    `neutrals.Xe.n`, `Tev`, `discharge_current`, with time `t` and grid `z`. Layouts: of versions
-    0.19 to 0.22 (output.frames); frames with `t` and `grid` beside them; 0.18 (`ni.0`, `ui.0`,
-    `nn`) and earlier (`ni_1`), a bare list of frames; without frames, plain columns. What stands
-    beside the frames is named by its path from the top.
+    Values are in SI, except Tev in eV. A name is a path inside a frame, with indices from 0:
+    `ions.Xe.0.n` (density of Xe+), `neutrals.Xe.n`, `Tev`, `discharge_current`, time `t`, grid `z`.
+    Supported layouts: versions 0.19 to 0.22 (output.frames); frames with `t` and `grid` beside
+    them; 0.18 (`ni.0`, `ui.0`, `nn`) and earlier (`ni_1`), a bare list of frames; without frames,
+    plain columns. Data beside the frames are named by their path from the top.
     Source: https://um-pepl.github.io/HallThruster.jl (Use JSON for input and output).
     """
     content = read_json(path.read_text(encoding="utf-8-sig"))
@@ -37,7 +37,7 @@ def read_hallthruster(path: Path) -> FileSource:
     if not frames and not columns:
         raise ValueError("it holds no output.frames; run the simulation with save_time_resolved")
     inside = list(leaves(frames[0])) if frames else []
-    grid = [name for name in ("z",) if name in inside]  # repeated in every frame: the grid stays
+    grid = [name for name in ("z",) if name in inside]  # the fixed grid is repeated in every frame
 
     def read(name: str) -> xr.DataArray:
         if name in grid:
@@ -54,14 +54,14 @@ def read_hallthruster(path: Path) -> FileSource:
 
 
 def _split_frames(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
-    """The frames, and what stands beside them."""
+    """Split the content into the frames and the data beside them."""
     if isinstance(content, list):
         frames, beside = content, {}
     else:
         output = content.get("output", {})
         holder = output if isinstance(output, dict) and "frames" in output else content
         frames = holder.get("frames") or []
-        # The input and the averages describe the run: they are no samples.
+        # The input and the averages describe the whole run and are not samples.
         beside = {k: v for k, v in holder.items() if k not in ("frames", "input", "average")}
         beside.pop("output", None)
     if not all(isinstance(frame, dict) for frame in frames):
@@ -70,7 +70,7 @@ def _split_frames(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
 
 
 def _is_column(value: Any) -> bool:
-    """Two numbers or more, or lists of them."""
+    """True for a list, or nested lists, of at least two numbers."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -79,13 +79,13 @@ def _is_column(value: Any) -> bool:
 
 
 def _units(names: Sequence[str]) -> dict[str, str]:
-    """What the program writes them in, by the last name of a path; a charge's is the one before."""
+    """Units in HallThruster.jl's output, by the last part of each path that is not an index."""
     lasts = {name: [part for part in name.split(".") if not part.isdigit()][-1] for name in names}
     return {name: UNITS[last] for name, last in lasts.items() if last in UNITS}
 
 
 def _channel_m(content: Mapping[str, Any]) -> float | None:
-    """Length of the channel in m, from the input that newer versions keep beside the output."""
+    """Length of the channel in m, from the input that newer versions store with the output."""
     places = ("input", "config", "thruster", "geometry", "channel_length")
     node: Any = content
     for place in places:

@@ -1,4 +1,4 @@
-"""HDF5 of any layout."""
+"""Reader of HDF5 files of any layout."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 UNITS = ("units", "Units", "UNITS", "unit", "Unit", "UNIT")
 
-# Attributes by which NetCDF packs numbers and marks those that are missing; other programs too.
+# Attributes by which NetCDF, and other programs too, pack numbers and mark missing ones.
 PACKING = (*PACKED_BY, "_FillValue", "missing_value")
 
 
 def read_hdf5(path: Path) -> FileSource:
-    """HDF5; a name is the path of a data set, such as "group/n_i".
+    """Read HDF5; a name is the path of a data set, such as "group/n_i".
 
-    Numbers packed by `scale_factor` and `add_offset` are unpacked; those that `_FillValue` marks,
-    and those that were never written, are NaN.
+    Numbers packed by `scale_factor` and `add_offset` are unpacked. Numbers equal to `_FillValue`,
+    and numbers that were never written, are NaN.
     """
     import h5py
 
@@ -53,9 +53,10 @@ def names_in_hdf5(path: Path) -> list[str]:
 
 
 def read_written(found: h5py.Dataset) -> np.ndarray:
-    """The values of a data set; NaN where none were ever written, for HDF5 gives zeros there.
+    """Read the values of a data set, with NaN in blocks that were never written (HDF5 gives zeros).
 
-    Raises ValueError where not one was, and for a null dataspace, which has no place for any.
+    Raises ValueError if nothing was ever written, and for a null dataspace, which cannot hold any
+    values.
     """
     if found.shape is None:
         raise ValueError(f"{found.name!r} is empty: its dataspace is null, and holds no values")
@@ -72,7 +73,7 @@ def read_written(found: h5py.Dataset) -> np.ndarray:
 
 
 def holes_of(found: h5py.Dataset) -> list[tuple[slice, ...]]:
-    """Blocks of a data set of numbers that have no place in the file, since nobody wrote them."""
+    """Blocks of a numeric data set without storage in the file, because they were never written."""
     if not found.size or found.shape == () or found.dtype.kind not in "iuf":
         return []
     if found.chunks is None or not found.id.get_num_chunks():
@@ -91,7 +92,10 @@ def holes_of(found: h5py.Dataset) -> list[tuple[slice, ...]]:
 
 
 def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:
-    """Unit and packing; an attribute that holds nothing says no unit, and no number."""
+    """Unit and packing attributes of a data set.
+
+    An empty attribute means no unit; raises ValueError for an empty packing attribute.
+    """
     said = {key: _plain(found.attrs[key]) for key in (*PACKING, *UNITS) if key in found.attrs}
     attrs = {key: said[key] for key in PACKING if key in said}
     if empty := [key for key, value in attrs.items() if value is None]:
@@ -104,7 +108,7 @@ def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """An attribute as one value; text as such, also where it stands in an array of one.
+    """Convert an attribute, or an array of one element, to a plain value, bytes to text.
 
     None for a null dataspace.
     """

@@ -1,4 +1,4 @@
-"""Readers of MATLAB files, up to v7 and v7.3, and of NumPy's archives."""
+"""Readers of MATLAB files (up to v7, and v7.3) and of NumPy's npz archives."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ V73 = b"MATLAB 7.3"
 
 
 def read_matlab(path: Path) -> FileSource:
-    """MATLAB of either kind; a struct's field is "data.n_i"."""
+    """Read a MATLAB file of either format; a struct's field is named "data.n_i"."""
     with path.open("rb") as file:
         return read_matlab73(path) if file.read(len(V73)) == V73 else read_matlab5(path)
 
 
 def read_matlab73(path: Path) -> FileSource:
-    """MATLAB v7.3, which is HDF5 with axes reversed; a struct's field is "data.n_i"."""
+    """Read MATLAB v7.3, which is HDF5 with reversed axes; a struct's field is named "data.n_i"."""
     import h5py
 
     def read(name: str) -> xr.DataArray:
@@ -36,7 +36,7 @@ def read_matlab73(path: Path) -> FileSource:
 
 
 def read_matlab5(path: Path) -> FileSource:
-    """MATLAB up to v7; a struct's field is "data.n_i"."""
+    """Read MATLAB up to v7; a struct's field is named "data.n_i"."""
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
@@ -55,7 +55,7 @@ MATLAB = Reader("MATLAB (v5, v7.3)", read_matlab, first_bytes=(b"MATLAB 5.0", V7
 
 
 def read_npz(path: Path) -> FileSource:
-    """NumPy arrays saved with `numpy.savez`; pickled objects are refused."""
+    """Read NumPy arrays saved with `numpy.savez`; pickled objects are refused."""
 
     def read(name: str) -> xr.DataArray:
         with np.load(path, allow_pickle=False) as arrays:

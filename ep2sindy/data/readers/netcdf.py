@@ -1,4 +1,4 @@
-"""Readers of NetCDF 3 and 4, and where the samples of the classic format stand in its file."""
+"""Reader of NetCDF 3 and 4, and a check of the classic format's header against its file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import xarray as xr
 from ep2sindy.data.readers.hdf5 import holes_of
 from ep2sindy.data.readers.source import FileSource, Reader, dataset_source
 
-# What the netCDF library reads where nothing was written and no attribute says otherwise; bytes
-# have none. Source: netcdf.h, NC_FILL_SHORT and its kin.
+# Default fill values, which the netCDF library returns for numbers that were never written unless
+# an attribute sets another. Bytes have none. Source: netcdf.h, NC_FILL_SHORT and its kin.
 FILLS = {
     "i2": -32767, "u2": 65535, "i4": -2147483647, "u4": 4294967295,
     "i8": -9223372036854775806, "u8": 18446744073709551614,
@@ -26,13 +26,14 @@ FILLS = {
 
 
 def read_netcdf(path: Path) -> FileSource:
-    """NetCDF 3 and 4, read when asked for; samples that were never written are NaN.
+    """Open NetCDF 3 or 4; values are read when used, and samples never written are NaN.
 
-    Raises ValueError for a classic file whose header does not fit it.
+    Raises ValueError for a classic file whose header does not fit its content. Reading a variable
+    raises ValueError if samples that were never written cannot be told from zeros.
     """
     with path.open("rb") as file:
         head = file.read(4)
-    # The netCDF library fills what a cut classic file lacks with zeros; SciPy raises.
+    # For a truncated classic file the netCDF library fills in zeros, whereas SciPy raises.
     engine: Literal["scipy", "netcdf4"] = "scipy" if head in (b"CDF\x01", b"CDF\x02") else "netcdf4"
     if head.startswith(b"CDF"):
         check_places(path)
@@ -46,10 +47,10 @@ def read_netcdf(path: Path) -> FileSource:
 
 
 def _with_holes(path: Path) -> frozenset[str]:
-    """Variables of which some samples were never written and read as a number like any other.
+    """Variables with samples that were never written but read as ordinary numbers.
 
-    The netCDF library leaves its fill values there; what other programs write through HDF5 reads
-    as zeros.
+    The netCDF library puts fill values there; files that other programs write through HDF5 give
+    zeros.
     """
     import h5py
 
@@ -80,23 +81,23 @@ NETCDF = Reader(
 )
 
 
-# Where the samples of a classic NetCDF file (CDF-1, CDF-2, CDF-5) stand, from its header.
+# Positions of the variables in a classic NetCDF file (CDF-1, CDF-2, CDF-5), from its header.
 #
 # Source: https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html
 
 
-# Bytes of a number by its type: byte, char, short, int, float, double, ubyte to uint64.
+# Bytes per number for each type code: byte, char, short, int, float, double, ubyte to uint64.
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 8, 7: 1, 8: 2, 9: 4, 10: 8, 11: 8}
 
-WIDTHS = {1: (4, 4), 2: (4, 8), 5: (8, 8)}  # by version: bytes of a count, and of a place
+WIDTHS = {1: (4, 4), 2: (4, 8), 5: (8, 8)}  # by version: bytes of a count and of a file offset
 
 BIG_ENDIAN = {4: ">I", 8: ">Q"}
 
 
 def check_places(path: Path) -> None:
-    """Raise ValueError unless every variable has a place of its own, after the header, in the file.
+    """Raise ValueError unless all variables lie inside the file, after its header, without overlap.
 
-    Values have no checksum here, and a damaged place would read as other values.
+    The classic format has no checksums, so a damaged offset would silently read other values.
     """
     with path.open("rb") as file:
         try:
@@ -114,7 +115,7 @@ def check_places(path: Path) -> None:
 
 
 class _Header:
-    """Reads numbers, names and lists one after the other."""
+    """Sequential reader of the numbers, names and lists in a header."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -134,12 +135,12 @@ class _Header:
         return self._number(self.place_bytes)
 
     def count(self) -> int:
-        """Of a list: a tag, then how many."""
+        """Number of items in a list; its tag comes first and is skipped."""
         self.small()
         return self.number()
 
     def skip(self, n_bytes: int) -> None:
-        """Over some bytes, and what fills them up to four."""
+        """Skip some bytes and the padding to a multiple of four."""
         self._file.seek(_pad(n_bytes), 1)
 
     def attributes(self) -> None:
@@ -150,9 +151,13 @@ class _Header:
 
 
 def _blocks(header: _Header) -> list[tuple[int, int]]:
-    """First byte and end of every variable; those with records, of all of these together."""
+    """First byte and end of each block of the file.
+
+    Each variable without records is one block. Variables with records give one block each for the
+    first record, and a common one for all later records.
+    """
     n_records = header.number()
-    if n_records == 256**header.count_bytes - 1:  # its writer did not know: one at least
+    if n_records == 256**header.count_bytes - 1:  # unknown to the writer; assume at least one
         n_records = 1
     lengths = []
     for _ in range(header.count()):
@@ -166,7 +171,7 @@ def _blocks(header: _Header) -> list[tuple[int, int]]:
         shape = [lengths[header.number()] for _ in range(header.number())]
         header.attributes()
         size = SIZES[header.small()]
-        header.number()  # its bytes, which may be too many for this number
+        header.number()  # size in bytes, unused: a large size does not fit this field
         begin = header.place()
         in_records = bool(shape) and shape[0] == 0
         (by_record if in_records else fixed).append((begin, size * prod(shape[in_records:])))

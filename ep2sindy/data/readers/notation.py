@@ -1,4 +1,4 @@
-"""How a table writes its numbers: the decimal sign, and marks between thousands."""
+"""Notation of numbers in a table: decimal sign and thousands separators."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Iterable
 
 _EXPONENT = r"([eEdD][+-]?\d+)?"
 
-# By the decimal sign.
+# Pattern of a number for each decimal sign.
 PLAIN = {
     ".": re.compile(rf"[+-]?(\d+\.?\d*|\.\d+){_EXPONENT}"),
     ",": re.compile(rf"[+-]?\d+(,\d+)?{_EXPONENT}"),
 }
-# `1,000.5`, `1.000,5`, `1 000`. It begins with no zero: 0,123 is a decimal number.
+# Grouped numbers: `1,000.5`, `1.000,5`, `1 000`. None starts with zero: 0,123 is a decimal number.
 GROUPED = {
     decimal: re.compile(
         rf"[+-]?[1-9]\d{{,2}}(?P<mark>[{other}'’ \u00a0\u202f])\d{{3}}(?:(?P=mark)\d{{3}})*"
@@ -27,18 +27,18 @@ def is_number(cell: str, decimal: str) -> bool:
 
 
 def is_grouped(cell: str, decimal: str) -> bool:
-    """Whether a number has marks between its thousands."""
+    """True if a number has thousands separators."""
     return bool(GROUPED[decimal].fullmatch(cell))
 
 
 def remove_grouping(cell: str, decimal: str) -> str:
-    """A number without its marks of thousands."""
+    """Remove the thousands separators from a number."""
     found = GROUPED[decimal].fullmatch(cell)
     return cell.replace(found["mark"], "") if found else cell
 
 
 def decimals_shown(cells: Iterable[str]) -> set[str]:
-    """The decimal signs without which some cell is no number; `1,234` and `1.234` show none."""
+    """Decimal signs that some cell requires to be a number; `1,234` and `1.234` require neither."""
     shown = set()
     for cell in cells:
         if "," in cell or "." in cell:

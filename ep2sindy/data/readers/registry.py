@@ -1,4 +1,4 @@
-"""Every kind of file that can be opened, and which of them a file is."""
+"""List of all readers, and the choice of the reader for a file."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from ep2sindy.data.readers.zarr import ZARR
 from ep2sindy.trust.guard import look_through_first
 from ep2sindy.trust.limits import check_kind
 
-# In any order: no two of them claim a file equally.
+# The order does not matter, since no two readers claim a file equally strongly.
 READERS = (NETCDF, HDF5, MATLAB, NPZ, CSV, HALLTHRUSTER, ZARR)
 
-# Beginnings of what libraries in C read, beside HDF5: MATLAB up to v7, and classic NetCDF of
-# 64-bit sizes.
+# First bytes of files other than HDF5 that C libraries parse: MATLAB up to v7, and classic NetCDF
+# with 64-bit sizes. A damaged one may crash the process.
 IN_C = (b"MATLAB 5.0", b"CDF\x05")
 
 
@@ -34,9 +34,10 @@ def open_source(path: Path) -> FileSource:
 
 
 def reader_of(path: Path, readers: Sequence[Reader] = READERS) -> Reader:
-    """Tell the kind of a file: by its first bytes where they say it, else by its ending.
+    """Choose the reader of a file by its first bytes, or else by its ending.
 
-    Raises ValueError, with the kinds there are, for a file that is missing or of none of them.
+    Raises ValueError for a file that is missing, empty or of no known kind; the last error lists
+    the known kinds.
     """
     if not path.exists():
         raise ValueError(f"no such file: {path.absolute()}")

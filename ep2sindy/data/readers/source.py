@@ -1,4 +1,4 @@
-"""What every reader gives, and what readers share."""
+"""`FileSource`, the common result of all readers, and helpers that readers share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import xarray as xr
 from ep2sindy.data.fields import channel_length_m
 from ep2sindy.trust.limits import ALWAYS, check_declared
 
-# Time stays a number, whatever its attribute `units` says.
+# xarray must keep times as numbers, whatever their attribute `units` says.
 UNDECODED: Any = {"decode_times": False, "decode_timedelta": False}
 
 PACKED_BY = ("scale_factor", "add_offset")
@@ -26,14 +26,14 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 @dataclass(frozen=True)
 class FileSource:
-    """A file opened: the names it holds, and the array of one name.
+    """An open file: the names of its arrays, and a function that reads one of them.
 
-    dims_named: whether the arrays' dimension names are the file's own. aliases: further names that
-    it answers to, such as a column's number. units: name -> unit that all files of the kind have.
-    step_s: of time, where the file says it elsewhere than in an array. channel_m: length of a
-    thruster's channel, where the file says it. words: how it was read, for those who look into it.
-    is_table: whether its arrays are columns. attributes: texts and numbers that are said of the
-    file as a whole.
+    names: names of all arrays. read: reads the array of a name. dims_named: True if the arrays'
+    dimension names come from the file. aliases: further names that can be read, such as a column's
+    number. units: name -> unit, as fixed for all files of this kind. step_s: time step in s, if the
+    file gives it outside its arrays. channel_m: length of the thruster's channel in m, if the file
+    gives it. words: notes on how the file was read, shown on inspection. is_table: True if the
+    arrays are columns of a table. attributes: texts and numbers that describe the whole file.
     """
 
     path: Path
@@ -58,13 +58,13 @@ class FileSource:
 
     @cached_property
     def known(self) -> frozenset[str]:
-        """All that may be read: names, and aliases."""
+        """All names that can be read, aliases included."""
         return frozenset([*self.names, *self.aliases])
 
 
 @dataclass(frozen=True)
 class Look:
-    """What tells a file's kind. head: its first 16 bytes, none of a folder."""
+    """Features that identify a file's kind. head: its first 16 bytes; empty for a folder."""
 
     form: Literal["folder", "hdf5", "other"]
     head: bytes
@@ -75,9 +75,10 @@ class Look:
 class Reader:
     """One kind of file: how it is recognised, and how it is opened.
 
-    first_bytes: beginnings that no other kind has. form, endings: otherwise a folder, HDF5 or any
-    other file with one of these endings; without endings, all of that form which nobody claims by
-    its ending. form None: recognised by its first bytes alone.
+    first_bytes: beginnings that no other kind of file has. form, endings: files without such a
+    beginning are recognised by their form (folder, HDF5 or other) together with one of the
+    endings. A reader without endings takes all files of its form that no other reader claims by
+    their ending. form None: recognised by first bytes alone.
     """
 
     name: str
@@ -87,7 +88,7 @@ class Reader:
     endings: tuple[str, ...] = ()
 
     def claim(self, look: Look) -> int:
-        """How surely the file is of this kind: 3 by its first bytes, 2 its ending, 1 its form."""
+        """Strength of the claim: 3 by first bytes, 2 by ending, 1 by form alone, 0 for none."""
         if look.head.startswith(self.first_bytes):
             return 3
         if look.form != self.form:
@@ -96,7 +97,7 @@ class Reader:
 
 
 def look_at(path: Path) -> Look:
-    """Raises OSError for a file that cannot be read."""
+    """Read the features that identify a file's kind; raises OSError if it cannot be read."""
     ending = path.suffix.lower()
     if path.is_dir():
         return Look("folder", b"", ending)
@@ -106,9 +107,9 @@ def look_at(path: Path) -> Look:
 
 
 def _is_hdf5(path: Path) -> bool:
-    """Whether the signature stands at byte 0, 512 or a double of it, after a block of the user's.
+    """True if the HDF5 signature stands at byte 0, 512, 1024, 2048 and so on.
 
-    Source: HDF5 file format specification 3.0, II.A.
+    A user block may precede it. Source: HDF5 file format specification 3.0, II.A.
     """
     size, place = path.stat().st_size, 0
     with path.open("rb") as file:
@@ -122,10 +123,10 @@ def _is_hdf5(path: Path) -> bool:
 
 @contextmanager
 def damage_named(path: Path) -> Iterator[None]:
-    """Turn what the parsing libraries raise into one error that names the file."""
+    """Turn any error of a parsing library into a ValueError that names the file."""
     try:
         yield
-    except Exception as error:  # of a damaged file a library may raise anything
+    except Exception as error:  # a library may raise anything for a damaged file
         said = str(error).strip().removesuffix(".") or type(error).__name__
         raise ValueError(
             f"{path} cannot be read: {said}; the file may be cut short, or of another kind"
@@ -134,7 +135,7 @@ def damage_named(path: Path) -> Iterator[None]:
 
 @contextmanager
 def file_named(path: Path) -> Iterator[None]:
-    """Let what is wrong with a file's values say which file it was."""
+    """Add the file's name to any ValueError raised within, unless it is already there."""
     try:
         yield
     except ValueError as error:
@@ -144,7 +145,7 @@ def file_named(path: Path) -> Iterator[None]:
 
 
 def check_packing(name: str, attributes: Mapping[str, Any]) -> None:
-    """Raise ValueError for a scale or an offset that turns packed numbers into none."""
+    """Raise ValueError for a packing scale or offset that is not finite, or a scale of zero."""
     for key in PACKED_BY:
         value = np.asarray(attributes.get(key, 1.0))
         is_number = value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value).all()
@@ -157,7 +158,7 @@ def check_packing(name: str, attributes: Mapping[str, Any]) -> None:
 
 
 def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
-    """Variables of a dataset as it is stored, whose dimensions the file names; unpacked here."""
+    """Source of the variables in a dataset as stored; packed numbers are unpacked here."""
     stored = {str(name): dict(variable.attrs) for name, variable in dataset.variables.items()}
     for variable in dataset.variables.values():
         for key in {*PACKED_BY} & {*variable.attrs}:
@@ -172,7 +173,7 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
         array = dataset[name]
         check_declared(repr(name), array.nbytes, path)
         if array.nbytes <= ALWAYS:
-            array.compute()  # damage is told here, with the file's name; the array stays on disk
+            array.compute()  # damage shows here, where the error names the file; result not kept
         return array
 
     said = {str(k): v for k, v in dataset.attrs.items() if isinstance(v, str | int | float)}
@@ -180,9 +181,9 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
 
 
 def leaves(node: Any, path: str = "") -> dict[str, Any]:
-    """Nested dicts and lists of them as {"a.b.0": value}; a list of numbers is one value.
+    """Flatten nested dicts and lists to {"a.b.0": value}; a list of numbers is one value.
 
-    Raises ValueError for two values of one such name, as {"a.b": 1, "a": {"b": 2}} has.
+    Raises ValueError if two values get the same name, as in {"a.b": 1, "a": {"b": 2}}.
     """
     pairs = list(_leaves(node, path))
     found = dict(pairs)

@@ -1,6 +1,6 @@
-"""How a text file holds its table: separator, decimal sign, preamble, and a header.
+"""Layout of a table in a text file: separator, decimal sign, preamble and header.
 
-The header stands above the rows and gives names and units of the columns.
+The header stands above the rows and gives the names and units of the columns.
 """
 
 from __future__ import annotations
@@ -18,22 +18,24 @@ SEPARATORS = (",", ";", "\t", "|", None)  # None: blanks
 COMMENTS = ("#", "%", "//", "!")
 PARTED = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "blanks"}
 
-# A missing sample, as programs write it.
+# Notations for a missing sample.
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "inf", "-inf"})
 
-# A line that is drawn under names.
+# A ruled line below names.
 RULE = re.compile(r"[\s|+,;]*[-=_]{2,}[-=_\s|+,;]*")
 
-# Lines at the end of what is looked at, which say what a row is like: no more than a quarter of it,
-# for a preamble may be longer than the rows.
+# Number of lines, at the end of those examined, from which the form of a row is found. No more than
+# a quarter of the lines is used, since a preamble may be longer than the rows.
 N_JUDGED = 40
 
 
 @dataclass(frozen=True)
 class Layout:
-    """separator: None for blanks. first: the line of the first row, from 0. columns: of numbers.
+    """Layout of a table in a text file.
 
-    has_marks: whether thousands are parted, as in 1,000.5. left_out: names of all other columns.
+    separator: None for blanks. decimal: decimal sign. first: line of the first row, from 0.
+    columns: indices of the columns that hold numbers. has_marks: True if numbers have thousands
+    separators, as in 1,000.5. left_out: names of the other columns, unless these are empty.
     """
 
     separator: str | None
@@ -46,7 +48,7 @@ class Layout:
 
     @property
     def words(self) -> str:
-        """What was taken for what, for those who look into the file."""
+        """Description of the layout, shown when the file is inspected."""
         n_columns = len(self.columns)
         parts = [f"{n_columns} column{'s' * (n_columns > 1)} of numbers"]
         parts[0] += f" between {PARTED[self.separator]}" if n_columns > 1 else ""
@@ -58,11 +60,11 @@ class Layout:
 
 
 def layout_of(lines: Sequence[str]) -> Layout:
-    """The table in the first lines of a file.
+    """Find the layout of the table in the first lines of a file.
 
-    What a row is like is told by the last of them, for what stands above may be anything.
-    Raises ValueError for lines without a row of numbers, for one among the rows that is none, for
-    numbers that may be read in two ways, and for a header that does not name the columns.
+    The form of a row is found from the last of these lines, since the lines above may be anything.
+    Raises ValueError if there is no row of numbers, if a line among the rows is not a row, if
+    numbers can be read in two ways, or if the header does not name the columns.
     """
     rows = [line for line in lines if line.strip() and not is_comment(line)]
     last = rows[-max(2, min(N_JUDGED, len(rows) // 4)) :]
@@ -111,12 +113,12 @@ def _is_rule(line: str) -> bool:
 
 
 def without_mark(line: str) -> str:
-    """A line without the mark of a comment: headers of many programs stand in one."""
+    """Remove the comment mark from a line: many programs write their header as a comment."""
     return line.strip().lstrip("#%!/").strip() if is_comment(line) else line
 
 
 def _trim(cells: list[str]) -> list[str]:
-    """Without the empty cells at the end, which a separator there makes."""
+    """Remove the empty cells at the end, which trailing separators cause."""
     while cells and not cells[-1]:
         cells = cells[:-1]
     return cells
@@ -125,7 +127,10 @@ def _trim(cells: list[str]) -> list[str]:
 def _rate_separator(
     rows: Sequence[str], separator: str | None, decimal: str
 ) -> tuple[float, int, tuple[int, ...]]:
-    """Share of the cells that are numbers, number of columns of numbers, and which they are."""
+    """Share of cells that are numbers, number of numeric columns, and their indices.
+
+    The share is 0 if there is no numeric column. Missing samples are not counted as cells.
+    """
     table = [split(row, separator) for row in rows]
     width = max((len(cells) for cells in table), default=0)
     n_numbers, n_cells, columns = 0, 0, []
@@ -133,14 +138,17 @@ def _rate_separator(
         cells = [cells[j] for cells in table if j < len(cells) and not _is_missing(cells[j])]
         numbers = [is_number(cell, decimal) for cell in cells]
         n_numbers, n_cells = n_numbers + sum(numbers), n_cells + len(cells)
-        # A cell or two that are no number are a fault of those lines, not another kind of column.
+        # A few cells that are not numbers are faults in those lines; the column is still numeric.
         if sum(numbers) > 0.5 * len(numbers) and len(numbers) > 0.25 * len(table):
             columns.append(j)
     return n_numbers / max(n_cells, 1) if columns else 0.0, len(columns), tuple(columns)
 
 
 def _decimal(cells: Sequence[str], separator: str | None, judged: str) -> str:
-    """The decimal sign; judged: that of the last rows, which decides where both are shown."""
+    """Decimal sign of the table.
+
+    judged: sign found from the last rows, which decides if the cells show both signs.
+    """
     shown = decimals_shown(cells)
     if len(shown) == 1:
         return shown.pop()
@@ -160,7 +168,7 @@ def _is_missing(cell: str) -> bool:
 def _first_row(
     lines: Sequence[str], columns: Sequence[int], separator: str | None, decimal: str
 ) -> int:
-    """The line of the first row; raises ValueError where rows stand above one that is none."""
+    """Line of the first row; raises ValueError if a line among the rows is not a row."""
     table = [split(line, separator) for line in lines]
     is_row = [_is_row(cells, columns, decimal) for cells in table]
     is_blank = [not line.strip() or is_comment(line) or _is_rule(line) for line in lines]
@@ -182,7 +190,10 @@ def _first_row(
 
 
 def _is_row(cells: Sequence[str], columns: Sequence[int], decimal: str) -> bool:
-    """Numbers, or words for missing ones; a word, where there are no numbers and columns beside."""
+    """True if all numeric columns hold numbers or notations for missing samples.
+
+    At least one cell must be a number, or, in a table of several columns, a word such as `nan`.
+    """
     at = [cells[j] if j < len(cells) else "" for j in columns]
     numbers = [is_number(cell, decimal) for cell in at]
     said = any(numbers) or (len(columns) > 1 and any(cell.strip("-") for cell in at))
@@ -192,7 +203,10 @@ def _is_row(cells: Sequence[str], columns: Sequence[int], decimal: str) -> bool:
 def _check_width(
     above: Sequence[Line], below: Sequence[Sequence[str]], separator: str | None
 ) -> None:
-    """Raise ValueError for one name above what may be one column of decimal commas, or two."""
+    """Raise ValueError for a single name above rows such as `1,5`.
+
+    Such rows may be one column with decimal commas, or two columns.
+    """
     whole = all(len(row) == 2 and row[1].isdecimal() for row in below)
     if separator == "," and whole and above and above[-1].is_word:
         raise ValueError(
@@ -203,7 +217,7 @@ def _check_width(
 
 
 def _check_text(cells: Sequence[str], name: str, decimal: str) -> None:
-    """Raise ValueError for a column of numbers that are written in another way than the others."""
+    """Raise ValueError for a column whose numbers use another decimal sign than the table."""
     other = "," if decimal == "." else "."
     strange = [cell for cell in cells if is_number(cell, other) and not is_number(cell, decimal)]
     if len(strange) > 0.5 * sum(not _is_missing(cell) for cell in cells):
@@ -216,20 +230,20 @@ def _check_text(cells: Sequence[str], name: str, decimal: str) -> None:
 # Names and units of a table's columns, from the lines above its rows.
 
 
-# `Time (s)`, `CH1 [V]`, `I/A`.
+# Names with a unit: `Time (s)`, `CH1 [V]`, `I/A`.
 WITH_UNIT = (re.compile(r"(.*\S)\s*[\(\[](.+)[\)\]]"), re.compile(r"(.*\S)\s*/\s*(\S+)"))
 
 TIMES = frozenset({"time", "t", "x-axis", "x"})
 
-# Units of time that are hardly anything else: `a,b` may be years and barns.
+# Units of time that are unlikely to be names; `a,b` could be years and barns.
 SECONDS = frozenset({"s", "ms", "us", "µs", "μs", "ns", "sec", "second", "seconds"})
 
-# What stands in a line of units for what has none.
+# Entries for "no unit" in a line of units.
 NO_UNIT = frozenset({"", "-", "--", "1", "a.u.", "arb", "arb.", "counts", "none", "n/a"})
 
 NUMBER = re.compile(r"[+-]?[\d.,]+([eE][+-]?\d+)?")
 
-# In a preamble, before the time step in s.
+# Labels of the time step in s in a preamble.
 STEP = re.compile(
     r"(horizontal )?(sampl\w* (interval|period|time)|time (step|interval)|dt)\b.*", re.I
 )
@@ -237,9 +251,10 @@ STEP = re.compile(
 
 @dataclass(frozen=True)
 class Header:
-    """names: of the columns, their numbers where none are given; units: "" where none.
+    """Names and units of a table's columns.
 
-    step_s: of time, where a preamble says it.
+    names: column numbers if the file gives no names. units: "" for a column without one.
+    step_s: time step in s, if a preamble gives it.
     """
 
     names: tuple[str, ...]
@@ -249,7 +264,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Line:
-    """The cells of a line above the rows. number: in the file, from 1."""
+    """Cells of a line above the rows. number: line number in the file, from 1."""
 
     number: int
     cells: Sequence[str]
@@ -264,7 +279,10 @@ class Line:
         return any(NUMBER.fullmatch(cell) for cell in self.cells)
 
     def may_be_names(self, n_columns: int) -> bool:
-        """As many words as columns; a line of several words is no single name."""
+        """True if the line has as many words as there are columns, and no numbers.
+
+        A line of several words does not count as the name of a single column.
+        """
         fits = len(self.cells) == n_columns and (n_columns > 1 or self.is_word)
         return fits and not self.is_comment and not self.has_numbers
 
@@ -274,10 +292,10 @@ class Line:
 
 
 def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
-    """From the lines above the rows.
+    """Find the header in the lines above the rows.
 
-    strict: a last line of several cells is a header, so that its number must be right.
-    Raises ValueError where it is not, and where it may be a row with a word in it.
+    strict: a last line of several cells is taken as a header, so it must name every column.
+    Raises ValueError if it does not, or if the last line could be a row with a word in it.
     """
     cells = [line.cells for line in above]
     step_s = _step_s(cells)
@@ -305,9 +323,11 @@ def header_of(above: Sequence[Line], n_columns: int, *, strict: bool) -> Header:
 
 
 def _check_names(above: Sequence[Line], n_columns: int) -> None:
-    """Raise ValueError for a last line that may be a row, or less than the names above it.
+    """Raise ValueError if the last line above the rows might not be the column names.
 
-    Names for time leave no doubt, nor do comments; a preamble may have lines as long as its names.
+    It may be a faulty row, or follow a line that looks like names as well. A line that begins with
+    a name for time, or is a comment, is accepted. A line of a longer preamble may happen to have as
+    many cells as there are columns, and is no reason for doubt.
     """
     last, before = above[-1], above[-2] if len(above) > 1 else None
     if last.begins_with_time or last.is_comment:
@@ -328,7 +348,7 @@ def _check_names(above: Sequence[Line], n_columns: int) -> None:
 
 
 def _step_s(above: Sequence[Sequence[str]]) -> float | None:
-    """What a preamble says of the time step."""
+    """Time step in s from a preamble, or None."""
     for cells in above:
         if len(cells) > 1 and STEP.fullmatch(cells[0]) and NUMBER.fullmatch(cells[1]):
             return float(cells[1].replace(",", "."))
@@ -336,7 +356,7 @@ def _step_s(above: Sequence[Sequence[str]]) -> float | None:
 
 
 def _split_name(name: str) -> tuple[str, str]:
-    """A name and its unit; a text in brackets that is no unit stays with the name."""
+    """Split a name and its unit; a text in brackets that is not a unit stays in the name."""
     for pattern in WITH_UNIT:
         found = pattern.fullmatch(name)
         if found and unit_like(_plain(found[2])):
@@ -345,21 +365,22 @@ def _split_name(name: str) -> tuple[str, str]:
 
 
 def _plain(unit: str) -> str:
-    """`Volt` and `μs` as `volt` and `us`."""
+    """Normalise a unit: `Volt` and `μs` become `volt` and `us`."""
     unit = unit.strip().replace("µ", "u").replace("μ", "u")
     return unit if unit_like(unit) or not unit_like(unit.lower()) else unit.lower()
 
 
 def _unit(cell: str) -> str:
-    """Of a line of units."""
+    """Unit in a cell of a line of units; "" for no unit."""
     unit = cell.strip("()[] ")
     return "" if unit.lower() in NO_UNIT else unit
 
 
 def _are_units(cells: Sequence[str], names: Sequence[str]) -> bool:
-    """A line of units below the names: in brackets, or beginning with one of time.
+    """True if cells are a line of units below the names.
 
-    `t,V` alone could be names or tonnes and volts.
+    The units must stand in brackets, or begin with a unit of time; `t,V` alone could be names or
+    tonnes and volts.
     """
     if len(cells) > len(names) or not cells:
         return False
@@ -375,7 +396,11 @@ def _are_units(cells: Sequence[str], names: Sequence[str]) -> bool:
 
 
 def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | None:
-    """Rigol's: samples are counted, and the last cells of two lines say their start and step."""
+    """Header of a Rigol oscilloscope, or None.
+
+    Its first column numbers the samples. The last cells of its two header lines give the start and
+    the increment of time.
+    """
     for k, cells in enumerate(above):
         words = [cell.lower() for cell in cells]
         if "increment" in words and k + 1 < len(above) and len(words) > n_columns:
@@ -386,9 +411,9 @@ def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | No
 
 
 def _unique(names: Sequence[str]) -> tuple[str, ...]:
-    """Names that come more than once get numbers: x.0, x.1; none is taken for x itself.
+    """Number names that occur more than once: x.0, x.1; no column keeps the name x.
 
-    Raises ValueError where such a name is there already.
+    Raises ValueError if a numbered name already exists.
     """
     names = [name or str(k) for k, name in enumerate(names)]
     counts, met = Counter(names), Counter[str]()

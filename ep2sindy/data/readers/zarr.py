@@ -1,4 +1,4 @@
-"""Zarr stores."""
+"""Reader of Zarr stores."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import xarray as xr
 from ep2sindy.data.readers.source import FileSource, Reader, dataset_source
 from ep2sindy.runtime.files import read_json
 
-# Compressors and filters that turn bytes into bytes or numbers. Others may make objects of them,
-# which can run code (pickle), and a codec that is registered by name may do anything.
+# Allowed compressors and filters, which turn bytes into bytes or numbers. Others may create objects
+# that can run code (pickle), and a codec registered by name may do anything.
 _NAMES = """
 blosc zlib gzip zstd lz4 bz2 lzma shuffle delta fixedscaleoffset quantize bitround packbits astype
 crc32 crc32c adler32 fletcher32 jenkins_lookup3
@@ -26,10 +26,10 @@ LARGEST_METADATA = 10_000_000  # bytes
 
 
 def read_zarr(path: Path) -> FileSource:
-    """Zarr store in a folder, with named dimensions as xarray writes it; read when asked for.
+    """Open a Zarr store in a folder, with named dimensions as xarray writes it.
 
-    Raises ValueError for an array of objects or with a codec that is not on the list, before
-    anything is decoded.
+    Values are read when they are used. Raises ValueError, before anything is decoded, for an array
+    of objects or an array with a codec that is not on the list of allowed ones.
     """
     check_store(path)
     return dataset_source(
@@ -38,7 +38,10 @@ def read_zarr(path: Path) -> FileSource:
 
 
 def check_store(path: Path) -> None:
-    """Hold every array of a store to numbers and text, by what its metadata say, and to files."""
+    """Raise ValueError unless a store consists of plain files and its arrays of numbers or text.
+
+    Only the metadata are read.
+    """
     for each in path.rglob("*"):
         if each.is_symlink() or not (each.is_file() or each.is_dir()):
             raise ValueError(f"{each.relative_to(path)} is a link, a pipe or a device, and no file")
@@ -61,7 +64,7 @@ def _metadata(place: Path) -> dict[str, Any]:
 
 
 def _check_array(place: Path, metadata: dict[str, Any]) -> None:
-    """Of one array, or of a group, which names neither type nor codec."""
+    """Check the metadata of one array, or of a group, which has neither type nor codecs."""
     sizes, chunks = _list(metadata, "shape"), _list(metadata, "chunks")
     wrong = [n for n in (*sizes, *chunks) if n is not None and not (type(n) is int and n >= 0)]
     if wrong or 0 in chunks:
@@ -83,7 +86,7 @@ def _check_array(place: Path, metadata: dict[str, Any]) -> None:
 
 
 def _codecs(metadata: dict[str, Any]) -> Iterator[str]:
-    """Names of all codecs of an array, those inside shards too, of both formats."""
+    """Names of all codecs of an array in either Zarr format, including those inside shards."""
     listed = [metadata.get("compressor"), *_list(metadata, "filters"), *_list(metadata, "codecs")]
     listed += [*_list(metadata, "index_codecs"), *_list(metadata, "storage_transformers")]
     for codec in listed:
