@@ -1,4 +1,4 @@
-"""The library: candidate terms, their names and units, and how equations are written."""
+"""Library of candidate terms: their names, functions and units, and the notation of equations."""
 
 from ep2sindy._stubs import attach
 

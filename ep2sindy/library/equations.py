@@ -1,4 +1,4 @@
-"""How equations are written: text, LaTeX, HTML, sympy."""
+"""Notation of equations: text, LaTeX, HTML, sympy."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 def latex_name(variable: str) -> str:
-    """`n_i` -> `n_{i}`, `T_e_eV` -> `T_{e,eV}`, `<n_i*n_n>` -> the average in angle brackets.
+    """LaTeX of a variable: `n_i` -> `n_{i}`, `T_e_eV` -> `T_{e,eV}`.
 
-    Words stand upright: in italics they would read as products of their letters.
+    An average `<n_i*n_n>` stands in angle brackets. Words are set upright: in italics they would
+    read as products of their letters.
     """
     if variable.startswith("<"):
         return rf"\langle {latex_term_name(variable[1:-1])} \rangle"
@@ -33,7 +34,10 @@ def latex_name(variable: str) -> str:
 
 
 def latex_derivative(state: str) -> str:
-    r"""`n_i` -> `\dot{n}_{i}`: the dot belongs on the stem; over a word it would be lost: `x'`."""
+    r"""LaTeX of a time derivative: `n_i` -> `\dot{n}_{i}`, with the dot on the stem.
+
+    A stem of several letters gets a prime, since a dot over a word would be overlooked.
+    """
     stem, index, rest = latex_name(state).partition("_")
     if stem.startswith(r"\mathrm"):
         return f"{latex_name(state)}'"
@@ -41,7 +45,10 @@ def latex_derivative(state: str) -> str:
 
 
 def latex_term_name(name: str) -> str:
-    r"""`n_i^2*n_n` -> `n_{i}^{2} \, n_{n}`, `x*sin(y)/z` -> `\frac{x \, \sin(y)}{z}`."""
+    r"""LaTeX of a term: `n_i^2*n_n` -> `n_{i}^{2} \, n_{n}`.
+
+    Quotients become fractions: `x*sin(y)/z` -> `\frac{x \, \sin(y)}{z}`.
+    """
     above, below = _sides(name)
     over, under = (
         r" \, ".join(_latex_factor(p) + _latex_power(p) for p in side) for side in (above, below)
@@ -69,14 +76,17 @@ def _latex_power(part: Part) -> str:
 
 
 def equation_text(state: str, terms: Mapping[str, float], *, digits: int = 3) -> str:
-    """`n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
+    """Equation as text: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
     return f"{state}' = {' '.join(equation_parts(terms, digits=digits)) or '0'}"
 
 
 def equation_parts(
     terms: Mapping[str, float], *, digits: int = 3, reach: Mapping[str, float] = NOTHING
 ) -> list[str]:
-    """Term by term, as `+ 5.48e-14 n_i n_n`; reach: `+ 5.48e-14 (±2e-16) n_i n_n`, by name."""
+    """Terms of an equation as texts such as `+ 5.48e-14 n_i n_n`.
+
+    reach: half-width of the confidence interval by term name; adds it as `(±2e-16)`.
+    """
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "-" if coef < 0 else "+" if k else ""
@@ -88,7 +98,7 @@ def equation_parts(
 
 
 def sum_latex(terms: Mapping[str, float], *, digits: int = 3) -> str:
-    r"""The right-hand side of an equation: `- 2.62 \cdot 10^{5} \, n_{i} + ...`."""
+    r"""LaTeX of the right-hand side of an equation: `- 2.62 \cdot 10^{5} \, n_{i} + ...`."""
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "-" if coef < 0 else "+" if k else ""
@@ -100,7 +110,7 @@ def sum_latex(terms: Mapping[str, float], *, digits: int = 3) -> str:
 
 
 def equations_latex(equations: Mapping[str, Mapping[str, float]], *, digits: int = 3) -> str:
-    """An `aligned` block with one equation per line, from terms by state."""
+    """LaTeX `aligned` block with one equation per line. equations: state -> terms."""
     lines = (
         f"{latex_derivative(state)} &= {sum_latex(terms, digits=digits)}"
         for state, terms in equations.items()
@@ -115,7 +125,10 @@ def equation_html(
     digits: int = 3,
     reach: Mapping[str, float] = NOTHING,
 ) -> str:
-    """One equation with sub- and superscripts, in HTML; reach: half an interval, by name."""
+    """HTML of one equation, with sub- and superscripts.
+
+    reach: half-width of the confidence interval by term name.
+    """
     parts = []
     for k, (name, coef) in enumerate(terms.items()):
         sign = "&minus;" if coef < 0 else "+" if k else ""
@@ -128,11 +141,11 @@ def equation_html(
 
 
 def sum_sympy(terms: Mapping[str, float]) -> sympy.Expr:
-    """The right-hand side of an equation as a sympy expression, coefficients as floats.
+    """Right-hand side of an equation as a sympy expression, with coefficients as floats.
 
-    A function of a user's own is one that sympy knows by name alone.
+    A user's own function becomes an undefined sympy function of the same name.
     """
-    import sympy  # half a second that most runs do not need
+    import sympy  # imported here because it takes half a second and most runs do not need it
 
     return sympy.Add(
         *(
@@ -164,7 +177,7 @@ def _sympy_number(value: float) -> sympy.Expr:
 
 
 def _number(coef: float, digits: int) -> tuple[str, int | None]:
-    """Mantissa without its sign, and the power of ten where one is written."""
+    """Absolute mantissa, and the power of ten, or None if the number needs no exponent."""
     mantissa, _, exponent = f"{abs(coef):.{digits}g}".partition("e")
     return mantissa, int(exponent) if exponent else None
 
@@ -175,7 +188,7 @@ def _number_html(coef: float, digits: int) -> str:
 
 
 def _parts(name: str) -> list[Part]:
-    """Factors and powers; a name that is no term stands as it is."""
+    """Factors and powers of a term; a name that cannot be read as a term is kept as it is."""
     try:
         return split_term(name)
     except ValueError:
@@ -183,7 +196,7 @@ def _parts(name: str) -> list[Part]:
 
 
 def _sides(name: str) -> tuple[list[Part], list[Part]]:
-    """What stands above and below the fraction line."""
+    """Factors above and below the fraction line."""
     parts = _parts(name)
     below = [part for part in parts if part.function == RECIPROCAL]
     return [part for part in parts if part.function != RECIPROCAL], below
@@ -213,6 +226,6 @@ def _variable_html(variable: str) -> str:
 
 
 def _is_greek(stem: str) -> bool:
-    """Small letters that LaTeX, matplotlib and HTML call by the same name."""
+    """True for small Greek letters that LaTeX, matplotlib and HTML call by the same name."""
     alpha_to_omega = 0x3B1 <= name2codepoint.get(stem, 0) <= 0x3C9
     return alpha_to_omega and stem not in ("omicron", "sigmaf")

@@ -1,6 +1,7 @@
-"""Functions of one variable, as factors of terms: those that are known by name, and a user's own.
+"""Functions of one variable as factors of terms: built-in functions, and a user's own.
 
-A function takes the number of its variable in SI: log(n_i) of n_i in m^-3 is log(n_i / 1 m^-3).
+A function acts on the number of its variable in SI: with n_i in m^-3, log(n_i) means
+log(n_i / 1 m^-3).
 """
 
 from __future__ import annotations
@@ -22,19 +23,21 @@ Values = Callable[[Any], Any]
 Interval = tuple[float, float]
 
 REAL_LINE: tuple[Interval, ...] = ((-np.inf, np.inf),)
-LARGEST_EXPONENT = 709.0  # of e, in float64
+LARGEST_EXPONENT = 709.0  # largest argument of exp in float64
 
 
 class UnknownFunctionError(ValueError):
-    """A function that a term names, and that nobody has registered."""
+    """A term names a function that is neither built in nor registered."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What a name stands for: a function and its derivative, element by element.
+    """A named function and its derivative, both evaluated element by element.
 
-    domain: open intervals in which both are finite; a trajectory stays in one of them. degree: p
-    where f(s x) = s^p f(x) for positive s, None for others. own: a user's, of NumPy arrays alone.
+    value, slope: the function f and its derivative f'. domain: open intervals in which both are
+    finite; a trajectory must stay in one of them. degree: p for a homogeneous function,
+    f(s x) = s^p f(x) for positive s; None for others. own: True for a user's function, which takes
+    NumPy arrays only.
     """
 
     name: str
@@ -45,7 +48,7 @@ class Kind:
     own: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """By name; a user's function brings its registration to another process."""
+        """Pickle by name; a user's function is registered again in the receiving process."""
         if not self.own:
             return _built_in, (self.name,)
         return _register_received, (self.name, self.value, self.slope, self.domain)
@@ -53,7 +56,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Function:
-    """A factor of terms: f(shift + scale * variable), or where it is a slope, f' of that."""
+    """A factor of terms: f(shift + scale * variable), or f' of that argument if `is_slope`."""
 
     kind: Kind
     variable: str
@@ -63,7 +66,10 @@ class Function:
 
     @property
     def name(self) -> str:
-        """`sin(2*x)`, `1/(0.5+x)`, as it is read back; a slope, which no user names, has a '."""
+        """Name such as `sin(2*x)` or `1/(0.5+x)`, as terms are read; slopes end in '.
+
+        Users never name a slope.
+        """
         text = Part(self.kind.name, self.variable, self.scale, self.shift).text
         return f"{text}'" if self.is_slope else text
 
@@ -74,7 +80,7 @@ class Function:
         return (self.kind.slope if self.is_slope else self.kind.value)(argument)
 
     def at(self, x: float) -> float:
-        """At one value of the variable; NaN or infinite outside the domain."""
+        """Value at one number of the variable; NaN or infinite outside the domain."""
         with np.errstate(all="ignore"):
             return float(self.value(np.array([x]))[0])
 
@@ -89,19 +95,22 @@ class Function:
         return scale**power, replace(self, shift=self.shift / scale)
 
     def unit(self, unit: str) -> str:
-        """That of a pure number where the function has no degree."""
+        """Unit of the function for a variable in `unit`; "1" if the function has no degree."""
         return unit_product([(unit, self.kind.degree or 0)])
 
     def interval(self, x: float) -> Interval | None:
-        """The part of the domain, in the argument, that a value of the variable is in."""
+        """Interval of the domain, in terms of the argument, that holds a value of the variable."""
         argument = self.scale * x + self.shift
         return next(((low, high) for low, high in self.kind.domain if low < argument < high), None)
 
     def misplaced(
         self, x: Float[np.ndarray, " samples"], beside: Float[np.ndarray, " _"]
     ) -> Bool[np.ndarray, " samples"]:
-        """Values of the variable that are not in one interval of the domain with others, or where
-        f or f' is not finite."""
+        """Mask of the values x of the variable at which the function cannot be used.
+
+        These values do not lie in the same interval of the domain as `beside`, or give an f or f'
+        that is not finite.
+        """
         here, there = (self.scale * values + self.shift for values in (x, beside))
         wrong = np.ones(x.shape, dtype=np.bool_)
         for low, high in self.kind.domain:
@@ -112,12 +121,12 @@ class Function:
 
     @property
     def has_poles(self) -> bool:
-        """Whether the domain is of several intervals."""
+        """True if the domain consists of several intervals."""
         return len(self.kind.domain) > 1
 
     @property
     def need(self) -> str:
-        """What must hold, in words: `x > 0`."""
+        """Condition on the variable, in words: `x > 0`."""
         argument = Part("", self.variable, self.scale, self.shift).argument
         if self.has_poles:
             ends = ", ".join(number_text(high) for _, high in self.kind.domain[:-1])
@@ -132,7 +141,7 @@ class Function:
         return self.scale == 1.0 and self.shift == 0.0
 
     def _bridged(self, argument: Any) -> Any:
-        """A user's NumPy function of a torch tensor, which follows its gradient by the slope."""
+        """Apply a user's NumPy function to a torch tensor; its slope provides the gradient."""
         at = argument.detach()
         numbers = at.cpu().numpy()
         found = self.kind.slope if self.is_slope else self.kind.value
@@ -175,19 +184,19 @@ _BUILT_IN = (
     Kind(RECIPROCAL, _reciprocal, _negative_square, _POLE, degree=-1.0),
 )
 _kinds = {kind.name: kind for kind in _BUILT_IN}  # register_function adds to it
-INVERSE = "inverse"  # what the reciprocal of every variable is called
+INVERSE = "inverse"  # name that asks for the reciprocal of every variable
 
 
 def function_names() -> list[str]:
-    """The functions that terms may name, in the order of their registration."""
+    """Names of all functions that terms may use, in the order of registration."""
     return [INVERSE if name == RECIPROCAL else name for name in _kinds]
 
 
 def function_of(part: Part) -> Function:
-    """The factor that a part of a term's name stands for.
+    """Function that a part of a term's name stands for.
 
-    Raises UnknownFunctionError with the functions that there are, and ValueError for a factor of
-    zero.
+    Raises UnknownFunctionError, listing the known functions; ValueError if the variable is
+    multiplied by zero, or a number is not finite.
     """
     name = RECIPROCAL if part.function == INVERSE else part.function
     if name not in _kinds:
@@ -205,14 +214,14 @@ def function_of(part: Part) -> Function:
 def register_function(
     name: str, value: Values, derivative: Values, *, domain: Interval = (-np.inf, np.inf)
 ) -> None:
-    """Let terms name a function of your own, as in `tanh(x)` or `tanh(2*x)`.
+    """Register a function of your own, so that terms can use it: `tanh(x)` or `tanh(2*x)`.
 
-    value, derivative: take a NumPy array and return one of its shape, element by element; nothing
-    else is needed, also for PyTorch. domain: an open interval in which both are finite.
-    Models store the name alone, so register before you load one. Registered again, a name means
-    the new function from then on.
-    Raises ValueError for a name that is no plain word or that is built in, a domain that is no
-    interval, values of another shape or not finite, or a derivative that is not that of the value.
+    value, derivative: take a NumPy array and return an array of the same shape, element by element;
+    PyTorch needs nothing more. domain: an open interval in which both are finite.
+    Models store only the name, so register the function before you load one. Registering a name
+    again replaces the function from then on.
+    Raises ValueError for a name that is not a plain word or is built in, a domain that is not an
+    interval, values of another shape or not finite, or a wrong derivative.
 
     >>> ep.register_function("tanh", np.tanh, lambda x: 1.0 - np.tanh(x) ** 2)
     >>> ep.polynomial(["x"], degree=1, functions=["tanh"]).names
@@ -232,7 +241,7 @@ def register_function(
 def _check_derivative(
     name: str, value: Values, derivative: Values, low: float, high: float
 ) -> None:
-    """Hold a derivative to central differences at a few points of the domain."""
+    """Compare a derivative with central differences at a few points of the domain."""
     points = _points(low, high)
     step = 1e-5 * np.minimum(1.0, np.minimum(points - low, high - points))
     try:
@@ -263,7 +272,7 @@ def _check_derivative(
 
 
 def _points(low: float, high: float) -> Float[np.ndarray, " points"]:
-    """Some places of an interval."""
+    """A few points inside an interval."""
     if np.isfinite(low) and np.isfinite(high):
         return low + (high - low) * np.array([0.21, 0.47, 0.83])
     away = np.array([0.37, 1.13, 2.71])
@@ -279,5 +288,5 @@ def _built_in(name: str) -> Kind:
 def _register_received(
     name: str, value: Values, slope: Values, domain: tuple[Interval, ...]
 ) -> Kind:
-    """A user's function that came from another process: registered here, unless it is already."""
+    """Register a user's function received from another process, unless it is known already."""
     return _kinds.setdefault(name, Kind(name, value, slope, domain, own=True))

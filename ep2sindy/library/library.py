@@ -1,4 +1,4 @@
-"""The library of candidate terms: how it is built, evaluated, scaled, and shown on a screen."""
+"""The library of candidate terms: construction, evaluation, scaling, derivatives and display."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Library:
     """Ordered candidate terms, each a product of powers of `variables` and of `functions` of them.
 
     exponents: (terms, variables then functions), non-negative integers; a row of zeros is the
-    constant. functions: the factors that are not variables; none makes every term a monomial.
-    Term names read `1`, `n_i`, `n_i*n_n`, `n_i^2`, factors in the order of `variables`.
-    Raises ValueError for repeated variables or terms, a variable that is no word, or no term.
+    constant. functions: the factors that are not variables; without them every term is a monomial.
+    Term names read `1`, `n_i`, `n_i*n_n`, `n_i^2`, with factors in the order of `variables`.
+    Raises ValueError for repeated variables or terms, an invalid variable name, or no term.
     """
 
     variables: Sequence[str]
@@ -63,7 +63,7 @@ class Library:
         return len(self.exponents)
 
     def __add__(self, other: Library) -> Library:
-        """Terms of both libraries over the same variables, each once, in order."""
+        """Join two libraries over the same variables; each term appears once, in order."""
         if other.variables != self.variables:
             raise ValueError(
                 f"libraries to be joined must share their variables: {list(self.variables)} "
@@ -90,7 +90,10 @@ class Library:
 
     @cached_property
     def table(self) -> Int[np.ndarray, "terms degree"]:
-        """Which columns each term multiplies, of the variables, a one, then the functions."""
+        """Indices of the columns that each term multiplies: variables, a one, then functions.
+
+        The one fills up rows of terms with fewer factors.
+        """
         n = len(self.variables)
         columns = np.delete(np.arange(self.exponents.shape[1] + 1), n)
         table = np.full((len(self), max(1, int(self.degrees.max()))), n)
@@ -115,7 +118,7 @@ class Library:
         return self._places[term]
 
     def places(self, other: Library) -> list[int]:
-        """Where the terms of another library over these variables stand in this one."""
+        """Positions in this library of the terms of another one over the same variables."""
         return [self._places[term] for term in other.terms]
 
     def units(self, units: Mapping[str, str]) -> tuple[str, ...]:
@@ -123,14 +126,14 @@ class Library:
         return tuple(term.unit(units) for term in self.terms)
 
     def take(self, rows: np.ndarray) -> Library:
-        """Some of the terms, by position or by mask, and the functions that they need."""
+        """Sub-library of some terms, by position or mask, with only the functions they need."""
         n, exponents = len(self.variables), self.exponents[rows]
         used = np.flatnonzero(exponents[:, n:].any(axis=0))
         kept, functions = [*range(n), *(n + used)], [self.functions[k] for k in used.tolist()]
         return Library(self.variables, exponents[:, kept], functions)
 
     def over(self, variables: Sequence[str]) -> Library:
-        """The same terms over other variables, in their order, among them all that are used."""
+        """The same terms over other variables, which must include all that the terms use."""
         n = len(self.variables)
         padded = np.pad(self.exponents[:, :n], ((0, 0), (0, 1)))
         order = [self.variables.index(v) if v in self.variables else -1 for v in variables]
@@ -140,7 +143,7 @@ class Library:
     def scaled(
         self, scale: Float[np.ndarray, " variables"]
     ) -> tuple[Library, Float[np.ndarray, " terms"]]:
-        """Terms of variables in units of `scale`, and what gives from each its value in SI."""
+        """Library for variables divided by `scale`, and factors that convert its terms to SI."""
         own = scale[self._arguments].tolist()
         pairs = [f.scaled(s) for f, s in zip(self.functions, own, strict=True)]
         numbers = np.append(scale, [number for number, _ in pairs])
@@ -163,25 +166,25 @@ class Library:
         return theta
 
     def with_functions(self, columns: Any, *, axis: int) -> Any:
-        """Columns of the variables and a one, along any axis, followed by those of the functions.
+        """Append the functions' columns to those of the variables and a one, along any axis.
 
-        With these, a term is the product of what its row of `table` names.
+        A term is then the product of the columns in its row of `table`.
         """
         if not self.functions:
             return columns
         xp = array_namespace(columns)
         of = [xp.take(columns, xp.asarray([k]), axis=axis) for k in self._arguments]
-        with np.errstate(all="ignore"):  # callers look for what is not finite outside a domain
+        with np.errstate(all="ignore"):  # callers check for values outside a function's domain
             values = [f.value(x) for f, x in zip(self.functions, of, strict=True)]
         return xp.concat([columns, *values], axis=axis)
 
     def at_points(
         self, known: Sequence[str], rows: np.ndarray | None = None
     ) -> tuple[Float[np.ndarray, " known"], Callable[[], Float[np.ndarray, " rows"]]]:
-        """Terms at one point after another, for solvers: one gather and one product per call.
+        """Evaluate terms at one point after another, for solvers: one gather and product per call.
 
         Returns an array to be filled with the variables in the order of `known`, and a function
-        that gives the terms (of some rows) where it stands.
+        that evaluates the terms (only `rows`, if given) at the current content of that array.
         """
         n = len(known)
         columns, table = np.ones(n + 1 + len(self.functions)), self.columns_of(known, rows)
@@ -201,14 +204,17 @@ class Library:
     def columns_of(
         self, known: Sequence[str], rows: np.ndarray | None = None
     ) -> Int[np.ndarray, "rows degree"]:
-        """As `table`, for columns of `known`, which holds all variables, a one, the functions."""
+        """Rows of `table` for columns in the order: variables in `known`, a one, functions.
+
+        known: must hold all variables of the library.
+        """
         n = len(known)
         others = range(n, n + 1 + len(self.functions))
         places = np.array([*map(list(known).index, self.variables), *others])
         return places[self.table if rows is None else self.table[rows]]
 
     def jacobian(self, values: Any) -> Any:
-        """Derivative of every term by every variable, at every sample.
+        """Derivative of every term with respect to every variable, at every sample.
 
         values: as for `evaluate`. Returns (variables, ..., terms), of the same kind.
         """
@@ -224,8 +230,8 @@ class Library:
     ) -> tuple[Library, Float[np.ndarray, "terms columns products"]]:
         """Terms and their derivatives by the first n variables, as sums of distinct products.
 
-        Returns a library of these products, by exponents, and (terms, 1 + n, products): what
-        makes each term, then its derivatives, of them.
+        Returns a library of these products, sorted by exponents, and weights of shape
+        (terms, 1 + n, products), which combine the products to each term and its n derivatives.
         """
         slopes = [[{term: 1.0}, *map(term.derivative, self.variables[:n])] for term in self.terms]
         distinct = dict.fromkeys(t for sums in slopes for parts in sums for t in parts)
@@ -247,12 +253,12 @@ class Library:
 
     @cached_property
     def _arguments(self) -> list[int]:
-        """The variable that each function is one of."""
+        """Index of the variable that each function takes."""
         return [self.variables.index(f.variable) for f in self.functions]
 
     @cached_property
     def _slopes(self) -> tuple[Library, list[list[tuple[np.ndarray, np.ndarray]]]]:
-        """Products, and by variable the addends of the derivatives: which of them, times what."""
+        """Products, and for each variable the addends of all derivatives: (indices, weights)."""
         products, shares = self.with_derivatives(len(self.variables))
         addends = []
         for by_variable in np.moveaxis(shares[:, 1:], 1, 0):
@@ -265,7 +271,7 @@ class Library:
 
 
 def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
-    """A library of these terms, each once, in this order."""
+    """Library of these terms in this order, without repetitions."""
     distinct = list(dict.fromkeys(terms))
     used = (factor for term in distinct for factor, _ in term.factors)
     factors: list[Factor] = list(dict.fromkeys([*map(VariableFactor, variables), *used]))
@@ -280,12 +286,12 @@ def library_of(variables: Sequence[str], terms: Iterable[Term]) -> Library:
 
 
 def by_exponents(library: Library) -> Library:
-    """The same terms in ascending order of their exponents, those of the first variable first."""
+    """Sort the terms by ascending exponents, comparing those of the first variable first."""
     return library.take(np.lexsort(library.exponents.T[::-1]))
 
 
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
-    """A library of exactly these terms, in this order."""
+    """Library of exactly these terms, in this order."""
     check_exponents(len(names), len(variables))
     terms = [read_term(name, variables) for name in names]
     if len(set(terms)) < len(terms):
@@ -301,13 +307,14 @@ def polynomial(
     functions: Sequence[str] = (),
     function_degree: int = 1,
 ) -> Library:
-    """All products of `variables` up to `degree`, the constant included, then named products.
+    """All products of `variables` up to `degree`, including the constant, then `products`.
 
-    functions: by name, `sin`, of every variable, or written out, `sin(2*x)`, `1/(0.5+x)`, of that
-    one. function_degree: the most factors of a term with a function: 1 takes functions alone, 2
-    their products with a variable or with each other, too.
-    Ordered by degree, then by the order of the variables, functions last: 1, x, y, sin(x), x^2, ...
-    Raises ValueError for a wrong degree, or a variable or a function that is unknown.
+    products: further terms by name. functions: a bare name such as `sin` applies to every variable;
+    one written out, such as `sin(2*x)` or `1/(0.5+x)`, is taken as it is. function_degree: largest
+    number of factors in a term with a function. 1 gives functions alone, 2 also their products with
+    a variable or with each other.
+    Terms are ordered by degree, then by variable, functions last: 1, x, y, sin(x), x^2, ...
+    Raises ValueError for a wrong degree, or for an unknown variable or function.
     """
     n, factors = len(variables), functions_named(functions, variables)
     check_degrees(degree, function_degree, n, len(factors))
@@ -321,13 +328,13 @@ def polynomial(
     return full + named_terms(variables, products) if products else full
 
 
-# How a library shows itself, on a screen or in a notebook.
+# Display of a library, on a screen or in a notebook.
 
 
 def library_text(
     variables: Sequence[str], names: Sequence[str], degrees: Int[ndarray, " terms"]
 ) -> str:
-    """Terms by degree, on one screen."""
+    """Terms of a library by degree, as text that fits one screen."""
     lines = [f"Library of {len(names)} terms over {', '.join(variables)}"]
     by_degree = list(_by_degree(names, degrees).items())
     for k, (degree, found) in enumerate(by_degree):
@@ -338,7 +345,7 @@ def library_text(
 
 
 def library_html(names: Sequence[str], degrees: Int[ndarray, " terms"]) -> str:
-    """The same as a table."""
+    """Terms of a library by degree, as an HTML table."""
     rows = [
         [str(degree), str(len(found)), html.escape(cut(", ".join(found), 1000))]
         for degree, found in _by_degree(names, degrees).items()

@@ -1,17 +1,17 @@
-"""Names of terms: how they are read."""
+"""Grammar and parsing of term names, and checks of variable names."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
 
-# The grammar of terms, for expressions without groups of their own. Nothing is tried twice (`++`,
-# `*+`): a term from someone else may be long.
-VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*+)"  # or the average of a product, in < >
+# The grammar of terms, as patterns without capturing groups. Possessive quantifiers (`++`, `*+`)
+# prevent backtracking, since a term from someone else may be very long.
+VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*+)"  # a word, or the average of a product in < >
 
 NUMBER = r"(?:\d++\.?\d*+|\.\d++)(?:[eE][+-]?\d++)?"
 
-# x, 2*x, -x, 0.5 + x, 1 - 2*x, and x + 0.5
+# Arguments of functions: x, 2*x, -x, 0.5 + x, 1 - 2*x, and x + 0.5
 ARGUMENT = (
     rf"(?:-?\s*+{NUMBER}\s*+(?=[+-]))?\s*+[+-]?\s*+(?:{NUMBER}\s*+\*\s*+)?{VARIABLE}"
     rf"(?:\s*+[+-]\s*+{NUMBER})?"
@@ -48,7 +48,7 @@ _FACTOR = r"[^\W\d]\w{,99}(?:\^\d{1,3})?"
 
 
 def check_variable(name: str) -> None:
-    """Raise ValueError for a name that no term could hold: it is no path and no markup either."""
+    """Raise ValueError for a name that cannot stand in a term; paths and markup are refused too."""
     if not isinstance(name, str) or not re.fullmatch(r"[^\W\d]\w{,99}", name):
         word = re.sub(r"\W+", "_", str(name)).strip("_")[:50] or "x"
         other = f"x{word}" if word[0].isdecimal() else word
@@ -59,21 +59,21 @@ def check_variable(name: str) -> None:
 
 
 def check_state(name: str) -> None:
-    """The same for a variable of a library: it may be an average of a product, `<n_i*n_n>`, too."""
+    """Raise ValueError unless a name is a valid variable or an average such as `<n_i*n_n>`."""
     if not (isinstance(name, str) and re.fullmatch(rf"<{_FACTOR}(?:\*{_FACTOR})*>", name)):
         check_variable(name)
 
 
-LONGEST_POWER = 100  # digits: what has more is no number of anything
+LONGEST_POWER = 100  # digits; a longer power is certainly a mistake
 
-RECIPROCAL = "1/"  # the function of what stands below a fraction line
+RECIPROCAL = "1/"  # name of the function x -> 1/x, for factors below the fraction line
 
 
 @dataclass(frozen=True)
 class Part:
-    """One factor as it is written: function(shift + scale * variable)^power.
+    """One factor of a term as written: function(shift + scale * variable)^power.
 
-    function: empty for the variable itself, `RECIPROCAL` for what is divided by.
+    function: empty for the variable itself, `RECIPROCAL` for a factor below the fraction line.
     """
 
     function: str
@@ -84,11 +84,11 @@ class Part:
 
     @property
     def argument(self) -> str:
-        """`x`, `2*x`, `0.5+x`, `1-2*x`: numbers so that they are read back exactly."""
+        """Argument such as `x`, `2*x`, `0.5+x`, `1-2*x`; its numbers are read back exactly."""
         return self.argument_of(self.variable, times="*")
 
     def argument_of(self, variable: str, *, times: str) -> str:
-        """The same with the variable, and what multiplies it, written in another way."""
+        """Argument with another notation for the variable and for the multiplication sign."""
         size = abs(self.scale)
         product = variable if size == 1.0 else f"{number_text(size)}{times}{variable}"
         sign = "-" if self.scale < 0.0 else "+" if self.shift else ""
@@ -96,26 +96,26 @@ class Part:
 
     @property
     def is_bare(self) -> bool:
-        """Whether the argument is the variable itself."""
+        """True if the argument is the variable itself."""
         return self.scale == 1.0 and self.shift == 0.0
 
     @property
     def text(self) -> str:
-        """Without its power: `x`, `sin(2*x)`, `1/x`, `1/(0.5+x)`."""
+        """Factor without its power: `x`, `sin(2*x)`, `1/x`, `1/(0.5+x)`."""
         if self.function != RECIPROCAL:
             return f"{self.function}({self.argument})" if self.function else self.variable
         return f"1/{self.argument}" if self.is_bare else f"1/({self.argument})"
 
 
 def number_text(value: float) -> str:
-    """The shortest text that is read back as the same number: `2`, `0.5`, `1e+18`."""
+    """Shortest text that is read back as the same number: `2`, `0.5`, `1e+18`."""
     return repr(value).removesuffix(".0")
 
 
 def split_term(name: str) -> list[Part]:
-    """Factors of a term as they are written: `x^2*sin(2*y)/(0.5+z)`; of `1`, none.
+    """Split a term name such as `x^2*sin(2*y)/(0.5+z)` into its factors; `1` has none.
 
-    Raises ValueError for what is no product of variables and functions of one variable.
+    Raises ValueError for anything but a product of variables and functions of one variable.
     """
     if name.strip() == "1":
         return []
@@ -139,7 +139,7 @@ def _power(text: str | None, name: str) -> int:
 
 
 def _split_argument(text: str) -> tuple[str, float, float]:
-    """Variable, what multiplies it, and what is added."""
+    """Variable, scale and shift of a function's argument."""
     found = _ARGUMENT.fullmatch(text.strip())
     assert found is not None
     scale = float(found["scale"] or 1.0) * (-1.0 if found["sign"] == "-" else 1.0)

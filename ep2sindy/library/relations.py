@@ -1,7 +1,7 @@
-"""Linear relations between coefficients, solved once and for all: coef = C free + d.
+"""Linear relations between coefficients, eliminated once as coef = C z + d with free values z.
 
-Some of the coefficients may be absent: then `binding` and `complete` say what relations ask of a
-support.
+If a support lacks some of the coefficients, `binding` and `complete` determine what the relations
+require of it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.names import NUMBER, PRODUCT, VARIABLE
 from ep2sindy.runtime.arrays import read_only
 
-ROUNDING = 1e-12  # a sum this small against what was added up has cancelled
+ROUNDING = 1e-12  # a sum this small relative to its addends has cancelled and counts as zero
 
 _NUMBER = rf"{NUMBER}(?!\w)"
 
@@ -35,7 +35,7 @@ _EXAMPLE = "write it like 'n_i: n_i*n_n == -1 * n_n: n_i*n_n'"
 class Relation:
     """One linear relation: the sum of factor * coef(state, term) over `factors` is `value`.
 
-    factors: (factor, state, term) as named in `text`. SI, as the coefficients.
+    factors: (factor, state, term) as named in `text`. Numbers refer to coefficients in SI.
     """
 
     factors: tuple[tuple[float, str, str], ...]
@@ -50,10 +50,10 @@ class Relation:
 
 
 def parse_relation(text: str) -> Relation:
-    """Read `2 * x: x*y + y: x*y == 0`, or `n_n: 1 == 1.83e23` for a known value.
+    """Read a relation: `2 * x: x*y + y: x*y == 0`, or `n_n: 1 == 1.83e23` for a known value.
 
     Each side adds and subtracts numbers and coefficients, `[number *] state: term`.
-    Raises ValueError with the text and the position of what cannot be read.
+    Raises ValueError with the text and the position of the first part that cannot be read.
     """
     if text.count("==") != 1:
         raise ValueError(f"a relation has two sides joined by one '==': {text!r} came; {_EXAMPLE}")
@@ -72,7 +72,7 @@ def parse_relation(text: str) -> Relation:
 
 
 def _addends(text: str, start: int, stop: int) -> Iterator[re.Match[str]]:
-    """What one side of a relation adds up."""
+    """Addends on one side of a relation, as matches of `_ADDEND`."""
     position = start
     while position == start or position < stop:
         if position > start and text[position] not in "+-":
@@ -97,9 +97,9 @@ def relations_from_matrix(
 ) -> tuple[dict[str, tuple[str, ...]], tuple[Relation, ...]]:
     """Read the thesis's matrix: coef(state i, feature k) = C[i, k] b_k, absent where C is zero.
 
-    Returns the support and the relations for `constraint`. Columns may repeat a term, so that
-    states can have coefficients b_k of their own.
-    Raises ValueError for another shape, or a term that comes twice in one equation.
+    Returns the support and the relations for `constraint`. Several columns may hold the same term,
+    so that states can have separate coefficients b_k of it.
+    Raises ValueError for another shape, or for a term that occurs twice in one equation.
     Source: thesis II-E, Eqs. 13-16.
     """
     if C.shape != (len(states), len(terms)):
@@ -125,11 +125,11 @@ def relations_from_matrix(
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """All coefficients that obey the relations: coef = C z + d for any z, in SI.
+    """Parametrisation of all coefficients that obey the relations: coef = C z + d, in SI.
 
     coefficients: (state, term) of each, equation by equation, in the order of the library.
-    free: (free,), indices of those that z holds: C[free] is the identity, d[free] is zero.
-    states: one per equation, also where it has no term.
+    free: (free,), indices of the coefficients that z holds: C[free] is the identity, d[free] zero.
+    states: one per equation, including equations without terms.
     """
 
     states: tuple[str, ...]
@@ -146,7 +146,7 @@ class Constraint:
         assert not self.d[self.free].any()
 
     def coef(self, z: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefs"]:
-        """Values of all coefficients, from those of the free ones."""
+        """Values of all coefficients from the values z of the free ones."""
         return self.C @ z + self.d
 
 
@@ -157,9 +157,10 @@ def constraint(
 ) -> Constraint:
     """Eliminate one coefficient of the support per relation.
 
-    The one of the largest factor goes; of equals the one that the relations name last.
-    Raises ValueError, with the relation, for one that contradicts or repeats the earlier ones
-    or names an unknown state or term, or one outside the support.
+    The coefficient with the largest factor is eliminated; among equal factors, the one whose first
+    mention in the relations comes last.
+    Raises ValueError for a relation that contradicts or repeats earlier ones, names an unknown
+    state or term, or names a term outside the support; the error quotes the relation.
 
     >>> library = ep.polynomial(["x", "y"], degree=2)
     >>> support = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
@@ -202,7 +203,7 @@ def constraint(
 def place_of(
     library: Library, coefficients: Sequence[tuple[str, str]], state: str, term: str, who: str
 ) -> int:
-    """Index of a coefficient that `who` names."""
+    """Index of the coefficient (state, term); `who`, such as a relation, is named in errors."""
     try:
         name = library.names[library.index(term)]
     except ValueError as error:
@@ -220,22 +221,22 @@ def place_of(
 
 
 def _round(sums: np.ndarray | float, sizes: np.ndarray | float) -> np.ndarray:
-    """Sums of numbers with these sizes in all; zero where they cancel but for rounding."""
+    """Set sums to zero that cancel within rounding; `sizes` are the sums of absolute addends."""
     return np.where(np.abs(sums) <= ROUNDING * sizes, 0.0, sums)
 
 
 def relations_of(relations: Sequence[Relation | str]) -> tuple[Relation, ...]:
-    """Relations from texts or as they are."""
+    """Parse relations given as texts; leave the others as they are."""
     return tuple(parse_relation(r) if isinstance(r, str) else r for r in relations)
 
 
 def binding(
     relations: Sequence[Relation], support: Mapping[str, Sequence[str]]
 ) -> tuple[Relation, ...] | None:
-    """The relations that a support has the terms for; None where it breaks one.
+    """Relations whose terms are all in a support; None if the support violates a relation.
 
-    A relation without a value holds where all of its terms are absent; with some of them absent,
-    it would take the others away as well.
+    A relation with value zero holds trivially if all of its terms are absent. If only some are
+    absent, it would force the others to vanish as well, so the support violates it.
     """
     found = []
     for relation in relations:
@@ -253,9 +254,10 @@ def complete(
     equation: str,
     relations: Sequence[Relation],
 ) -> Bool[np.ndarray, "_ terms"]:
-    """Supports of one equation, and the same with what relations ask of it, each once.
+    """Adapt candidate supports of one equation to the relations, without duplicates.
 
-    Terms whose relation has a value are in all; those of a relation without one, all or none.
+    Terms of a relation with a nonzero value are added to every support. Terms of a relation with
+    value zero are in a support all together or not at all; both versions are kept.
     Raises ValueError for a term that the library does not have.
     """
     for relation in relations:

@@ -1,6 +1,6 @@
-"""Terms: products of factors, each a variable or a function of one, to whole powers.
+"""Terms: products of variables, and of functions of one variable, raised to whole powers.
 
-And how many terms a library of some degree has, which is counted before it is built.
+Also checks the size of a library before it is built.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ep2sindy.trust.memory import check_memory
 
 @dataclass(frozen=True)
 class VariableFactor:
-    """The factor that is the variable itself."""
+    """A factor that is a variable itself."""
 
     name: str
 
@@ -44,22 +44,22 @@ Factor = VariableFactor | Function
 
 @dataclass(frozen=True)
 class Term:
-    """A product of powers of factors; of none, the constant.
+    """A product of powers of factors; without factors, the constant.
 
-    factors: as `product` orders them, so that equal terms are equal values.
+    factors: (factor, power) in the order of `product`, so that equal terms compare equal.
     """
 
     factors: tuple[tuple[Factor, int], ...]
 
     @property
     def name(self) -> str:
-        """`1`, `n_i`, `n_i*n_n`, `n_i^2`, `x*sin(y)/z`."""
+        """Name such as `1`, `n_i`, `n_i*n_n`, `n_i^2`, `x*sin(y)/z`."""
         parts = [f.name if power == 1 else f"{f.name}^{power}" for f, power in self.factors]
         over = "*".join(part for part in parts if not part.startswith(RECIPROCAL)) or "1"
         return over + "".join(part[1:] for part in parts if part.startswith(RECIPROCAL))
 
     def derivative(self, variable: str) -> dict[Term, float]:
-        """By one variable: the terms it is a sum of, and what each is multiplied by."""
+        """Derivative by one variable, as a sum of terms: term -> factor."""
         order = list(dict.fromkeys(factor.variable for factor, _ in self.factors))
         found: dict[Term, float] = {}
         for factor, power in self.factors:
@@ -74,12 +74,12 @@ class Term:
         return found
 
     def unit(self, units: Mapping[str, str]) -> str:
-        """From the units of the variables."""
+        """Unit of the term, from the units of the variables."""
         return unit_product((f.unit(units[f.variable]), power) for f, power in self.factors)
 
 
 def product(powers: Mapping[Factor, int], variables: Sequence[str]) -> Term:
-    """The term of these powers: factors in the order of `variables`, functions behind theirs."""
+    """Term with these powers; each function follows its variable, in the order of `variables`."""
 
     def place(factor: Factor) -> tuple[int, bool, str]:
         return variables.index(factor.variable), factor.name != factor.variable, factor.name
@@ -93,9 +93,10 @@ def read_term(name: str, variables: Sequence[str]) -> Term:
 
 
 def read_factors(name: str, variables: Sequence[str]) -> dict[Factor, int]:
-    """The factors of a term name, and their powers.
+    """Read the factors of a term name, and their powers.
 
-    Raises ValueError for a name that is no term, an unknown variable or an unknown function.
+    Raises ValueError for a name that is not a term, an unknown variable or function, or a degree
+    beyond 100.
     """
     powers: dict[Factor, int] = {}
     for factor, power in _factors(name):
@@ -114,9 +115,10 @@ def read_factors(name: str, variables: Sequence[str]) -> dict[Factor, int]:
 
 
 def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Function]:
-    """What a list of functions means: each of every variable, or of the one that it names.
+    """Functions that a list of names stands for.
 
-    Raises ValueError for what is no function.
+    A bare name such as `sin` gives one function of every variable; `sin(2*x)` gives that function.
+    Raises ValueError for a name that is not a function.
     """
     if isinstance(names, str):
         raise ValueError(f"functions must be a list: {names!r} came; write [{names!r}]")
@@ -136,7 +138,7 @@ def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Func
 
 
 def variables_of(name: str) -> list[str]:
-    """The variables that a term name needs, in its own order."""
+    """Variables that a term needs, in the order of its name."""
     return list(dict.fromkeys(factor.variable for factor, _ in _factors(name)))
 
 
@@ -145,20 +147,20 @@ def _factors(name: str) -> list[tuple[Factor, int]]:
 
 
 def factor_of(part: Part) -> Factor:
-    """A variable, or a function of one, as it is written."""
+    """Factor that a part of a term's name stands for: a variable or a function of one."""
     return function_of(part) if part.function else VariableFactor(part.variable)
 
 
-# How large a library may be: counted before it is made.
+# Limits on the size of a library, checked before it is built.
 
 
 LARGEST_DEGREE = 100
-MAX_TERMS = 20_000  # whose products with each other take 3 GB
-MAX_EXPONENTS = 4_000_000  # all terms that there may be, of 200 variables
+MAX_TERMS = 20_000  # the Gram matrix of so many terms takes 3 GB
+MAX_EXPONENTS = 4_000_000  # MAX_TERMS terms of 200 variables
 
 
 def check_degrees(degree: int, function_degree: int, n_variables: int, n_functions: int) -> None:
-    """Raise ValueError for degrees that are none, or whose products are more than can be held."""
+    """Raise ValueError for invalid degrees, or for degrees that give too many terms."""
     if not isinstance(degree, int) or degree < 0:
         raise ValueError(f"degree must be a whole number, zero or more: {degree!r} came")
     if not isinstance(function_degree, int) or function_degree < 1:
@@ -183,7 +185,7 @@ def _check_size(name: str, degree: int, n_factors: int) -> None:
 
 
 def check_exponents(n_terms: int, n_factors: int) -> None:
-    """Raise ValueError for more terms than a library may hold of so many factors."""
+    """Raise ValueError if terms times factors exceed the number of exponents a library may have."""
     if n_terms * n_factors > MAX_EXPONENTS:
         raise ValueError(
             f"a library may have up to {MAX_EXPONENTS / 1e6:g} million exponents, one for every "
@@ -193,10 +195,13 @@ def check_exponents(n_terms: int, n_factors: int) -> None:
 
 
 def check_values(n_terms: int, shape: Sequence[int]) -> None:
-    """Raise ValueError where the terms at so many samples, (..., variables), exceed memory."""
+    """Raise ValueError if the values of all terms do not fit in memory.
+
+    shape: (..., variables), the shape of the samples.
+    """
     n_samples = prod(shape[:-1])
     check_memory(
-        24.0 * n_terms * n_samples,  # and what they are made of
+        24.0 * n_terms * n_samples,  # 8 bytes per value, and temporary arrays
         f"{n_terms} terms at {n_samples} samples",
         way_out="take every second sample (ep2sindy.prepare.decimate), or fewer terms",
         each=24.0 * n_terms,

@@ -1,4 +1,4 @@
-"""Units as short strings: "m^-3", "m^3/s", "1". Only names are handled; values stay SI."""
+"""Units as short strings: "m^-3", "m^3/s", "1". Only the strings are handled; values stay in SI."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     import pint
 
 
-# Symbols that are their own base symbol: products of their powers need no registry.
+# Symbols that pint keeps as they are, so that products of their powers need no registry.
 PLAIN = frozenset({"s", "m", "A", "V", "eV", "K", "T", "kg", "Hz", "W", "N", "J", "C", "Pa"})
 _PLAIN_FACTOR = re.compile(rf"({'|'.join(PLAIN)}|1)(?:\^(-?\d{{1,2}}))?")
 
 
-# How a unit may be written. What it says is reckoned out, so it must not be a sum to work on:
-# no power of a power, no brackets in brackets.
+# Permitted notation of a unit. Pint evaluates the text, so expensive expressions are excluded: no
+# power of a power, no nested brackets.
 _SIGNED = r"[({]?\s*[+-]?\d{1,2}(?:\.\d{1,2})?(?:/\d)?\s*[)}]?"
 _POWER = rf"(?:\s*(?:\^|\*\*)\s*{_SIGNED})?"
 _NUMBER = r"\d{1,20}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,2})?"
@@ -28,11 +28,11 @@ _ONE = rf"(?:{_NUMBER}|[^\W\d]\w*(?:-\d{{1,2}}(?!\d))?|°\s?\w+|%){_POWER}"
 _JOIN = r"(?:\s*[*/.·×]\s*|\s+)"
 _FACTOR = rf"(?:{_ONE}|\({_ONE}(?:{_JOIN}{_ONE})*\){_POWER})"
 _UNIT = re.compile(rf"\s*{_FACTOR}(?:{_JOIN}{_FACTOR})*\s*")
-LONGEST = 60  # characters
+LONGEST = 60  # largest number of characters in a unit
 
 
 def check_unit(unit: str) -> None:
-    """Raise ValueError for text that is not written as a unit, before anything is made of it."""
+    """Raise ValueError for text that is not written as a unit, before it is evaluated."""
     if len(unit) > LONGEST or not _UNIT.fullmatch(unit):
         shown = repr(unit) if len(unit) <= LONGEST else f"{unit[:LONGEST]!r}..."
         raise ValueError(
@@ -44,7 +44,7 @@ def check_unit(unit: str) -> None:
 
 @cache
 def unit_errors() -> tuple[type[Exception], ...]:
-    """What pint raises on text that is no unit."""
+    """Exceptions that pint raises for text that is not a unit."""
     import pint
 
     return (
@@ -55,7 +55,7 @@ def unit_errors() -> tuple[type[Exception], ...]:
 
 @cache
 def registry() -> pint.UnitRegistry:
-    """The one registry of the package; importing and building it takes a quarter of a second."""
+    """Return the package's only pint registry; importing and building it takes 0.25 s."""
     import pint
 
     return pint.UnitRegistry()
@@ -63,7 +63,7 @@ def registry() -> pint.UnitRegistry:
 
 @cache
 def _powers(unit: str) -> dict[str, float]:
-    """Base symbol -> exponent of one unit string; an unknown unit stays a symbol of its own."""
+    """Exponents of a unit's symbols: symbol -> exponent; an unknown unit counts as one symbol."""
     if unit in ("", "1"):
         return {}
     if (plain := _plain_powers(unit)) is not None:
@@ -77,12 +77,12 @@ def _powers(unit: str) -> dict[str, float]:
 
 
 def _plain_powers(unit: str) -> dict[str, float] | None:
-    """Powers of symbols that stand alone, `m^-3 s^-1` or `m^3/s`; None for all else."""
+    """Exponents for simple units such as `m^-3 s^-1` or `m^3/s`; None for all others."""
     found: dict[str, float] = {}
     for k, divided in enumerate(unit.split("/")):
         for text in divided.split(" "):
             factor = _PLAIN_FACTOR.fullmatch(text)
-            if factor is None or (k and " " in divided):  # who reads m/s V, may mean either
+            if factor is None or (k and " " in divided):  # m/s V is ambiguous
                 return None
             symbol, power = factor.groups()
             if symbol != "1":
@@ -92,7 +92,7 @@ def _plain_powers(unit: str) -> dict[str, float] | None:
 
 @cache
 def unit_like(text: str, like: str | None = None) -> bool:
-    """Whether a text is a unit, `like`: of the same kind as this one."""
+    """True if a text is a unit; with `like`, if it also converts to that unit."""
     try:
         check_unit(text)
         parsed = registry().parse_units(netcdf_powers(text)) if text.strip() else None
@@ -104,7 +104,7 @@ def unit_like(text: str, like: str | None = None) -> bool:
 
 
 def netcdf_powers(unit: str) -> str:
-    """`m-3`, as netCDF writes it, as `m^-3`."""
+    """Rewrite powers in netCDF's notation: `m-3` becomes `m^-3`."""
     return re.sub(r"\b([A-Za-zµ]+)(-?\d+)\b", r"\1^\2", unit)
 
 
@@ -128,9 +128,9 @@ def with_prefix(value: float) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class Clock:
-    """The unit that people read times in, such as years; all values and files stay in seconds.
+    """Unit in which times are displayed, such as years; all values and files stay in seconds.
 
-    The second goes by SI prefixes, to 71 µs and 14.1 kHz. seconds: how many the unit has.
+    Seconds are displayed with SI prefixes, as 71 µs and 14.1 kHz. seconds: length of the unit in s.
     """
 
     unit: str = "s"
@@ -138,9 +138,9 @@ class Clock:
 
     @staticmethod
     def of(unit: str) -> Clock:
-        """Of the unit that a file counts its time in; the second for its decimal parts.
+        """Clock for the unit of time in a file; units of a second or less give seconds.
 
-        Raises ValueError for what is no unit of time.
+        Raises ValueError for text that is not a unit of time.
         """
         if unit == "s":
             return SECONDS
@@ -154,34 +154,34 @@ class Clock:
         return SECONDS if seconds <= 1.0 else Clock(unit, seconds)
 
     def scale(self, duration_s: float) -> tuple[float, str]:
-        """What a duration is multiplied by to be read, and its unit: (1e6, "µs")."""
+        """Factor from seconds to the displayed unit, and that unit: (1e6, "µs")."""
         if self.unit != "s":
             return 1.0 / self.seconds, self.unit
         factor, prefix = with_prefix(duration_s)
         return factor, f"{prefix.replace('u', 'µ')}s"
 
     def frequency_scale(self, frequency_Hz: float) -> tuple[float, str]:
-        """The same of a frequency: (1e-3, "kHz"), (3.2e7, "1/year")."""
+        """Factor from Hz to the displayed unit, and that unit: (1e-3, "kHz"), (3.2e7, "1/year")."""
         if self.unit != "s":
             return self.seconds, f"1/{self.unit}"
         factor, prefix = with_prefix(frequency_Hz)
         return factor, f"{prefix.replace('u', 'µ')}Hz"
 
     def duration_text(self, duration_s: float, *, digits: int = 3) -> str:
-        """`182 µs`, `21 years`; a dash for none."""
+        """Duration as text: `182 µs`, `21 years`; a dash if it is not finite."""
         factor, unit = self.scale(duration_s)
         count = f"{duration_s * factor:.{digits}g}"
         many = "s" if count != "1" and self.unit in ("day", "week", "month", "year") else ""
         return f"{count} {unit}{many}" if math.isfinite(duration_s) else "-"
 
     def frequency_text(self, frequency_Hz: float) -> str:
-        """`14.1 kHz`, `0.1 per year`; a dash for none."""
+        """Frequency as text: `14.1 kHz`, `0.1 per year`; a dash if it is not finite."""
         factor, unit = self.frequency_scale(frequency_Hz)
         text = f"{frequency_Hz * factor:.4g} {unit.replace('1/', 'per ')}"
         return text if math.isfinite(frequency_Hz) else "-"
 
     def rate_unit(self, unit: str) -> str:
-        """Of a derivative in time; unit: of the variable."""
+        """Unit of a time derivative. unit: that of the variable."""
         if self.unit == "s":
             return unit_product([(unit, 1), ("s", -1)])
         return f"{'' if unit == '1' else unit} {self.unit}^-1".strip()

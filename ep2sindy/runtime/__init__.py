@@ -1,1 +1,1 @@
-"""What runs rely on: files written whole or not at all, workers, threads, kernels, the screen."""
+"""Services for runs: atomic file output, workers, threads, compiled kernels, progress, display."""

@@ -1,4 +1,4 @@
-"""Arrays that values own."""
+"""Read-only copies of arrays, for immutable objects."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def read_only(values: np.ndarray) -> np.ndarray:
-    """Copy to float64 and lock, so that a value cannot change behind its owner."""
+    """Copy to float64 and lock, so that the data of an object cannot change from outside."""
     copy = np.array(values, dtype=np.float64, order="C")
     copy.flags.writeable = False
     return copy

@@ -1,4 +1,4 @@
-"""Write files so that a final name never stands for a half-written file; read JSON."""
+"""Atomic writing of files, so that a final name never stands for a half-written file; JSON."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import psutil
 
 
 class WriteError(OSError):
-    """A file could not be written: which, why, and the way out."""
+    """A file could not be written; the message says which, why, and what to do."""
 
     def __init__(self, path: Path, reason: OSError | str) -> None:
         self.reason = getattr(reason, "strerror", None) or str(reason) or type(reason).__name__
@@ -30,13 +30,13 @@ class WriteError(OSError):
         )
         self._made_of = path, self.reason
 
-    def __reduce__(self) -> tuple[Any, ...]:  # workers send their errors
+    def __reduce__(self) -> tuple[Any, ...]:  # workers send their errors as pickles
         return WriteError, self._made_of
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Let an error of the operating system say which file could not be written."""
+    """Turn an OSError raised within into a WriteError that names the file."""
     try:
         yield
     except WriteError:
@@ -47,19 +47,19 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path`; it takes the final name only if the block succeeds.
+    """Yield a temporary path beside `path`; the file is renamed to `path` if the block succeeds.
 
-    The temporary keeps the suffix, since writers tell formats by it. Whatever ends the block
-    early (an error, Ctrl-C) leaves the final name as it was. Raises WriteError, an OSError.
+    The temporary keeps the suffix, since writers choose the format by it. If the block ends early
+    (an error, Ctrl-C), a file at `path` stays as it was. Raises WriteError, an OSError.
     """
     temporary = path.with_name(f".{path.stem}-{_maker()}-{uuid.uuid4().hex[:8]}{path.suffix}")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield temporary
-            _sync(temporary)  # the disk may be full only now, and a name outlives a power cut
+            _sync(temporary)  # a full disk may show only now; data must be safe before the name
             os.replace(temporary, path)
-            with suppress(OSError):  # the file is whole; some file systems sync no folders
+            with suppress(OSError):  # the file is complete; some file systems cannot sync folders
                 _sync(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
@@ -75,7 +75,7 @@ def _sync(path: Path) -> None:
 
 
 def _maker() -> str:
-    """Machine and process, by which it is told whose a temporary file is."""
+    """Identifier of machine and process, which marks the owner of a temporary file."""
     return f"{zlib.crc32(platform.node().encode()):08x}-{os.getpid()}"
 
 
@@ -83,33 +83,33 @@ TEMPORARY = re.compile(r"\..+-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}(\.\w+)?")
 
 
 def sweep(folder: Path) -> None:
-    """Remove what processes of this machine that were killed left half-written in a folder.
+    """Remove half-written files that killed processes of this machine left in a folder.
 
-    Its folders are swept as well. A file of a living process, or of another machine, stays.
+    Subfolders are swept as well. Files of a living process, or of another machine, stay.
     """
     ours = _maker().partition("-")[0]
     for place, _, names in os.walk(folder):
         for name in names:
             found = TEMPORARY.fullmatch(name)
             if found and found[1] == ours and not psutil.pid_exists(int(found[2])):
-                with suppress(OSError):  # another start may sweep at the same time
+                with suppress(OSError):  # another process may sweep at the same time
                     os.unlink(os.path.join(place, name))
 
 
 def write_bytes(path: Path, content: bytes | memoryview) -> None:
-    """Write bytes under `path`, whole or not at all."""
+    """Write bytes to `path`, completely or not at all."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text under `path`, whole or not at all."""
+    """Write UTF-8 text to `path`, completely or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON under `path`, whole or not at all; NaN becomes null: JSON has no word for it."""
+    """Write JSON to `path`, completely or not at all; NaN and infinities become null."""
     write_text(path, json.dumps(_without_nan(content), indent=2, allow_nan=False) + "\n")
 
 
@@ -124,10 +124,10 @@ def _without_nan(content: Any) -> Any:
 
 
 def read_json(text: str) -> Any:
-    """What a text of JSON says.
+    """Parse JSON.
 
-    Raises ValueError for any other, and for a key that one object has twice: Python's reader
-    forgets the first.
+    Raises ValueError for text that is not JSON, and for an object that has a key twice, of which
+    Python's parser would silently drop the first.
     """
     return json.loads(text, object_pairs_hook=_each_once)
 
@@ -141,10 +141,10 @@ def _each_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def fingerprint(settings: str, *, sources: Path) -> str:
-    """Sixteen hexadecimal digits of some settings and of the source text that uses them.
+    """Hash of settings and of the source code that uses them: sixteen hexadecimal digits.
 
-    sources: a Python file, or a folder of them; what a changed formula would answer differently
-    is not taken from what an old one left on disk.
+    sources: a Python file, or a folder of them. They are included so that results of an old
+    formula are not reused from disk after the formula has changed.
     """
     digest = hashlib.sha256(settings.encode())
     for source in [sources] if sources.is_file() else sorted(sources.rglob("*.py")):

@@ -1,4 +1,4 @@
-"""Independent pieces of work: one after the other, on all cores, or on a cluster."""
+"""Execution of independent pieces of work: one after the other, on all cores, or on a cluster."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
 from ep2sindy.trust.user_code import isolate_children, own_packages
 
-# Pieces handed to a cluster ahead of their turn, per thread: they queue there with their data.
+# Pieces submitted to a cluster per thread, including the running one; they queue with their data.
 AHEAD = 2
 
 
 @runtime_checkable
 class Workers(Protocol):
-    """What the alternatives share: apply a function to every piece, results as they come.
+    """Interface of all kinds of workers, which apply a function to every piece.
 
-    Yields (number of the piece, result), in any order. Each piece runs on one thread, so that a
-    result does not depend on where it was computed. Function, pieces and results must pickle.
+    `run` yields (number of the piece, result) as results arrive, in any order. Each piece runs on
+    one thread, so that a result does not depend on where it was computed. Function, pieces and
+    results must be picklable.
     """
 
     def run(
@@ -53,10 +54,10 @@ def collect(
     size: Callable[[Any], int] = lambda piece: 1,
     tell: Callable[[int, Any], None] = lambda number, result: None,
 ) -> list[Any]:
-    """The results of all pieces in their order, though they come in any order.
+    """Compute all pieces and return their results in the order of the pieces.
 
-    stage: of a `Progress`; it is told the size of every piece that is done. tell: is given the
-    number and the result of every piece as it comes.
+    stage: a stage of a `Progress`, which receives the size of every finished piece. tell: called
+    with the number and the result of every piece as soon as it is done.
     """
     results: dict[int, Any] = {}
     with stage as advance:
@@ -73,10 +74,10 @@ def rows_in_order(
     pieces: Iterable[Any],
     progress: Callable[[int], None] = lambda n_more: None,
 ) -> list[Any]:
-    """The rows that a function finds in every piece, in the order of the pieces.
+    """Compute the rows of every piece and return all rows in the order of the pieces.
 
-    progress: told of every finished piece.
-    Raises ValueError where there is no row at all.
+    progress: called with 1 for every finished piece.
+    Raises ValueError if there is no row at all.
     """
     found = {}
     for number, rows in workers.run(function, pieces):
@@ -93,9 +94,9 @@ def rows_in_order(
 def _in_worker(code: bytes, parent: int, numbered: tuple[int, Any]) -> tuple[int, Any]:
     from tqdm import tqdm
 
-    if os.getpid() != parent:  # within a worker, joblib stays in the process
+    if os.getpid() != parent:  # inside a worker, joblib runs nested work in the same process
         end_with(parent)
-        tqdm.set_lock(RLock())  # by default a semaphore, of which the end of a worker would be told
+        tqdm.set_lock(RLock())  # the default, a semaphore, causes a warning when the worker ends
     return _sent_on_one_thread(code, numbered)
 
 
@@ -104,8 +105,10 @@ def _sent_on_one_thread(code: bytes, numbered: tuple[int, Any]) -> tuple[int, An
 
 
 def _with_its_code(function: Callable[[Any], Any], *packages: ModuleType) -> bytes:
-    """A pickle that holds the code of packages which workers cannot import by their names:
-    these, and what configs have named in the folder of the run."""
+    """Pickle a function with the code of packages that workers cannot import by name.
+
+    These are the given packages, and the modules in the folder of the run that configs have named.
+    """
     for package in (*packages, *own_packages()):
         cloudpickle.register_pickle_by_value(package)
     return cloudpickle.dumps(function)
@@ -113,7 +116,7 @@ def _with_its_code(function: Callable[[Any], Any], *packages: ModuleType) -> byt
 
 @dataclass(frozen=True)
 class Serial:
-    """One piece after the other, in this process."""
+    """Workers that compute one piece after the other, in this process."""
 
     def run(
         self, function: Callable[[Any], Any], pieces: Iterable[Any]
@@ -127,7 +130,7 @@ ONE_BY_ONE = Serial()
 
 @dataclass(frozen=True)
 class Loky:
-    """Pieces side by side in processes of this machine. n_jobs: how many; -1, one per core."""
+    """Workers in parallel processes on this machine. n_jobs: their number; -1 for one per core."""
 
     n_jobs: int = -1
 
@@ -144,22 +147,22 @@ class Loky:
         if effective_n_jobs(self.n_jobs) == 1:
             yield from ONE_BY_ONE.run(function, pieces)
             return
-        # Pieces are pickled as they are: joblib would keep a copy of every large array on disk.
+        # max_nbytes=None, or joblib would keep a copy of every large array on disk.
         workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
         code, numbered = _with_its_code(function), enumerate(pieces)
-        with isolate_children():  # all workers start before the first result is asked for
+        with isolate_children():  # all workers start here, before the first result is requested
             found = workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
         yield from found
 
 
 @dataclass(frozen=True)
 class Dask:
-    """Pieces on the workers of a running dask scheduler, such as "tcp://10.0.0.1:8786".
+    """Workers of a running dask scheduler, such as "tcp://10.0.0.1:8786".
 
-    A piece whose worker dies is given to another, as often as the scheduler allows (three times,
-    unless it was told otherwise). Workers need this package, and see the same files under the
-    same paths; a function from elsewhere goes to them with its code. Needs the extra `cluster`.
-    Raises OSError when no scheduler answers at the address, or none has a worker, within timeout_s.
+    If a worker dies, its piece goes to another one, as often as the scheduler allows (three times
+    by default). Workers need this package, and must see the same files under the same paths. A
+    function from another package is sent with its code. Needs the extra `cluster`.
+    Raises OSError if no scheduler with a worker answers at the address within `timeout_s`.
     """
 
     address: str
@@ -174,7 +177,7 @@ class Dask:
 
     @contextmanager
     def _client(self, distributed: Any) -> Iterator[Any]:
-        """A connection to a scheduler that has a worker, and that nobody else uses by default."""
+        """Connect to a scheduler that has a worker, without making it dask's default client."""
         client = None
         try:
             client = distributed.Client(self.address, timeout=self.timeout_s, set_as_default=False)
@@ -201,7 +204,7 @@ class Dask:
         code = _with_its_code(function, *_package_of(function))
 
         def submitted() -> list[Any]:
-            """What keeps all threads busy, of workers that have joined since, too."""
+            """Submit enough pieces to keep all threads busy, including those of new workers."""
             n_threads = max(1, sum(client.nthreads().values()))
             return [
                 client.submit(_sent_on_one_thread, code, each, pure=False)
@@ -223,7 +226,10 @@ class Dask:
 
 
 def _package_of(function: Callable[[Any], Any]) -> list[ModuleType]:
-    """Where a function comes from, unless workers have it: this package, or the main program."""
+    """Package of a function as a list; empty for this package or the main program.
+
+    Those two need not be sent with their code.
+    """
     inner: Any = function
     while isinstance(inner, partial):
         inner = inner.func

@@ -1,4 +1,4 @@
-"""How far long work has come: its stages, told to whoever waits, as bars or not at all."""
+"""Progress of long computations in stages: shown as bars, passed to a function, or not shown."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Advance = Callable[[int], None]
 
 
 def nothing(n_more: int) -> None:
-    """The advance of work that nobody watches."""
+    """Ignore the number of finished pieces."""
 
 
 @runtime_checkable
 class Progress(Protocol):
-    """Whoever watches long work. Write one for a bar of your own, and pass it as `progress=`.
+    """Interface of progress displays. Implement it for your own display, passed as `progress=`.
 
-    A stage is entered before its work begins, and left when it is over or has failed. It yields a
-    function to be told of every number of pieces that are done. Stages may lie within stages.
-    total: number of pieces; None where it is not known before. unit: what a piece is, a noun;
-    empty for work that is not counted. label: what is computed.
+    A stage is a context: entered before its work begins, left when the work is over or has failed.
+    It yields a function to be called with each number of newly finished pieces. Stages may be
+    nested. total: number of pieces; None if it is not known in advance. unit: noun for a piece;
+    empty for work that is not counted. label: name of the computation.
     """
 
     def stage(
@@ -35,7 +35,7 @@ class Progress(Protocol):
 
 @dataclass(frozen=True)
 class Silent:
-    """Nobody watches."""
+    """Progress that is not displayed."""
 
     def stage(
         self, total: int | None, unit: str, label: str = ""
@@ -48,9 +48,9 @@ SILENT = Silent()
 
 @dataclass(frozen=True)
 class Bars:
-    """A bar per stage on the standard error, where that is a terminal or a notebook.
+    """Progress bars on standard error, one per stage, in a terminal or a notebook.
 
-    A bar goes when its stage is over. Logs and pipes see nothing.
+    A bar disappears when its stage is over. Nothing is written to logs and pipes.
     """
 
     @contextmanager
@@ -67,13 +67,13 @@ class Bars:
             bar_format=_layout(total, unit, label),
             leave=False,
             disable=False,
-            miniters=1,  # slow pieces after fast ones are shown as they come
+            miniters=1,  # update for every piece, also for slow pieces after fast ones
         ) as bar:
             yield lambda n_more: bar.update(n_more) and None
 
 
 def _layout(total: int | None, unit: str, label: str) -> str:
-    """What tqdm writes on a line."""
+    """Format of a bar for tqdm."""
     if not unit:
         return "{desc} ... "
     if total is None:
@@ -83,7 +83,7 @@ def _layout(total: int | None, unit: str, label: str) -> str:
 
 @dataclass(frozen=True)
 class Told:
-    """A function that is told of finished pieces, whatever they are."""
+    """Progress that is passed to a function, which receives the number of finished pieces."""
 
     advance: Advance
 
@@ -94,12 +94,12 @@ class Told:
 
 
 def is_watched() -> bool:
-    """Whether the standard error is read by people as it comes."""
+    """True if standard error is a terminal or a notebook, where someone may be watching."""
     return "ipykernel" in sys.modules or (sys.stderr is not None and sys.stderr.isatty())
 
 
 def as_progress(progress: Progress | Advance | bool) -> Progress:
-    """True means bars, False nobody; a function is told of finished pieces."""
+    """Convert to a Progress: True gives bars, False none; a function receives finished pieces."""
     if isinstance(progress, bool):
         return Bars() if progress else SILENT
     return progress if isinstance(progress, Progress) else Told(progress)
@@ -108,7 +108,7 @@ def as_progress(progress: Progress | Advance | bool) -> Progress:
 def count_pieces(
     progress: Progress, pieces: Collection[Piece], unit: str, label: str = ""
 ) -> Iterator[Piece]:
-    """Every piece in turn, as a stage: one is done when the next is asked for."""
+    """Yield every piece as part of a stage; a piece counts as done when the next is requested."""
     with progress.stage(len(pieces), unit, label) as advance:
         for piece in pieces:
             yield piece

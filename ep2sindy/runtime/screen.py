@@ -1,4 +1,4 @@
-"""What values show of themselves: a screen of text, or a table in a notebook."""
+"""Display of objects: text that fits a screen, or an HTML table in a notebook."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from typing import Any
 
 WIDTH, N_LINES = 100, 25
 
-# Controls but tab and new line, marks of direction, signs without width, halves of signs.
+# Control characters except tab and newline, direction marks, zero-width characters, surrogates.
 _HIDDEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ud800-\udfff\ufeff]"
 )
 
 
 def plain(text: str) -> str:
-    """Text from anywhere as a terminal may be given it: what steers terminals is written out."""
+    """Make text from any source safe for a terminal: control characters are written as escapes."""
     return _HIDDEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def in_line(text: str) -> str:
-    """The same for what stands within a line."""
+    """Make text safe for a terminal as part of one line; newlines and tabs are escaped as well."""
     return plain(text).replace("\n", "\\n").replace("\t", "\\t")
 
 
 def say(text: str, *, error: bool = False) -> None:
-    """A line for who watches; error: on standard error. See `on_screen`."""
+    """Print a line; error: to standard error. A failing stream is ignored, see `on_screen`."""
     stream = sys.stderr if error else sys.stdout
     with on_screen(stream):
         print(plain(text), file=stream, flush=True)
@@ -36,9 +36,9 @@ def say(text: str, *, error: bool = False) -> None:
 
 @contextmanager
 def on_screen(stream: Any) -> Iterator[None]:
-    """Print to a stream within: a screen that has gone away (`| head`), or is full, ends nothing.
+    """Print to a stream within this context, ignoring a closed pipe (`| head`) or a full disk.
 
-    What is printed after goes nowhere.
+    After such an error, everything else printed to the stream is discarded.
     """
     try:
         yield
@@ -50,7 +50,7 @@ def on_screen(stream: Any) -> Iterator[None]:
 
 
 def one_screen(lines: Sequence[str], *, n_lines: int = N_LINES) -> str:
-    """Lines cut to the width of a screen, and to its height: `... 7 more lines`."""
+    """Cut lines to the width and height of a screen, ending in `... 7 more lines` if needed."""
     if len(lines) > n_lines:
         lines = [*lines[: n_lines - 1], f"... {len(lines) - n_lines + 1} more lines"]
     return "\n".join(cut(plain(line)) for line in lines)
@@ -61,7 +61,10 @@ def cut(text: str, width: int = WIDTH) -> str:
 
 
 def wrap(parts: Sequence[str], *, what: str, n_lines: int, indent: str = "    ") -> list[str]:
-    """Parts joined by blanks into lines of a screen's width: at the end `... 7 more terms`."""
+    """Join parts by blanks into lines of a screen's width, at most `n_lines` of them.
+
+    If parts are left out, the last line reads `... 7 more terms`, with `what` as the noun.
+    """
     lines, counts = [""], [0]
     for k, part in enumerate(parts):
         if lines[-1] and len(lines[-1]) + 1 + len(part) > WIDTH:
@@ -69,7 +72,7 @@ def wrap(parts: Sequence[str], *, what: str, n_lines: int, indent: str = "    ")
             counts.append(0)
         joint = " " if lines[-1].strip() else ""
         lines[-1] = cut(lines[-1] + joint + part)
-        counts[-1] += k > 0  # the first part is the head of what follows
+        counts[-1] += k > 0  # the first part is a heading and is not counted
     if len(lines) > 1 >= n_lines:
         return [f"{parts[0]} ... {len(parts) - 1} {what}"]
     if len(lines) > n_lines:
@@ -79,7 +82,7 @@ def wrap(parts: Sequence[str], *, what: str, n_lines: int, indent: str = "    ")
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Columns side by side, each as wide as its longest cell."""
+    """Lines of a table in plain text; each column is as wide as its longest cell."""
     cells = [[in_line(cell) for cell in row] for row in (header, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return [
@@ -88,7 +91,7 @@ def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str
 
 
 def html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML already: what may hold < or & must come escaped."""
+    """HTML table of cells that are HTML already: < and & in plain text must be escaped before."""
     head = "".join(f"<th>{cell}</th>" for cell in header)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

@@ -1,6 +1,7 @@
-"""One thread: sums come in one order, and threads do not wait for each other over small arrays.
+"""Restriction of linear algebra and PyTorch to one thread.
 
-What is independent runs side by side in processes instead (`parallel.py`).
+Sums are then always added in the same order, and no time is lost on synchronising threads over
+small arrays. Independent work runs in parallel processes instead (`parallel.py`).
 """
 
 from __future__ import annotations
@@ -13,22 +14,22 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
-# Read by OpenMP and by the libraries of linear algebra when they are loaded.
+# Environment variables that OpenMP and linear algebra libraries read when they are loaded.
 NUMBERS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
 def start_on_one_thread() -> None:
-    """Keep this process, and those that it starts, on one thread each; before NumPy is imported."""
+    """Limit this process and its children to one thread each; call before NumPy is imported."""
     os.environ.update(dict.fromkeys(NUMBERS, "1"))
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one thread, also in PyTorch if it is loaded; then on as many as before.
+    """Compute on one thread within this context, also in PyTorch if it is loaded.
 
-    Serves as a decorator too.
+    The previous number of threads is restored afterwards. Also works as a decorator.
     """
-    torch = sys.modules.get("torch")  # nobody need wait for it here
+    torch = sys.modules.get("torch")  # not imported here, since the import is slow
     n_threads = torch.get_num_threads() if torch else 1
     with _pools(len(sys.modules)).limit(limits=1):
         try:
@@ -42,5 +43,5 @@ def one_thread() -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _pools(n_modules: int) -> ThreadpoolController:
-    """The pools of threads of all libraries, which are looked for again once more are loaded."""
+    """Thread pools of all loaded libraries, found anew when the number of modules changes."""
     return ThreadpoolController()

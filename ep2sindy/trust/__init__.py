@@ -1,1 +1,1 @@
-"""Guards against files, configs and folders of strangers, and against what ends a run early."""
+"""Protection against untrusted files, configs and folders, and handling of early ends of a run."""

@@ -1,4 +1,4 @@
-"""What a kept result is held to when it is read back: its own parameters, and every value."""
+"""Checksums of stored results, which verify parameters and all values when they are read back."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ CHECKSUM, MADE_OF = "checksum", "kept_for"
 
 
 def with_checksum(field: xr.Dataset, parameters: str) -> xr.Dataset:
-    """A result with what it was made of, and the checksum of all that it holds."""
+    """Add to a result the parameters it was computed from, and a checksum of all its content."""
     marked = field.assign_attrs({MADE_OF: parameters})
     return marked.assign_attrs({CHECKSUM: checksum(marked)})
 
 
 def verified(stored: xr.Dataset, parameters: str) -> xr.Dataset:
-    """The result as it was kept; raises ValueError where it is another, or has changed."""
+    """Return a stored result without its marks.
+
+    Raises ValueError if it was computed from other parameters, or has changed since.
+    """
     if stored.attrs.get(MADE_OF) != parameters:
         raise ValueError("it is of other parameters")
     if stored.attrs.get(CHECKSUM) != checksum(stored):
@@ -29,7 +32,10 @@ def verified(stored: xr.Dataset, parameters: str) -> xr.Dataset:
 
 
 def checksum(field: xr.Dataset) -> str:
-    """SHA-256 of all values, names and attributes, whatever kind of number a file makes of them."""
+    """SHA-256 of all values, names and attributes.
+
+    Numbers in attributes are hashed as float64, since a file may change their type.
+    """
     digest = hashlib.sha256()
     for name in sorted(map(str, field.variables)):
         variable = field[name]
@@ -42,7 +48,7 @@ def checksum(field: xr.Dataset) -> str:
 
 
 def _text(attributes: dict[Any, Any]) -> bytes:
-    """Attributes in the order of their names; a number as it is in float64."""
+    """Attributes sorted by name, as bytes; numbers are converted to float64."""
     plain = {
         str(name): float(value).hex() if isinstance(value, Real | np.number) else str(value)
         for name, value in attributes.items()

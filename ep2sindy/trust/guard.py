@@ -1,4 +1,4 @@
-"""Files whose libraries may die of them are looked through in a process of its own first."""
+"""Test of files in a separate process, since a damaged file can crash the library that reads it."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from threading import Lock
 from ep2sindy.trust.limits import size_of
 from ep2sindy.trust.user_code import isolate
 
-PATIENCE_S = 20.0  # and a second per 10 MB: slower than any disk
+PATIENCE_S = 20.0  # plus the time at SPEED, which is slower than any disk
 SPEED = 1e7  # bytes per s
 
 _LOCK = Lock()
 
 
 def look_through_first(path: Path, reader: str) -> None:
-    """Raise ValueError for a file that cannot be read to its end, or that the library dies of.
+    """Raise ValueError for a file that cannot be read to its end, or that crashes its library.
 
-    reader: the name of the one that will read it. The process is started once and kept. A file that
-    was sound is not looked at again until it changes.
+    reader: name of the reader that will open the file. The test process is started once and kept.
+    A file is not tested again until its size or date changes.
     """
     stat = path.stat()
     if said := _verdict(path.absolute(), reader, stat.st_size, stat.st_mtime_ns):
         raise ValueError(f"a file must be readable to its end: {said}")
 
 
-@lru_cache(maxsize=1000)  # a process may read files for weeks
+@lru_cache(maxsize=1000)  # bounded, because a process may read files for weeks
 def _verdict(path: Path, reader: str, size: int, changed_ns: int) -> str:
     with _LOCK:
         prober = _prober(os.getpid())
-        if prober.poll() is not None:  # since the last file, as by Ctrl-C in a notebook
+        if prober.poll() is not None:  # it may have ended since, as by Ctrl-C in a notebook
             _end(prober)
             prober = _prober(os.getpid())
         patience_s = PATIENCE_S + size_of(path) / SPEED
         try:
             line = _ask(prober, [str(path), reader], patience_s)
-        except BaseException:  # its answer would be taken for that on the next file
+        except BaseException:  # or a late answer would be taken as the one for the next file
             _end(prober)
             raise
         if line:
@@ -54,7 +54,7 @@ def _verdict(path: Path, reader: str, size: int, changed_ns: int) -> str:
 
 
 def _ask(prober: subprocess.Popen, file: list[str], patience_s: float) -> bytes | None:
-    """What it says of a file; nothing, if it dies, and None, if it takes too long."""
+    """Answer of the test process about a file; empty if it crashes, None if it takes too long."""
     assert prober.stdin is not None
     assert prober.stdout is not None
     prober.stdin.write(json.dumps(file).encode() + b"\n")
@@ -63,28 +63,28 @@ def _ask(prober: subprocess.Popen, file: list[str], patience_s: float) -> bytes 
 
 
 def _end(prober: subprocess.Popen) -> int:
-    """The status of a process that is ended here, if it has not ended itself."""
+    """Kill the test process if it still runs, and return its exit status."""
     _prober.cache_clear()
     prober.kill()
     return prober.wait()
 
 
 def _answers(prober: subprocess.Popen, patience_s: float) -> bool:
-    """Whether it says something, or ends, in time."""
+    """True if the test process answers or ends in time."""
     if os.name == "nt":
-        return True  # no pipe can be waited for there
+        return True  # on Windows, select does not work with pipes
     assert prober.stdout is not None
     return bool(select.select([prober.stdout], [], [], patience_s)[0])
 
 
 @cache
 def _prober(process: int) -> subprocess.Popen:
-    """One for each process of ours: a fork must not share its parent's."""
+    """Start the test process, one for each of our processes: a fork must not share its parent's."""
     command, environment = isolate("ep2sindy.trust.probe")
     return subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env={**environment, "MALLOC_PERTURB_": "165"},  # luck is no soundness
+        env={**environment, "MALLOC_PERTURB_": "165"},  # makes reads of freed memory fail reliably
     )

@@ -1,4 +1,4 @@
-"""The end of a run by a signal: as Ctrl-C ends it, and its workers with it."""
+"""Termination of a run by a signal, handled like Ctrl-C, and termination of its workers."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import time
 from functools import cache
 from types import FrameType
 
-ENDING = ("SIGTERM", "SIGHUP")  # of batch systems and of terminals that close
+ENDING = ("SIGTERM", "SIGHUP")  # sent by batch systems, and by terminals that close
 
-LOOK_S = 0.5  # between two looks of a worker at its parent
+LOOK_S = 0.5  # interval at which a worker checks its parent
 
 
 def end_as_interrupted() -> None:
-    """Let signals that ask the process to end raise KeyboardInterrupt, as Ctrl-C does."""
+    """Make termination signals raise KeyboardInterrupt, as Ctrl-C does."""
     for name in ENDING:
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, _interrupt)  # `nohup` asked to ignore it: then it is
+            signal.signal(number, _interrupt)  # not if `nohup` has set the signal to be ignored
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -28,9 +28,9 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 @cache
 def end_with(parent: int) -> None:
-    """End this process soon after its parent: a run that was killed tells its workers nothing.
+    """End this process soon after its parent, because a killed run cannot notify its workers.
 
-    May be called before every piece of work; one watch is kept.
+    May be called before every piece of work; only one watching thread is started.
     """
     if hasattr(os, "getppid"):
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()

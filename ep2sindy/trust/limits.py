@@ -1,25 +1,26 @@
-"""How much a file may ask for: what it declares is counted before it is believed."""
+"""Limits on what a file may declare, checked before memory is allocated for it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-N_NAMES = 100_000  # arrays in one file
-DEPTH = 64  # of groups in groups
+N_NAMES = 100_000  # largest number of arrays in one file
+DEPTH = 64  # deepest nesting of groups
 
-# Bytes that an array may have in memory whatever its file is, and per byte of the file: deflate
-# packs zeros a thousandfold, but no file of samples holds so little.
+# Bytes that an array may take in memory: ALWAYS for any file, or PER_BYTE for each byte of the
+# file if that is more. Deflate compresses zeros a thousandfold, but no file of real samples is so
+# compressible.
 ALWAYS, PER_BYTE = 2**28, 200
 
 
 def check_kind(path: Path) -> None:
-    """Raise ValueError for what is neither a file nor a folder: opening a pipe waits for ever."""
+    """Raise ValueError for anything but a file or a folder: opening a pipe would wait forever."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(f"a file or a folder must come: {path} is a pipe, a socket or a device")
 
 
 def check_declared(what: str, n_bytes: int, path: Path) -> None:
-    """Raise ValueError for an array that is too large for the file it is said to be in."""
+    """Raise ValueError if an array is too large for the file that declares it."""
     most = max(ALWAYS, PER_BYTE * size_of(path))
     if n_bytes > most:
         raise ValueError(
@@ -30,6 +31,6 @@ def check_declared(what: str, n_bytes: int, path: Path) -> None:
 
 
 def size_of(path: Path) -> int:
-    """Bytes of a file, or of all in a folder."""
+    """Size in bytes of a file, or of all files in a folder."""
     files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
     return sum(each.stat().st_size for each in files)

@@ -1,19 +1,19 @@
-"""Memory is counted before it is asked for: a program that is killed for it can say nothing."""
+"""Check of memory before it is allocated: a process killed for lack of memory gives no message."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-UNCOUNTED = 2**28  # bytes that are not worth a look
+UNCOUNTED = 2**28  # bytes up to which no check is made
 CGROUP = Path("/sys/fs/cgroup")
 
 
 def free_bytes() -> int:
-    """What may still be taken: of the machine, and of the group of processes that we run in."""
+    """Free memory in bytes: of the machine, or of our control group if that has less."""
     pages = "SC_AVPHYS_PAGES" if "SC_AVPHYS_PAGES" in os.sysconf_names else "SC_PHYS_PAGES"
     free = os.sysconf(pages) * os.sysconf("SC_PAGE_SIZE")
-    try:  # what the system keeps of files, and gives back, counts as free
+    try:  # MemAvailable includes the page cache, which the system gives back on demand
         lines = Path("/proc/meminfo").read_text().splitlines()
         free = next(1024 * int(line.split()[1]) for line in lines if line[:13] == "MemAvailable:")
     except (OSError, StopIteration, ValueError):
@@ -21,15 +21,16 @@ def free_bytes() -> int:
     try:
         limit, used = ((CGROUP / f"memory.{name}").read_text() for name in ("max", "current"))
         free = min(free, int(limit) - int(used))
-    except (OSError, ValueError):  # there is none, or it is "max"
+    except (OSError, ValueError):  # there is no limit, or it reads "max"
         pass
     return max(free, 0)
 
 
 def check_memory(n_bytes: float, what: str, *, way_out: str, each: float = 0.0) -> None:
-    """Raise ValueError where an array, or several, would take more than there is.
+    """Raise ValueError if one or several arrays would take more memory than is free.
 
-    what, way_out: for the message. each: bytes of one piece; the message says how many would fit.
+    what, way_out: texts for the message. each: bytes per piece; if given, the message says how
+    many pieces would fit.
     """
     if n_bytes <= UNCOUNTED or n_bytes <= (free := free_bytes()):
         return

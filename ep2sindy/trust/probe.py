@@ -1,7 +1,8 @@
-"""The process that looks through a file first, for libraries in C may die of a damaged one.
+"""Test process that reads files first, since a damaged one may crash the C library that reads it.
 
-Run as `python -m ep2sindy.trust.probe`: a path and the name of its reader come in as JSON,
-one line for each file, and "" or what is wrong with the file goes out. It ends when its input does.
+Run as `python -m ep2sindy.trust.probe`. Each line of input is JSON with a path and the name of its
+reader. Each line of output is JSON: "" for a sound file, or what is wrong with it. The process ends
+with its input.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from typing import Any
 
 from ep2sindy.trust.limits import DEPTH, N_NAMES, check_declared
 
-SLAB = 2**24  # values read at once
-READ_THROUGH = 2**30  # bytes of an array that are all read; of a longer one its ends
+SLAB = 2**24  # number of values read at once
+READ_THROUGH = 2**30  # bytes up to which an array is read completely; of a longer one, its ends
 
-MEMORY = 2**31  # bytes of address space beyond twenty times the file
+MEMORY = 2**31  # limit of address space in bytes, in addition to twenty times the file's size
 
 
 def look_through(path: Path, reader: str) -> None:
-    """Read all that a file holds, as its reader would; raises what is wrong with it."""
+    """Read the content of a file as its reader would; raises an error if something is wrong."""
     with path.open("rb") as file:
         head = file.read(10)
     if head.startswith(b"MATLAB 5.0"):
@@ -37,7 +38,7 @@ def _matlab(path: Path) -> None:
     from scipy.io import loadmat, whosmat
 
     for name, shape, kind in whosmat(path):
-        is_nested = kind in ("struct", "cell", "object")  # whose elements are objects of Python
+        is_nested = kind in ("struct", "cell", "object")  # their elements become Python objects
         check_declared(repr(name), prod(shape) * (256 if is_nested else 8), path)
     loadmat(path, simplify_cells=True)
 
@@ -49,7 +50,7 @@ def _netcdf(path: Path) -> None:
         for name, found in file.variables.items():
             for attribute in found.ncattrs():
                 found.getncattr(attribute)
-            if not file.data_model.startswith("NETCDF4"):  # else HDF5 has read the values
+            if not file.data_model.startswith("NETCDF4"):  # otherwise _hdf5 has read the values
                 check_declared(repr(name), found.size * found.dtype.itemsize, path)
                 found[...]
 
@@ -71,7 +72,7 @@ def _group(group: Any, path: Path, *, depth: int, seen: set[Any]) -> None:
         if isinstance(link, h5py.ExternalLink):
             raise ValueError(f"{name!r} is in another file, {link.filename!r}; open that one")
         if isinstance(link, h5py.SoftLink):
-            continue  # what it names is met under its own name, or is not there
+            continue  # its target is visited under its own name, or does not exist
         item = group[name]
         if item.id in seen:
             continue
@@ -105,7 +106,10 @@ def _array(found: Any, path: Path) -> None:
 
 
 def _chunks(found: Any) -> None:
-    """What the index lists must be found by it, or values read as if nobody had written them."""
+    """Raise ValueError unless the index leads to every chunk that it lists.
+
+    Otherwise their values would read as if they had never been written.
+    """
     places: list[tuple[int, ...]] = []
     found.id.chunk_iter(lambda chunk: places.append(chunk.chunk_offset))
     if len(set(places)) < len(places):
@@ -123,13 +127,13 @@ def _limit(path: Path) -> None:
     try:
         import resource
     except ImportError:
-        return  # Windows has no limits of this kind
+        return  # Windows does not offer such limits
     most = MEMORY + 20 * path.stat().st_size
     resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
 
 
 def main() -> None:
-    """Answer one line for each that comes; what libraries print goes elsewhere."""
+    """Answer each input line with one line; whatever libraries print goes to standard error."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -139,7 +143,7 @@ def main() -> None:
             _limit(path)
             look_through(path, reader)
             said = ""
-        except Exception as error:  # any: it goes to the one who asked
+        except Exception as error:  # of any kind: it is reported to the process that asked
             said = str(error).strip() or type(error).__name__
         print(json.dumps(said), file=answers, flush=True)
 

@@ -1,8 +1,8 @@
-"""Code of the user's own: modules below the folder that a run is started in.
+"""User code for configs: modules below the folder in which a run is started.
 
-A config may come from anybody, and so may name no other code than the package's and that of this
-folder, of which it may call only what is marked for it. The folder may be full of what others
-wrote, with the names of modules: nothing of it is imported but what is named.
+A config may come from anyone. It may therefore name only code of this package and code in that
+folder, and of the latter only functions and classes that are marked for configs. The folder itself
+may hold files by others that shadow module names, so nothing in it is imported unless it is named.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from typing import Any, TypeVar
 
 PACKAGE = Path(__file__).resolve().parents[1]
 MARK = "__offered_to_configs__"
-SAFE = "PYTHONSAFEPATH"  # asks Python to import nothing of the current folder
+SAFE = "PYTHONSAFEPATH"  # tells Python to import nothing from the current folder
 Called = TypeVar("Called", bound=Callable[..., Any])
 
-_OWN: dict[str, ModuleType] = {}  # the first part of a dotted name -> what it names
+_OWN: dict[str, ModuleType] = {}  # first part of a dotted name -> its module
 
 
 def leave_folder() -> None:
-    """Import nothing from the current folder from now on, unless it is a checkout of the package.
+    """Stop imports from the current folder, unless it is a checkout of the package.
 
-    Raises ValueError where the folder is gone.
+    Raises ValueError if the folder no longer exists.
     """
     try:
         here = Path.cwd()
@@ -42,24 +42,26 @@ def leave_folder() -> None:
 
 
 def isolate(module: str) -> tuple[list[str], dict[str, str]]:
-    """Command and environment of a process that runs a module of the package, and that imports
-    nothing of the current folder, unless it is a checkout of the package."""
+    """Command and environment of a process that runs a module of the package.
+
+    The process imports nothing from the current folder, unless it is a checkout of the package.
+    """
     here = Path.cwd()
     places = [path for path in sys.path if path]
-    if here != PACKAGE.parent:  # else another checkout that is installed would be found before it
+    if here != PACKAGE.parent:  # in a checkout the path stays, or an installed one would be found
         places = [path for path in places if Path(path).resolve() != here]
     known = os.pathsep.join([*places, str(PACKAGE.parent)])
     return [sys.executable, "-P", "-m", module], {**os.environ, SAFE: "1", "PYTHONPATH": known}
 
 
 def away_from(settings: str) -> AbstractContextManager[None]:
-    """Stand elsewhere while something is imported that would read this file of the folder."""
+    """Change the folder during an import that would read this settings file, if there is one."""
     return chdir(PACKAGE) if os.path.exists(settings) else nullcontext()
 
 
 @contextmanager
 def isolate_children() -> Iterator[None]:
-    """Processes of Python that are started within import nothing of the current folder."""
+    """Let Python processes started in this context import nothing from the current folder."""
     before = os.environ.get(SAFE)
     os.environ[SAFE] = "1"
     try:
@@ -74,10 +76,10 @@ def isolate_children() -> Iterator[None]:
 def for_configs(call: Called) -> Called:
     """Mark a function or class of your own, so that configs may name it: `@ep.for_configs`.
 
-    A config then says `_target_: my_module.crop_twice`, of my_module.py in the folder that the
-    run is started in.
+    A config can then use `_target_: my_module.crop_twice` for a function in my_module.py, which
+    lies in the folder where the run is started.
     """
-    setattr(call, MARK, call)  # itself: a class derived from it is not marked by that
+    setattr(call, MARK, call)  # refers to itself, so that derived classes do not count as marked
     return call
 
 
@@ -86,11 +88,11 @@ def is_for_configs(value: object) -> bool:
 
 
 def load_user_module(name: str) -> ModuleType:
-    """The module of a file below the current folder, by its dotted name.
+    """Load a module from a file below the current folder, by its dotted name.
 
-    Modules of a folder may import each other by its name, `from studies.tools import crop`.
-    Raises ModuleNotFoundError where there is no such file, or where the name is that of an
-    installed package or of the standard library, before anything is run.
+    Modules in a folder can import each other by its name: `from studies.tools import crop`.
+    Raises ModuleNotFoundError, before anything is run, if there is no such file, or if the name
+    belongs to an installed package or the standard library.
     """
     parts = name.split(".")
     here = Path.cwd()
@@ -102,24 +104,24 @@ def load_user_module(name: str) -> ModuleType:
 
 
 def own_source(name: str) -> Path | None:
-    """The file or folder below the current one that holds the code of a dotted name."""
+    """File or folder below the current folder that holds the code of a dotted name, or None."""
     root = Path.cwd() / name.partition(".")[0]
     return root if root.is_dir() else _file(root)
 
 
 def own_packages() -> list[ModuleType]:
-    """What configs have named, whose code no other process can import by its name."""
+    """User modules that configs have named; other processes cannot import them by name."""
     return [module for name, module in _OWN.items() if sys.modules.get(name) is module]
 
 
 def _file(place: Path) -> Path | None:
-    """The source of a module, or of a package, that a dotted name leads to."""
+    """Source file of the module or package at a place, or None."""
     files = (place.with_suffix(".py"), place / "__init__.py")
     return next((file for file in files if file.is_file()), None)
 
 
 def _load(name: str, place: Path) -> None:
-    """Make a module from its source: a file of bytecode beside it need not say the same."""
+    """Load a module from its source, ignoring bytecode beside it, which may differ."""
     known = find_spec(name)
     if known is not None and not _lies_at(known, place):
         raise ModuleNotFoundError(
@@ -149,7 +151,7 @@ def _lies_at(spec: ModuleSpec, place: Path) -> bool:
 
 
 def _spec(name: str, place: Path) -> ModuleSpec:
-    """Of a module's source, a package, or a folder with modules."""
+    """Import specification of a module, a package, or a folder with modules."""
     file = _file(place)
     if file is None:
         spec = ModuleSpec(name, None, is_package=True)
