@@ -46,8 +46,7 @@ def open_field(
     time, z, r: the coordinates; None, or name None, if the file has none.
     dt_s: time step in s, for a file without times; it replaces `time` if both are given.
     mask: array that is nonzero where there is plasma; elsewhere values become NaN.
-    channel_m: length of the channel from z = 0, stored in the field's attributes; None: the
-        length that the file gives.
+    channel_m: length of the channel from z = 0, stored as an attribute; None: as in the file.
     chunks: our dimension -> length, to stream data that exceed memory (needs dask; NetCDF, Zarr).
     Values from NetCDF and Zarr are read when they are used; without dask, this holds for variables
     in SI without a mask. Other kinds of file are read at once.

@@ -50,8 +50,7 @@ def zone_average(
     which none of them is masked.
     products: each, such as "n_i*n_n*R_ion", adds an input named `<n_i*n_n*R_ion>` with the average
     of the product, which is not the product of averages. If a variable's attribute `average_of`
-    names the product, that variable is used instead: a simulation's samples are averages in time,
-    and so is this variable.
+    names the product, that variable is used: like a simulation's samples, it is averaged in time.
     Sums run in float64, slab by slab in time, whatever the storage type. Samples at which a
     variable of time alone is missing (NaN) are left out for all variables.
     Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
