@@ -23,7 +23,7 @@ from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
 
-MAX_NOTES = 6  # on a screen
+MAX_NOTES = 6  # shown in the repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,12 @@ class Discovery:
     fronts: for each state, candidates with their scores, the lowest selected. chosen: for each
     state, the selected candidate with its coefficients in the model. If the noise of the samples is
     propagated into the rows, these come from a weighted refit. Their covariance is in the model.
-    method: that found the model. noise_test: test of the residuals against the noise. ambiguities:
-    terms that these data cannot tell apart, and warnings of too few rows for the terms. note: how a
-    rule for whole systems decided, how certain a trajectory search is, or that the residuals exceed
-    the noise; else empty. remarks: sentences on where the samples deviate from the assumptions
-    (`Estimate.remarks`). estimate: of states and coefficients together, after a trajectory search.
+    method: that found the model. noise_test: test of the residuals against the noise.
+    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
+    terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
+    the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
+    the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
+    trajectory search.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)

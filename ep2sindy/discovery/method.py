@@ -106,8 +106,8 @@ class Finding:
 class DiscoveryMethod(Protocol):
     """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
 
-    selection: the rule that chooses among candidates. depth: candidates kept per size. provenance:
-    record in a model of how it was found.
+    selection: the rule that chooses among candidates. depth: candidates kept per size.
+    provenance: record in a model of how it was found.
     """
 
     @property
@@ -264,8 +264,9 @@ def _ambiguities_of_samples(runs: Sequence[Trajectory], library: Library) -> tup
 class SearchedEquation:
     """One equation of a regression after the search.
 
-    draws: the bootstraps of its rows. number: its index among the equations of those rows. found:
-    supports proposed by the search in every draw. supports: the same, pooled. front: their fits.
+    draws: the bootstraps of its rows. number: its index among the equations of those rows.
+    found: supports proposed by the search in every draw. supports: the same, pooled. front: their
+    fits.
     """
 
     draws: Resamples

@@ -313,8 +313,8 @@ class Block:
 def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
     """Rectangles of at most `n_points` points, made of whole lines along the last axis if one fits.
 
-    Points that are neighbours in a file are then read together. Raises ValueError for n_points
-    below one.
+    Points that are neighbours in a file are then read together.
+    Raises ValueError for n_points below one.
     """
     if n_points < 1:
         raise ValueError(f"a block needs a point: block_points={n_points} came")

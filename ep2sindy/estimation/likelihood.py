@@ -63,8 +63,8 @@ class Level:
 class TrajectoryFit:
     """Fitted states and coefficients.
 
-    paths: for each record, (samples, d), scaled. free: (free,), zero outside the support. squares:
-    (d,), the objective by state; infinite if the flow is not finite.
+    paths: for each record, (samples, d), scaled. free: (free,), zero outside the support.
+    squares: (d,), the objective by state; infinite if the flow is not finite.
     """
 
     paths: tuple[np.ndarray, ...]

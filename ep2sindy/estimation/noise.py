@@ -198,8 +198,8 @@ def flow_error(problem: EstimationProblem, fit: TrajectoryFit, noise: Noise, exa
     """The rho under which the fit's support is most likely; 0 if an exact flow is.
 
     The exact flow is weighed with correlated noise if the noise is correlated; a flow with error is
-    weighed with white noise. Source of the likelihood by innovations: Schweppe 1965,
-    doi:10.1109/TIT.1965.1053737.
+    weighed with white noise.
+    Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
     white = replace(exact, noise=noise.white)
     by_memory = problem.n_samples * np.log1p(-np.square(noise.memory)).sum()

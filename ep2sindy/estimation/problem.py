@@ -96,8 +96,9 @@ class EstimationProblem:
     """Records, the library of their variables, and the coefficients: coef = C free + fixed.
 
     library: of scaled variables, states first. term_names: names of its terms in SI variables.
-    equation, column: (coefficients,), the equation and the term of each coefficient. C:
-    (coefficients, free), fixed: (coefficients,), both scaled; without relations C is the identity.
+    equation, column: (coefficients,), the equation and the term of each coefficient.
+    C: (coefficients, free), fixed: (coefficients,), both scaled; without relations C is the
+    identity.
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
     advance: called at every step of a fit.

@@ -143,7 +143,7 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
         delays = delays + step
         here = move_channels(here, now.annealed.fit.paths, step)
         if min(len(record.samples) for record in here.records) < MIN_LEFT:
-            return None  # brought as far apart as a record is long: that is no delay
+            return None  # shifts as long as a record are no delays
         now = _from_start(here, None, max_terms)
         if now.annealed.around is None:
             return None
@@ -151,7 +151,7 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
         step = fit_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
         if np.abs(step).max() < SETTLED:
             break
-    # Samples at the ends are left out: their share of the likelihood is that of the others.
+    # Samples at the ends are left out: scale the likelihood to the full number of samples.
     score = now.score + now.noise.deviance * (problem.n_samples / here.n_samples - 1.0)
     price = late.sum() * log(problem.n_samples) + PAYS
     return Aligned(here, now, delays) if now.fits and score + price < found.score else None

@@ -142,7 +142,7 @@ class RefinedScore:
         """Pairs of windows to refine on and windows to judge on; every window judges once."""
         pieces = self._pieces(runs, self._window(runs, ensemble.states))
         n_folds = min(N_FOLDS, len(pieces))
-        nothing_left_to_chance = np.random.default_rng(0)  # a trajectory for every window
+        nothing_left_to_chance = np.random.default_rng(0)  # one window per trajectory
 
         def batch(chosen: list[Trajectory]) -> WindowBatch:
             return cut_windows(
