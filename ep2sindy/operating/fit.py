@@ -262,8 +262,8 @@ def leave_one_out(
 ) -> list[LeaveOneOut]:
     """Test each point in turn with the law of the others: weighted, or tied if `start` is given.
 
-    start: the law that the tied laws start from. Raises ValueError if the points without one do not
-    suffice for the law.
+    start: the law that the tied laws start from.
+    Raises ValueError if the points without one do not suffice for the law.
     """
     for k, record in enumerate(fit.records):
         try:

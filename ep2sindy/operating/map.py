@@ -42,8 +42,9 @@ class Fate(StrEnum):
 class MapPoint:
     """A law's model at one operating point.
 
-    inside: True in the hull of the records. frequency_Hz, relative_amplitude: of its cycle
-    (standard deviation over mean, root mean square over the states); NaN without a cycle.
+    inside: True in the hull of the records.
+    frequency_Hz, relative_amplitude: of its cycle (standard deviation over mean, root mean square
+    over the states); NaN without a cycle.
     growth_per_s: largest real part of the fixed point's eigenvalues, in 1/s, positive if it is
     unstable; NaN if there is no fixed point near. second: modulus of the second Floquet multiplier;
     NaN without a cycle.

@@ -276,9 +276,9 @@ def resample_coefficients(
 
     A draw counts groups of rows, the same for all equations. Each equation keeps the weight that it
     has on all rows, and rows of known noise stay whitened as under `model`. model: result of
-    `constrained_fit` on these problems. block: number of consecutive groups in a block. Returns one
-    column per coefficient of the constraint. The draws are shifted so that their mean is the fit:
-    blocks seldom reach the ends of the record, which would bias them.
+    `constrained_fit` on these problems. block: number of consecutive groups in a block.
+    Returns one column per coefficient of the constraint. The draws are shifted so that their mean
+    is the fit: blocks seldom reach the ends of the record, which would bias them.
     Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for Dependent
     Data, 2.5, for the centre.

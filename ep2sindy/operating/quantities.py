@@ -128,7 +128,8 @@ def estimates_of_draws(
     """Estimates with intervals from percentiles of draws, and the draws of every quantity.
 
     The reciprocal of a coefficient has an infinite interval if the coefficient's interval holds
-    zero. coef, draws: in the order of the constraint's coefficients.
+    zero.
+    coef, draws: in the order of the constraint's coefficients.
     """
     estimates, drawn = {}, {}
     for name, quantity in quantities.items():

@@ -35,7 +35,8 @@ class OperatingRecord:
 
     trajectory: None if the source says that nothing oscillates. status: as the source says; only
     "oscillating" is checked, other values are taken as given. notes: remarks on problems of the
-    data. used: description of the data. Raises ValueError for parameters that are not finite.
+    data. used: description of the data.
+    Raises ValueError for parameters that are not finite.
     """
 
     parameters: Mapping[str, float]
@@ -186,9 +187,10 @@ def interpolation_errors(
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
     """Leave-one-out errors of interpolating frequency and amplitude by functions of the parameters.
 
-    Both are interpolated directly, in logarithms. Returns the relative error of the frequency, and
-    the largest relative error of the standard deviation over the states. They show how smoothly the
-    records vary: no law of these functions can be much better.
+    Both are interpolated directly, in logarithms.
+    Returns the relative error of the frequency, and the largest relative error of the standard
+    deviation over the states. They show how smoothly the records vary: no law of these functions
+    can be much better.
     """
     scaled = basis / zero_to_one(np.linalg.norm(basis, axis=0))
     hat = scaled @ np.linalg.pinv(scaled)

@@ -52,8 +52,8 @@ class Equation:
 class Table:
     """A table for reading: numbers to three digits, NaN as a dash, an `Equation` written out.
 
-    page_only: too long for a terminal. bold, italic: indices of rows in that style. breaks: indices
-    of rows followed by a line.
+    page_only: too long for a terminal.
+    bold, italic: indices of rows in that style. breaks: indices of rows followed by a line.
     """
 
     rows: pd.DataFrame

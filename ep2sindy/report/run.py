@@ -20,9 +20,9 @@ from ep2sindy.runtime.progress import Advance, Bars, Progress
 class Run:
     """One run of a study: name and seed, destinations of its results, and its messages.
 
-    settings: the whole config as plain values. said: messages to be repeated on the page. warnings:
-    messages about problems, for the page and the summary. provenance: version of the code, and the
-    command. watch: receives the progress of the run.
+    settings: the whole config as plain values. said: messages to be repeated on the page.
+    warnings: messages about problems, for the page and the summary. provenance: version of the
+    code, and the command. watch: receives the progress of the run.
     """
 
     title: str
