@@ -87,8 +87,9 @@ class FreeRunScore:
     The records are split into `n_folds`. Every combination of candidates, one per equation, is
     refined on windows of `window_periods` in all folds but one, then run freely over the fold held
     out, in turn for every fold. A run starts on the data's cycle at the phase where the held-out
-    part begins, not at its first sample, whose noise is not the model's fault. A system lives if
-    frequency, amplitudes and waveform stay within `bounds` of the data's cycle in every run.
+    part begins, not at its first sample, whose noise is not the model's fault. A model with inputs
+    starts at the smoothed sample instead. A system lives if frequency, amplitudes and waveform stay
+    within `bounds` of the data's cycle in every run.
     Living systems within `margin` come first; among these the smallest, and among equals the one
     with the best waveform, is refined on windows of all data and run over the longest record. It
     wins if it lives there too, on a cycle that attracts. A system on a neutral cycle wins only if
