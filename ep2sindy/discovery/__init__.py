@@ -1,4 +1,4 @@
-"""Discovery: from data to a model; alone, for several operating points, and on a grid."""
+"""Discovery: methods that find models from data, pointwise searches of a grid, and regimes."""
 
 from ep2sindy._stubs import attach
 

@@ -1,7 +1,7 @@
-"""The choice: one candidate per front as a rule has it, fitted as the model needs it.
+"""Choice of one candidate per front by a selection rule, and the final fit of the model.
 
-The last fit weighs the rows of chosen terms where their noise is known, and joins the equations to
-one model.
+The final fit weighs the rows of the chosen terms if their noise is known, and joins the equations
+into one model.
 """
 
 from __future__ import annotations
@@ -33,22 +33,23 @@ from ep2sindy.selection.rule import (
     support_of,
 )
 
-MAX_COMBINATIONS = 1_000_000  # that relations between equations may have to be checked on
+MAX_COMBINATIONS = 1_000_000  # most combinations to check for the terms of relations
 
 
-# Of a right equation chi-squared per row is 1, give or take a standard error, and a little more:
-# the noise is estimated from the samples that it judges. Measured: 0.7 to 1.3 with 70 rows.
+# For a correct equation chi-squared per row is 1 within its standard error, and a little more,
+# since the noise is estimated from the same samples. Measured: 0.7 to 1.3 with 70 rows.
 MAX_CHI_SQUARED, STANDARD_ERRORS = 1.2, 3.0
 
-SMALLEST = np.finfo(np.float64).tiny  # an exact fit leaves nothing
+SMALLEST = np.finfo(np.float64).tiny  # for exact fits, without residuals
 
 
 @dataclass(frozen=True)
 class LeftOver:
-    """What the terms of one equation leave of its rows, whitened by the noise that reaches them.
+    """Residuals of one equation on its rows, whitened by the noise that propagates into them.
 
-    chi_squared: per row, 1 where the noise is all that is left; then autocorrelation, of a row's
-    residual with the next, is 0, and leaves_noise is true.
+    chi_squared: per row, 1 if the residuals are nothing but noise. autocorrelation: of the
+    residuals of neighbouring rows, then 0. leaves_noise: True if chi_squared is consistent with
+    noise alone.
     """
 
     chi_squared: float
@@ -58,10 +59,11 @@ class LeftOver:
 
 @dataclass(frozen=True, eq=False)
 class EquationFit:
-    """The terms of one equation as they go into a model.
+    """The fitted terms of one equation of a model.
 
-    coef: (terms,), in SI. covariance: (terms, terms) of coef, in SI, where noise has been followed
-    to it and is all that is left. left: of the rows; None where their noise is not known.
+    coef: (terms,), in SI. covariance: (terms, terms) of coef, in SI; None if the noise of the rows
+    is not known, or if the residuals exceed it. left: residuals on the rows; None if their noise is
+    not known.
     """
 
     equation: str
@@ -77,11 +79,12 @@ class EquationFit:
 
 @dataclass(frozen=True, eq=False)
 class NoiseTest:
-    """Whether a model explains the data as far as their noise.
+    """Test whether a model explains the data to within their noise.
 
-    left: by state, what its equation leaves of rows; empty where no rows were asked: of a search
-    of trajectories, which tests whole trajectories, and of rules that judge free runs. misfit: why
-    the model does not explain the data; empty where it does, or where nothing was tested.
+    left: for each state, the residuals of its equation on rows. It is empty if no rows were tested:
+    after a trajectory search, which tests whole trajectories, and for rules that judge free runs.
+    misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
+    tested.
     """
 
     left: Mapping[str, LeftOver] = field(default_factory=dict)
@@ -92,10 +95,10 @@ class NoiseTest:
 class Choice:
     """Result of applying a selection rule to the Pareto fronts.
 
-    fronts: with the scores of the rule. chosen: per front the selected candidate. model: of the
-    chosen terms; its coefficients may be others than the candidates': weighted, constrained or
-    refined. note: how the rule came to it; else empty. left: by state, what the last fit leaves of
-    rows whose noise it knows; None where the model was judged by other means than rows.
+    fronts: with the scores of the rule. chosen: for each front, the selected candidate. model: of
+    the chosen terms; its coefficients may differ from the candidates' by weighting, constraints or
+    refinement. note: how the rule decided; else empty. left: for each state, the residuals of the
+    final fit on rows whose noise is known; None if the model was not judged by rows.
     """
 
     fronts: Sequence[ParetoFront]
@@ -114,10 +117,10 @@ def choose(
     provenance: Mapping[str, str],
     progress: Progress = SILENT,
 ) -> Choice:
-    """Score the candidates of a regression, select, and fit: constrained, weighted or as they are.
+    """Select from the candidates of a regression, and fit: constrained, weighted or unchanged.
 
-    Under relations the combination of least summed score wins that has the terms, and all
-    equations are fitted at once.
+    Under relations, only combinations that have the terms of the relations count. The one of least
+    summed score wins, and all equations are fitted at once.
     Raises ValueError for relations that no combination has the terms for.
     """
     library = fronts[0].rows.library
@@ -148,7 +151,7 @@ def choose_by_runs(
     provenance: Mapping[str, str],
     progress: Progress = SILENT,
 ) -> Choice:
-    """Have whole systems of candidates judged by a rule that runs them, and refines the winner.
+    """Select among systems of candidates by a rule that integrates them and refines the winner.
 
     Raises ValueError for relations that no combination has the terms for.
     """
@@ -162,7 +165,7 @@ def choose_by_runs(
 def score_by_rule(
     fronts: Sequence[ParetoFront], rule: Selection, progress: Progress
 ) -> list[ParetoFront]:
-    """Fronts with the scores of a rule that judges candidates one by one."""
+    """Fronts with the scores of a rule that judges single candidates."""
     with progress.stage(None, "", f"candidates by {rule.label}"):
         scores = rule.scores(fronts)
     return [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
@@ -175,12 +178,13 @@ def noise_test(
     left: Mapping[str, LeftOver] | None,
     estimate: Estimate | None = None,
 ) -> NoiseTest:
-    """Say what a model leaves of the noise, whatever it was found by.
+    """Test the residuals of a model against the noise, independently of the method that found it.
 
-    left: by state, what the last fit of its rows left; of states that it lacks, weak rows of the
-    runs are asked: coefficients stay as they are. Where there are none, as of a record of a few
-    samples, nothing is said. None where a rule has judged the model by running it: then rows say
-    nothing. estimate: of states and coefficients together, which has tested whole trajectories.
+    left: for each state, the residuals of the final fit. A state without any is tested on weak rows
+    of the runs, with the model's coefficients; if there are no such rows, for example for a record
+    of a few samples, that state is not tested. None if a rule judged the model by running it: rows
+    then say nothing. estimate: the joint estimate of states and coefficients, which has tested
+    whole trajectories already.
     """
     if estimate is not None:
         return NoiseTest(misfit=estimate.misfit)
@@ -195,9 +199,9 @@ def noise_test(
 def _left_of_weak_rows(
     model: SparseModel, runs: Sequence[Trajectory], states: Sequence[str]
 ) -> dict[str, LeftOver]:
-    """What some equations leave of weak rows; empty where the samples make none."""
+    """Residuals of some equations on weak rows; empty if the samples are too few for rows."""
     try:
-        # The same numbers as with all terms, at a fraction of their cost.
+        # Same result as with the whole library, at a fraction of the cost.
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
         used[0] |= not used.any()  # a library needs a term
         form, rng = Weak(split=RandomSplit(0.0)), np.random.default_rng(0)
@@ -210,13 +214,13 @@ def _left_of_weak_rows(
 
 
 def _fit_in(model: SparseModel, state: str) -> EquationFit:
-    """One equation of a model."""
+    """One equation of a model as a fit."""
     terms = model.terms(state)
     return EquationFit(state, tuple(terms), np.array(list(terms.values())))
 
 
 def _misfit(left: Mapping[str, LeftOver]) -> str:
-    """Which equations leave more than noise, in a sentence; empty where none does."""
+    """Sentence on the equations whose residuals exceed the noise; empty if there are none."""
     more = {state: each.chi_squared for state, each in left.items() if not each.leaves_noise}
     if not more:
         return ""
@@ -228,7 +232,7 @@ def _misfit(left: Mapping[str, LeftOver]) -> str:
 
 
 def fit_last(front: ParetoFront, candidate: Candidate) -> EquationFit:
-    """A selected candidate as it goes into the model: weighted, where the noise is known."""
+    """Final fit of a selected candidate, weighted if the noise of its rows is known."""
     if front.rows.noisy is None:
         return EquationFit(candidate.equation, candidate.terms, candidate.coef)
     return reweight(front.rows, candidate)
@@ -241,7 +245,7 @@ def assemble_model(
     units: Mapping[str, str],
     provenance: Mapping[str, str],
 ) -> SparseModel:
-    """Join one fit per equation into a model, as if errors of equations were independent."""
+    """Join one fit per equation into a model, with errors independent between equations."""
     blocks = [fit.covariance for fit in fits if fit.covariance is not None]
     return SparseModel(
         library=library,
@@ -256,9 +260,10 @@ def assemble_model(
 def reweight(
     problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int = 8
 ) -> EquationFit:
-    """Fit a candidate's terms again, with weights and corrected samples, and say how well.
+    """Fit a candidate's terms again, with weights and corrected samples, and test the residuals.
 
-    What leaves more than the noise of its rows has no covariance: it would not hold the truth.
+    If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
+    the truth.
     """
     terms = np.isin(problem.term_names, candidate.terms)
     scale = problem.coef_scale(0)
@@ -287,14 +292,14 @@ def reweight(
 def _least_sum(
     fronts: Sequence[ParetoFront], relations: Sequence[Relation]
 ) -> Int[np.ndarray, " fronts"]:
-    """The combination of candidates of least summed score that has the relations' terms."""
+    """The combination of least summed score among those that have the relations' terms."""
     places = admissible(fronts, combinations(fronts, MAX_COMBINATIONS), relations)
     sums = np.sum([f.scores[column] for f, column in zip(fronts, places.T, strict=True)], axis=0)
     return places[int(np.argmin(sums))]
 
 
 def _won(scores: Float[np.ndarray, " candidates"], winner: int) -> Float[np.ndarray, " candidates"]:
-    """Scores with the winner's the least: what relations chose counts as selected."""
+    """Scores with the winner's made the least, so that it counts as selected."""
     won = scores.copy()
     won[winner] = min(won[winner], np.nextafter(won.min(), -np.inf))
     return won

@@ -23,22 +23,22 @@ from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
 
-MAX_NOTES = 6  # on a screen
+MAX_NOTES = 6  # shown in the repr
 
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """What a search leaves: per state the candidates, and the model of those that were selected.
+    """Result of a discovery: the candidates of every state, and the model of the selected ones.
 
-    fronts: by state, candidates with their scores, the lowest selected. chosen: by state, the
-    selected one, with the coefficients that it has in the model: where the noise of the samples is
-    followed into the rows, fitted again with weights. Their covariance is the model's.
-    method: that it was found by. noise_test: what the model leaves of the noise.
-    ambiguities: terms that these data cannot tell apart, and rows that are few for the terms.
-    note: how a rule that judges whole systems of equations came to its model, how sure a search of
-    trajectories is, or that a model leaves more than noise; else empty.
-    remarks: what the samples show that is not as assumed, in sentences (`Estimate.remarks`).
-    estimate: of states and coefficients together, where trajectories were searched.
+    fronts: for each state, candidates with their scores, the lowest selected. chosen: for each
+    state, the selected candidate with its coefficients in the model. If the noise of the samples is
+    propagated into the rows, these come from a weighted refit. Their covariance is in the model.
+    method: that found the model. noise_test: test of the residuals against the noise.
+    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
+    terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
+    the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
+    the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
+    trajectory search.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)
@@ -60,13 +60,15 @@ class Discovery:
 
     @property
     def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
-        """By state, one per candidate of its front, the lowest selected."""
+        """For each state, one score per candidate of its front, the lowest selected."""
         return {state: front.scores for state, front in self.fronts.items()}
 
     @property
     def misfit(self) -> str:
-        """Why the model does not explain the data as far as their noise; empty where it does, or
-        where the noise is not followed into the rows."""
+        """The reason why the model does not explain the data to within their noise.
+
+        Empty if it does, or if the noise is not propagated into the rows.
+        """
         return self.noise_test.misfit
 
     def __repr__(self) -> str:
@@ -104,15 +106,15 @@ def discover(
 ) -> Discovery:
     """Find sparse equations for every state of the runs.
 
-    The method makes candidates of the runs, chooses one per equation, and fits what it chose: a
+    The method makes candidates from the runs, chooses one per equation, and fits it: a
     `TrajectorySearch` by the likelihood of whole trajectories, a `Regression` by rows.
-    runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`.
-    library: None means every product of the variables of the first run up to degree 2.
-    method: None means TrajectorySearch(), the route for noisy data that we know to be best.
-    relations: between coefficients, such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in
-    the search, in the selection and in the model. terms: by state, all the terms of an equation
-    that is known but for its coefficients. progress: True shows bars; see `Progress`.
-    recipe: the old name of method, for one version more.
+    runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`. library: None
+    means every product of the variables of the first run up to degree 2. method: None means
+    TrajectorySearch(), the best method we know for noisy data. relations: between coefficients,
+    such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search, in the selection and in
+    the model. terms: for each state whose equation is known but for its coefficients, all terms of
+    that equation. progress: True shows bars; see `Progress`. recipe: the old name of method, for
+    one more version.
     Raises ValueError for a relation or a term that the library or the states do not have.
     """
     method = method or old_name(recipe) or TrajectorySearch()
@@ -126,7 +128,7 @@ def discover(
     found = method.identify(trajectories, library, known, rng=rng, progress=watch)
     choice = found.choice
     test = noise_test(choice.model, trajectories, left=choice.left, estimate=found.estimate)
-    # Intervals of a model that leaves more of its rows than noise would not hold the truth.
+    # If the residuals of the rows exceed the noise, intervals would not cover the truth.
     withheld = bool(test.left and test.misfit)
     return Discovery(
         fronts={front.equation: front for front in choice.fronts},
@@ -142,6 +144,6 @@ def discover(
 
 
 def _as_in(model: SparseModel, candidate: Candidate) -> Candidate:
-    """A candidate with its coefficients as a model has them."""
+    """A candidate with the coefficients that it has in a model."""
     terms = model.terms(candidate.equation)
     return replace(candidate, coef=np.array([terms.get(name, 0.0) for name in candidate.terms]))

@@ -1,8 +1,8 @@
-"""Methods: how equations are made of runs, each in one value that every discovery takes.
+"""Discovery methods, each a single value with all settings of a search.
 
-A `TrajectorySearch` fits states and coefficients together; a `Regression` makes rows of the runs,
-and searches these. Both make candidates of runs, choose among them and fit what they chose, by
-`identify`.
+A `TrajectorySearch` fits states and coefficients together; a `Regression` makes rows from the runs,
+and searches these. The method `identify` of both makes candidates, chooses among them and fits the
+chosen ones.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ M = TypeVar("M")
 
 @dataclass(frozen=True)
 class Known:
-    """What a user knows of the equations before they are searched.
+    """Knowledge of the user about the equations before the search.
 
-    relations: between coefficients. terms: by state, of an equation that is known but for its
-    coefficients; it is not searched.
+    relations: between coefficients. terms: for each state whose equation is known but for its
+    coefficients, all terms of that equation; it is not searched.
     """
 
     relations: Sequence[Relation] = ()
@@ -50,7 +50,7 @@ class Known:
     def of(
         self, equation: str, library: Library, found: Sequence[Bool[np.ndarray, "_ terms"]]
     ) -> list[Bool[np.ndarray, "_ terms"]]:
-        """What was found for an equation in every draw, as far as it agrees with what is known.
+        """Supports found for an equation in every draw, made consistent with this knowledge.
 
         Raises ValueError for a term that the library does not have.
         """
@@ -63,7 +63,7 @@ class Known:
         return [complete(masks, library, equation, self.relations) for masks in found]
 
     def check(self, library: Library, states: Sequence[str]) -> None:
-        """Raise ValueError for a state or term that is not there, or an equation without terms."""
+        """Raise ValueError for an unknown state or term, or an equation without terms."""
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.terms.items() for term in terms]
         for state, term in named:
@@ -76,12 +76,12 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedEquations:
-    """What a method makes of runs.
+    """Result of applying a method to runs.
 
-    choice: the candidates of every equation, with their scores, and the model of those chosen.
-    ambiguities: terms that these data cannot tell apart, and rows that are few for the terms.
-    remarks: what the samples show that is not as assumed, in sentences. estimate: of states and
-    coefficients together; None of a regression.
+    choice: the candidates of every equation, with their scores, and the model of the chosen ones.
+    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
+    terms. remarks: sentences on where the samples deviate from the assumptions. estimate: of states
+    and coefficients together; None after a regression.
     """
 
     choice: Choice
@@ -92,10 +92,10 @@ class IdentifiedEquations:
 
 @dataclass(frozen=True)
 class Finding:
-    """Supports that a method offers, without the last fit.
+    """Supports that a method offers, without the final fit.
 
     kept: state -> the supports on its front. selected: state -> the support of its equation, or
-    None where the method offers candidates and leaves the choice to the user.
+    None if the method offers candidates and leaves the choice to the user.
     """
 
     kept: Mapping[str, Sequence[frozenset[str]]]
@@ -104,10 +104,10 @@ class Finding:
 
 @runtime_checkable
 class DiscoveryMethod(Protocol):
-    """How equations are made of runs: `TrajectorySearch`, or `Regression`.
+    """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
 
     selection: the rule that chooses among candidates. depth: candidates kept per size.
-    provenance: what a model remembers of how it was found.
+    provenance: record in a model of how it was found.
     """
 
     @property
@@ -138,10 +138,11 @@ class DiscoveryMethod(Protocol):
 class TrajectorySearch:
     """Search by the likelihood of whole trajectories, states and coefficients fitted together.
 
-    For noisy samples of all states of a system whose law the library holds: no derivative is
-    estimated, so it finds what no regression can (docs/estimation.md). White noise, or noise that
-    lasts for some samples. max_terms: of one equation. align: channels that are found to come late
-    are brought forward; else the model is said to be a misfit, with their delays.
+    For noisy samples of all states of a system whose law the library holds. No derivative is
+    estimated, so it finds laws that no regression can (docs/estimation.md). The noise may be white,
+    or correlated over some samples. max_terms: of one equation. align: if True, channels found to
+    be late are shifted forward; if False, late channels make the model a misfit, and their delays
+    are reported.
     selection: Evidence, or a rule that runs models, such as FreeRunScore. depth: candidates kept
     per size, for such a rule to judge.
     Raises ValueError for fewer than one term, or a rule that does not go with the search.
@@ -167,7 +168,7 @@ class TrajectorySearch:
 
     @property
     def provenance(self) -> dict[str, str]:
-        """What a model remembers of how it was found."""
+        """Record in a model of how it was found."""
         return {"search": repr(self), "selection": repr(self.selection)}
 
     def identify(
@@ -179,9 +180,9 @@ class TrajectorySearch:
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> IdentifiedEquations:
-        """Estimate states and coefficients, and choose; nothing is left to chance.
+        """Estimate states and coefficients, and choose; the search is deterministic.
 
-        Terms that cannot be told apart are those whose values at the samples are alike.
+        Ambiguities are terms whose values at the samples are alike.
         """
         provenance = self.provenance | _labels(runs)
         found = estimate(
@@ -212,7 +213,7 @@ class TrajectorySearch:
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
-        """The supports alone: what a benchmark counts."""
+        """Supports alone, as a benchmark counts them."""
         found = estimate(runs, library, max_terms=self.max_terms, align=self.align)
         states = found.model.states
         return Finding(
@@ -224,7 +225,7 @@ class TrajectorySearch:
 def _front(
     state: str, scored: Sequence[ScoredSupport], library: Library, depth: int
 ) -> ParetoFront:
-    """The likeliest `depth` candidates of every size, the empty one first."""
+    """The likeliest `depth` candidates of every size, the empty support first."""
     kept = [s for k, s in enumerate(scored) if _rank(scored, k) < depth or s.deviance == 0.0]
     if not kept or kept[0].coef:
         kept = [ScoredSupport({}, float("inf")), *kept]
@@ -232,12 +233,12 @@ def _front(
 
 
 def _rank(scored: Sequence[ScoredSupport], k: int) -> int:
-    """How many of its size come before one; they are sorted."""
+    """Number of supports of the same size before this one; they are sorted."""
     return sum(len(each.coef) == len(scored[k].coef) for each in scored[:k])
 
 
 def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidate:
-    """No rows stand behind it, and no bootstraps."""
+    """A candidate without rows and bootstraps behind it."""
     terms = tuple(name for name in library.names if name in support.coef)
     return Candidate(
         equation=state,
@@ -263,8 +264,9 @@ def _ambiguities_of_samples(runs: Sequence[Trajectory], library: Library) -> tup
 class SearchedEquation:
     """One equation of a regression after the search.
 
-    draws: the bootstraps of its rows. number: its place among the equations of those rows.
-    found: what the search proposed in every draw. supports: the same, pooled. front: their fits.
+    draws: the bootstraps of its rows. number: its index among the equations of those rows.
+    found: supports proposed by the search in every draw. supports: the same, pooled. front: their
+    fits.
     """
 
     draws: Resamples
@@ -276,14 +278,15 @@ class SearchedEquation:
 
 @dataclass(frozen=True)
 class Regression:
-    """Search rows: a formulation makes them of runs, a search proposes supports in every bootstrap.
+    """Search by regression: a formulation makes rows, and a search proposes supports for them.
 
-    Each support is fitted to all training rows, and the best of every size make the front; the
-    rule selects one per equation. Where the noise of the samples is followed into the rows,
-    selected terms are fitted again with weights. Regression() is the best route of rows that we
-    know; the thesis's is written below.
-    depth: candidates kept per size: 3 lets a true support win that noise has put second or third.
-    Raises ValueError for what is no formulation, search, rule or bootstraps.
+    The search runs in every bootstrap of the rows. Each support is fitted to all training rows, and
+    the best of every size make the front; the rule selects one per equation. If the noise of the
+    samples is propagated into the rows, the selected terms are fitted again with weights.
+    Regression() is the best regression that we know; the thesis's is written below.
+    depth: candidates kept per size. 3 lets a true support win that noise has ranked second or
+    third.
+    Raises ValueError for a value that is no formulation, search, rule or bootstraps.
 
     >>> thesis = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps())
     >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
@@ -306,7 +309,7 @@ class Regression:
 
     @property
     def provenance(self) -> dict[str, str]:
-        """What a model remembers of how it was found."""
+        """Record in a model of how it was found."""
         return {
             "formulation": repr(self.formulation),
             "search": repr(self.search),
@@ -330,7 +333,7 @@ class Regression:
         choice = self.choose(fronts, runs, library, known.relations, progress=progress)
         found: list[Ambiguity] = []
         for front in fronts:
-            # Equations that are known are not searched, so few rows hold none of them down.
+            # Known equations are not searched, so too few rows do no harm to them.
             if not set(front.rows.equations) <= set(known.terms):
                 found += few_rows(front.rows)
             found += ambiguities(front.rows)
@@ -345,7 +348,7 @@ class Regression:
         rng: np.random.Generator | int,
         progress: Progress = SILENT,
     ) -> list[SearchedEquation]:
-        """Assemble the rows, search every bootstrap of them, and fit what is found."""
+        """Assemble the rows, search every bootstrap of them, and fit the supports found."""
         rng, known = np.random.default_rng(rng), known or Known()
         equations = []
         with progress.stage(None, "", "rows of the regression"):
@@ -371,7 +374,7 @@ class Regression:
         *,
         progress: Progress = SILENT,
     ) -> Choice:
-        """Select a candidate of every front, and fit what was selected."""
+        """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(runs)
         if isinstance(self.selection, SystemSelection):
             return choose_by_runs(
@@ -386,7 +389,7 @@ class Regression:
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
-        """The supports alone: what a benchmark counts."""
+        """Supports alone, as a benchmark counts them."""
         fronts = [e.front for e in self.search_equations(runs, library, rng=rng)]
         scores = score_candidates(self.selection, fronts, library, runs)
         chosen = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
@@ -400,7 +403,7 @@ AnyMethod = TrajectorySearch | Regression
 
 
 def old_name(recipe: M | None) -> M | None:
-    """What came by the argument `recipe`, with a warning that it is called method now."""
+    """The argument `recipe`, with a warning that it is called method now."""
     if recipe is not None:
         warnings.warn(
             "recipe=... goes with the next version: write method=...", FutureWarning, stacklevel=4
@@ -409,7 +412,7 @@ def old_name(recipe: M | None) -> M | None:
 
 
 def check_kind(name: str, value: object, kind: type, example: str) -> None:
-    """Raise ValueError for a value of another kind, or a class where a value is meant."""
+    """Raise ValueError for a value of the wrong type, or a class instead of an instance."""
     if isinstance(value, type) or not isinstance(value, kind):
         raise ValueError(f"{name} must be a {kind.__name__}, such as {example}: {value!r} came")
 
@@ -424,7 +427,7 @@ def _labels(runs: Sequence[Trajectory]) -> dict[str, str]:
 
 
 def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
-    """What is said of clipped or rounded samples where rows are regressed on them."""
+    """Remarks on clipped or rounded samples, for regressions on rows."""
     found = [bounds_of(run.states, run.state_names) for run in runs]
     words = dict.fromkeys(each for bounds in found if bounds for each in bounds.words)
     way_out = "rows take them for values; TrajectorySearch() reads them as limits"

@@ -1,6 +1,7 @@
-"""A search at every grid point of a field: which terms act where, with which coefficients.
+"""Discovery at every grid point of a field: the active terms and their coefficients by place.
 
-The grid is cut in blocks of points; finished blocks are kept on disk for a run that goes on.
+The grid is cut into blocks of points. Finished blocks are kept on disk, so that an interrupted run
+can be continued.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO
 
 @dataclass(frozen=True, eq=False)
 class PointSearch:
-    """What is done at every point: `discover`, and the spread of its result over the bootstraps.
+    """Settings of the search at every point, whose spread is taken over the bootstraps.
 
-    least_variation: standard deviation of every state, as a share of its root mean square,
-    below which a point shows no dynamics. seed: every point meets the same split and the same
+    least_variation: standard deviation of every state, as a share of its root mean square, below
+    which a point counts as having no dynamics. seed: every point has the same split and the same
     draws, so that results differ by place alone.
     """
 
@@ -58,7 +59,7 @@ class PointSearch:
 
     @cached_property
     def variables(self) -> tuple[str, ...]:
-        """States, then what else the library needs."""
+        """States, then the other variables that the library needs."""
         others = (v for v in self.library.variables if v not in self.states)
         return (*self.states, *others)
 
@@ -75,18 +76,17 @@ def pointwise(
     """Search at every point of a (time, z, r), (time, z) or (time, r) field, block by block.
 
     Returns, over `equation`, `term`, `draw` and the axes of the field:
-    coef, in SI, zero where a term is not in the selected support; inclusion, share of bootstraps
-    whose support of that size held the term; weight, coef times the root mean square of its term,
-    with its sign, as a share of all terms of the equation (not the variance: the constant has
-    none); coef_draws and weight_draws, the same in every bootstrap; r2_train, r2_test, n_terms
-    per equation; status per point. Where the status is not 0, the others are NaN. The attribute
-    no_fit holds a reason why a fit failed, if one did.
-    Only the block at work is in memory where the field is open lazily.
-    kept: where finished blocks are found again by a run that takes up a broken one.
-    progress: True shows a bar; a function is told of the points of every finished block; see
-    `Progress`.
-    Raises ValueError for a field without space, a variable it lacks, or where no point could be
-    fitted, with the first reason.
+    coef, in SI, zero for a term outside the selected support; inclusion, share of bootstraps whose
+    support of that size held the term; weight, coef times the root mean square of its term, with
+    its sign, as a share of all terms of the equation (not the variance: the constant has none);
+    coef_draws and weight_draws, the same in every bootstrap; r2_train, r2_test, n_terms per
+    equation; status per point. If the status is not 0, the others are NaN. The attribute no_fit
+    holds a reason why a fit failed, if one did.
+    If the field is opened lazily, only the current block is in memory.
+    kept: store of finished blocks, from which an interrupted run is continued. progress: True shows
+    a bar; a function is called with the number of points of every finished block; see `Progress`.
+    Raises ValueError for a field without space, a variable it lacks, or, with the first reason, if
+    no point could be fitted.
     """
     _check(field, search)
     part = field[list(search.variables)]
@@ -109,7 +109,7 @@ def _search_blocks(
     workers: Workers,
     kept: Kept | None,
 ) -> Iterator[tuple[Block, Mapping[str, np.ndarray]]]:
-    """Every block with its results: first what is kept, then what is searched now, and kept."""
+    """Every block with its results: first the kept ones, then those searched and kept now."""
     waiting: list[Block] = []
     for block in blocks:
         done = kept.read(block) if kept else None
@@ -147,7 +147,7 @@ def _check(field: xr.Dataset, search: PointSearch) -> None:
 
 
 def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
-    """The result before any point is done: units and coordinates, and NaN."""
+    """The result before any point is done: units, coordinates, and NaN."""
     axes = [axis for axis in SPACE if axis in field.dims]
     shape = tuple(field.sizes[axis] for axis in axes)
     units = {name: str(field[name].attrs["units"]) for name in search.variables}
@@ -178,7 +178,7 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
     )
 
 
-# Dimensions of every result, before those of space.
+# Dimensions of every result, followed by those of space.
 LAYOUT: Mapping[str, tuple[str, ...]] = {
     "coef": ("equation", "term"),
     "inclusion": ("equation", "term"),
@@ -193,15 +193,15 @@ LAYOUT: Mapping[str, tuple[str, ...]] = {
 
 def _place(result: xr.Dataset, block: Block, done: Mapping[str, np.ndarray]) -> None:
     reasons = {str(result.attrs[NO_FIT]), str(done[NO_FIT])} - {""}
-    result.attrs[NO_FIT] = min(reasons, default="")  # whatever the blocks are
+    result.attrs[NO_FIT] = min(reasons, default="")  # independent of the division into blocks
     for name in (*LAYOUT, "status"):
         values, target = done[name], result[name].isel(block.slices)
         target.values[...] = values.reshape(target.shape)
 
 
 def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarray]:
-    """Every point of a block, points along the last axis; why a fit failed, if one did."""
-    block = block.load(scheduler="synchronous")  # in chunks, if at all, on this thread
+    """Results at every point of a block, points along the last axis; a reason if a fit failed."""
+    block = block.load(scheduler="synchronous")  # chunks, if any, are read on this thread
     t = grid_points(block, "time")
     columns = _columns(block, search.variables)
     status = np.array([_status(values, search) for values in columns], dtype=np.int8)
@@ -225,7 +225,7 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> dict[str, np.ndarra
 def _columns(
     block: xr.Dataset, names: Sequence[str]
 ) -> Float[np.ndarray, "points variables samples"]:
-    """All variables at all points, each one's samples in one stretch of memory."""
+    """All variables at all points, the samples of each contiguous in memory."""
     shape = (block.sizes["time"], *(block.sizes.get(axis, 1) for axis in SPACE))
     columns = np.empty((shape[1] * shape[2], len(names), shape[0]))
     for j, name in enumerate(names):
@@ -235,7 +235,7 @@ def _columns(
 
 
 def _status(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
-    """What can be said before a fit; 0 where one is worth trying."""
+    """Status that can be told before a fit; 0 if a fit is worth trying."""
     lost = ~np.isfinite(values)
     if lost.all(axis=1).any():
         return STATUSES.index("no_plasma")
@@ -269,7 +269,7 @@ def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
 
 
 def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
-    """Search, select and fit one trajectory; its spread over the bootstraps."""
+    """Search, select and fit at one point, and the spread over the bootstraps."""
     rng = np.random.default_rng(search.seed)
     equations = search.method.search_equations([run], search.library, rng=rng)
     fronts = [equation.front for equation in equations]
@@ -290,7 +290,7 @@ def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
 
 
 def _shares(contributions: Float[np.ndarray, "*draws terms"]) -> Float[np.ndarray, "*draws terms"]:
-    """Each term's part in the sum of absolute values, with its sign; zeros where all are."""
+    """Each term's part in the sum of absolute values, with its sign; zeros if all are zero."""
     total = np.abs(contributions).sum(axis=-1, keepdims=True)
     return contributions / np.where(total > 0.0, total, 1.0)
 
@@ -311,9 +311,10 @@ class Block:
 
 
 def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
-    """Rectangles of at most `n_points` points: whole lines along the last axis where one fits.
+    """Rectangles of at most `n_points` points, made of whole lines along the last axis if one fits.
 
-    Neighbours in a file are read together that way. Raises ValueError for n_points below one.
+    Points that are neighbours in a file are then read together.
+    Raises ValueError for n_points below one.
     """
     if n_points < 1:
         raise ValueError(f"a block needs a point: block_points={n_points} came")
@@ -331,7 +332,7 @@ def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
 
 @dataclass(frozen=True)
 class Kept:
-    """Finished blocks in a folder, each file whole or not there."""
+    """Store of finished blocks in a folder; each file is complete or absent."""
 
     folder: Path
 
@@ -342,7 +343,7 @@ class Kept:
         return self._path(block).exists()
 
     def read(self, block: Block) -> dict[str, np.ndarray] | None:
-        """A finished block, or None where there is none that can be read."""
+        """Results of a finished block, or None if there are none that can be read."""
         try:
             with np.load(self._path(block), allow_pickle=False) as stored:
                 return dict(stored)
@@ -350,7 +351,7 @@ class Kept:
             return None
 
     def write(self, block: Block, done: Mapping[str, np.ndarray]) -> None:
-        """Raises OSError, naming the way out, where the disk takes no more."""
+        """Store a finished block. Raises OSError, naming the way out, if writing fails."""
         try:
             with replacing(self._path(block)) as temporary:
                 np.savez(temporary, **done)  # type: ignore[arg-type]
@@ -362,11 +363,11 @@ class Kept:
             ) from error
 
     def clear(self) -> None:
-        """Remove the finished blocks, once the result that they make is written.
+        """Remove the finished blocks, once the whole result is written.
 
-        Another run of the same study may be at work in the folder: then that stays.
+        The folder stays if another run of the same study is at work in it.
         """
-        for path in self.folder.glob("[!.]*.npz"):  # not what is being written
+        for path in self.folder.glob("[!.]*.npz"):  # leaves out files being written
             path.unlink(missing_ok=True)
         with suppress(OSError):
             self.folder.rmdir()

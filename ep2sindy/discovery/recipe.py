@@ -1,4 +1,4 @@
-"""Methods from settings that are chosen one by one: the groups of a config, and the old recipe."""
+"""Methods from single settings: the groups of a config, and the old `Recipe`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ep2sindy.selection.rule import Selection, SystemSelection
 
 
 def regression_of(method: AnyMethod) -> Regression:
-    """The method, if it has rows. Raises ValueError for a search of trajectories."""
+    """The method if it is a regression. Raises ValueError for a search of trajectories."""
     if isinstance(method, TrajectorySearch):
         raise ValueError(
             "a search of trajectories fits them whole, and serves discover() and the experiments "
@@ -32,9 +32,9 @@ def method_of(
     selection: SystemSelection | Selection,
     depth: int,
 ) -> AnyMethod:
-    """The method that settings stand for which are chosen one by one, as the groups of a config.
+    """The method for settings that are chosen one by one, such as the groups of a config.
 
-    A `TrajectorySearch` takes the rule and the depth; it has no use for a formulation.
+    A `TrajectorySearch` takes the rule and the depth, and ignores the formulation.
     Raises ValueError for bootstraps that do not go with the search.
     """
     if not isinstance(search, TrajectorySearch):
@@ -47,16 +47,16 @@ def method_of(
     return replace(search, selection=selection, depth=depth)
 
 
-def Recipe(  # the name of a class that it stands in for
+def Recipe(  # has the name of the class that it replaces
     formulation: Formulation | None = None,
     search: TrajectorySearch | Search | None = None,
     bootstraps: Bootstraps | None = None,
     selection: SystemSelection | Selection | None = None,
     depth: int = 1,
 ) -> AnyMethod:
-    """The old way to write a method, for one version more: it warns, with the new one written out.
+    """Old way to write a method, for one more version: it warns, and writes out the new one.
 
-    With nothing of rows asked for it is a search of trajectories, else a regression.
+    It returns a search of trajectories, unless a setting of a regression is given.
     """
     of_rows = formulation is not None or bootstraps is not None
     if search is None and (of_rows or not isinstance(selection, Evidence | None)):
@@ -80,7 +80,7 @@ def Recipe(  # the name of a class that it stands in for
 
 
 def _call_of(method: AnyMethod) -> str:
-    """How a method is written, what is as by default left out."""
+    """Source text of a method, default arguments left out."""
     plain = type(method)()
     names = [f.name for f in fields(method) if getattr(method, f.name) != getattr(plain, f.name)]
     given = ", ".join(f"{name}={getattr(method, name)!r}" for name in names)

@@ -1,13 +1,14 @@
-"""Regimes of a field: points where the same terms act, how many there are, and how sure that is.
+"""Regimes of a field: groups of points where the same terms act, their number and certainty.
 
-The pointwise study gives every point its equations. A term's weight there is its signed share of
-the equation; what tells regimes apart is which terms act, as source or sink, so a weight w counts
-as w |w| / (w^2 + least^2): near 0 well below the share `least`, near +-1 well above it. Points are
-grouped by a Gaussian mixture of these, with no component narrower than `resolution` or than the
-bootstraps' own spread, and as many components as Schwarz's criterion supports. Neighbours are
-alike and no regime is exact, so that with enough points any difference would become significant:
-the likelihood is raised to the power 1 / (1 + n_points / COARSENING). Where equations pass into
-one another, the points between may still come out as a regime of their own.
+The pointwise study gives every point its equations. A term's weight at a point is its signed share
+of the equation. Regimes differ by which terms act, as source or sink, so a weight w counts as w |w|
+/ (w^2 + least^2): near 0 well below the share `least`, near +-1 well above it. The points are
+grouped by a Gaussian mixture of these values. No component is narrower than `resolution` or than
+the bootstraps' own spread, and Schwarz's criterion decides on the number of components. Neighbours
+are alike and no regime is exact, so with enough points any difference would become significant: the
+likelihood is therefore raised to the power 1 / (1 + n_points / COARSENING). If equations change
+gradually from one regime to another, the points between may still come out as a regime of their
+own.
 Sources: Callaham, Koch, Brunton, Kutz & Brunton 2021, doi:10.1038/s41467-021-21331-z (regimes as
 clusters of the balance between terms); Schwarz 1978, doi:10.1214/aos/1176344136; Miller & Dunson
 2019, doi:10.1080/01621459.2018.1469995 (coarsening).
@@ -27,26 +28,26 @@ from sklearn.mixture import GaussianMixture
 from ep2sindy.data.fields import SPACE
 from ep2sindy.runtime.threads import one_thread
 
-N_STARTS = 20  # of the mixture's iteration, which may end in a poor optimum
+N_STARTS = 20  # of the mixture's iteration, which may converge to a poor optimum
 
-COARSENING = 100.0  # points after which evidence stops growing
+COARSENING = 100.0  # number of points at which evidence stops growing
 
-UNSURE = 0.5  # a confidence below
+UNSURE = 0.5  # confidence below which a point counts as unsure
 
 
 @dataclass(frozen=True, eq=False)
 class Regimes:
-    """Which points share an equation.
+    """Groups of points that share an equation.
 
-    labels: over z and r as far as the field has them; 0 is the largest regime, -1 a point without
-    equations. confidence: same shape, how probable the point's regime is on average over the
-    bootstraps; NaN where labels are -1.
-    table: one row per regime, equation and term: acts, whether the median of |weight| reaches
-    `least`; in_support, share of the regime's points whose support holds the term; weight, the
-    median; coef, coef_low and coef_high, median, 16 % and 84 % of the points that hold the term,
-    in the unit of the column coef_units; n_points, confidence (mean) and unsure (share of the
-    points whose confidence is below UNSURE) of the regime.
-    at_limit: whether there are as many as max_regimes allowed; the points may bear more.
+    labels: over those of z and r that the field has; 0 is the largest regime, -1 a point without
+    equations. confidence: same shape, mean probability of the point's regime over the bootstraps;
+    NaN where labels are -1.
+    table: one row per regime, equation and term. acts: True if the median of |weight| reaches
+    `least`. in_support: share of the regime's points whose support holds the term. weight: the
+    median. coef, coef_low and coef_high: median, 16 % and 84 % of the points that hold the term, in
+    the unit of the column coef_units. n_points, confidence (mean) and unsure (share of the points
+    whose confidence is below UNSURE) are those of the regime.
+    at_limit: True if there are as many regimes as max_regimes allows; the points may support more.
     """
 
     labels: xr.DataArray
@@ -59,9 +60,10 @@ class Regimes:
         return int(self.labels.max()) + 1
 
     def equations(self, regime: int) -> dict[str, dict[str, float]]:
-        """Terms that act in a regime, with their medians over the points that have them.
+        """Acting terms of each equation in a regime, with the medians of their coefficients.
 
-        No point need have the equation as it stands: see in_support and the spread in the table.
+        The medians are over the points that have the term. No single point need have exactly this
+        equation: see in_support and the spread in the table.
         """
         if not 0 <= regime < self.n_regimes:
             raise ValueError(f"regimes run from 0 to {self.n_regimes - 1}: {regime} came")
@@ -83,10 +85,10 @@ def find_regimes(
 ) -> Regimes:
     """Group the points of a pointwise study by the terms that act in their equations.
 
-    result: as `studies.pointwise` gives it; used are weight, weight_draws and coef, with the
-    dimensions equation, term, draw, and z and r as far as the field has them.
-    max_regimes: where as many come out, the points may bear more.
-    Raises ValueError where no point has equations, or no bootstraps stand behind them.
+    result: as returned by `pointwise`. Its variables weight, weight_draws, coef and coef_units are
+    used, with the dimensions equation, term, draw, and those of z and r that the field has.
+    max_regimes: if as many are found, the points may support more.
+    Raises ValueError if no point has equations, or if there are no bootstraps.
     """
     rng = np.random.default_rng(rng)
     if not result.sizes["draw"]:
@@ -136,11 +138,11 @@ def group_points(
     least: float = 0.1,
     resolution: float = 0.2,
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-    """Regime of every point and how sure it is; the order of the points does not matter.
+    """Regime and confidence of every point; the order of the points does not matter.
 
     weights: signed shares of all terms in all equations. draws: the same from each bootstrap, NaN
-    where it could not be fitted. A confidence is the probability of the point's regime under the
-    mixture, averaged over the bootstraps: low where they disagree or fail, and where a point lies
+    if it could not be fitted. The confidence is the probability of the point's regime under the
+    mixture, averaged over the bootstraps. It is low if they disagree or fail, and for a point
     between two regimes.
     Raises ValueError unless max_regimes is one or more, least and resolution above 0.
     """
@@ -168,14 +170,14 @@ def group_points(
 
 
 def _action(weights: np.ndarray, least: float) -> np.ndarray:
-    """How far a term acts: 0 for not at all, +-1/2 at the share `least`, +-1 in the end."""
+    """Activity of a term by its weight: 0 if inactive, +-1/2 at the share `least`, at most +-1."""
     return weights * np.abs(weights) / (weights**2 + least**2)
 
 
 def _mixture(
     features: np.ndarray, floor: float, max_regimes: int, *, seed: int
 ) -> GaussianMixture | None:
-    """The mixture of least coarsened BIC; None for one regime, which needs none.
+    """The mixture of least coarsened BIC; None if one regime suffices.
 
     floor: added to the variance of every component.
     """
@@ -185,7 +187,7 @@ def _mixture(
     if n_most == 1:
         return None
     sizes = np.arange(1, n_most + 1)
-    with one_thread():  # a step is short
+    with one_thread():  # steps are too short for threads to pay
         candidates = [
             GaussianMixture(
                 n, covariance_type="spherical", reg_covar=floor, n_init=N_STARTS, random_state=seed
@@ -193,7 +195,7 @@ def _mixture(
             for n in sizes.tolist()
         ]
     n_effective = len(points) / (1.0 + len(points) / COARSENING)
-    # A mean, a variance and a share each; the shares sum to one.
+    # Each component has a mean, a variance and a share; the shares sum to one.
     n_parameters = sizes * (points.shape[1] + 2) - 1
     misfit = np.array([-2.0 * mixture.score(points) for mixture in candidates])
     best = int(np.argmin(n_effective * misfit + n_parameters * np.log(n_effective)))
@@ -201,7 +203,7 @@ def _mixture(
 
 
 def spread(coef: Float[np.ndarray, " points"]) -> tuple[float, float, float]:
-    """16, 50 and 84 % of the points that have the term; NaN where none has it."""
+    """16, 50 and 84 % quantiles over the points that have the term; NaN if none has it."""
     held = coef[coef != 0.0]
     low, middle, high = np.percentile(held, [16, 50, 84]) if held.size else [np.nan] * 3
     return low, middle, high

@@ -1,1 +1,1 @@
-"""States and coefficients together: sparse equations by the likelihood of whole trajectories."""
+"""Joint estimation of states and coefficients by the likelihood of whole trajectories."""

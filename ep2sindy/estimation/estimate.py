@@ -1,6 +1,6 @@
-"""What an estimate of states and coefficients together returns.
+"""Joint estimation of states and sparse coefficients, and the report of its result.
 
-Beside the model: what a reader must know of the samples and of their noise, in sentences.
+Besides the model, the result holds remarks: sentences about the samples and their noise.
 """
 
 from __future__ import annotations
@@ -31,19 +31,21 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 
 MAX_RIVALS = 5
-MIN_ODDS = 1e-3  # of a rival that is worth a word
-HEAVY, STANDARD_ERRORS = 4.0, 5.0  # a kurtosis that is told; by which it must be above 3
-COLLINEAR = 5.0  # standard errors of a variance that is no more than noise
-PART = 0.05  # of the largest share: states with less have no part in a relation
-EVEN = 0.2  # odds of a rival that leave it open which of the two is right
+MIN_ODDS = 1e-3  # rivals with lower odds are not reported
+HEAVY, STANDARD_ERRORS = 4.0, 5.0  # least kurtosis reported; least excess over 3
+COLLINEAR = 5.0  # standard errors by which a variance may exceed that of noise
+PART = 0.05  # share of the largest part: states with less are left out of a relation
+EVEN = 0.2  # above these odds of a rival, the choice is reported as undecided
 
 
 @dataclass(frozen=True)
 class ScoredSupport:
-    """A support of one equation, the others as chosen. coef: SI, of its terms, by name.
+    """A support of one equation, the other equations as chosen, with its coefficients and deviance.
 
-    deviance: -2 log likelihood of the trajectories plus the prices of all terms, beside the
-    chosen model's; linearised about that, so exact for what is close to it.
+    coef: term name -> coefficient, in SI.
+    deviance: -2 log likelihood of the trajectories plus the prices of all terms, minus the same of
+    the chosen model. It comes from a linearisation about the chosen model, so it is accurate only
+    for supports whose fit is close to it.
     """
 
     coef: Mapping[str, float]
@@ -52,7 +54,7 @@ class ScoredSupport:
 
 @dataclass(frozen=True)
 class Rival:
-    """Another support of one equation, and its odds against the chosen one: 1 is even."""
+    """Another support of one equation, and its odds against the chosen one; 1 is equally likely."""
 
     state: str
     terms: tuple[str, ...]
@@ -61,22 +63,24 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """States and coefficients, estimated together.
+    """Result of estimating states and coefficients together.
 
-    model: with the covariance of its coefficients, unless it is a misfit. paths: by run, the
-    states that the model and the samples agree on, (samples, d), in SI. noise_std: (d,), of the
-    samples' noise, in SI; memory: (d,), its correlation from one sample to the next, 0 for white
+    model: carries the covariance of its coefficients, unless it is a misfit. paths: for each run,
+    the estimated states, (samples, d), in SI. noise_std: (d,), standard deviation of the samples'
+    noise, in SI. memory: (d,), correlation of this noise from one sample to the next, 0 for white
     noise.
-    flow_error: how far from the model the states move from sample to sample, as a share of the
-    noise; 0 where nothing but noise is left. misfit: why these equations do not explain the data;
-    empty where they do. few: a word where there are too few samples to tell; else empty.
-    supports: by state, the best supports of every size. rivals: what else may be, most likely
-    first.
-    remarks: what the samples show that is not as assumed, in sentences: limits of sensors, noise
-    that lasts, grows or has outliers, states that hang together.
-    kurtosis: (d,), of the noise, 3 where it is normal, NaN where no sample is a value. growth:
-    (d,), share of its variance that grows with the state. delays_s: (d,), by which channels come
-    late; `align=True` brings them together, and leaves out what that takes at the ends.
+    flow_error: size of the deviation of the states from the model over one sampling step, as a
+    share of the noise; 0 if the residuals are nothing but noise. misfit: the reason why these
+    equations do not explain the data; empty if they do. few: a remark if there are too few samples
+    to decide; otherwise empty.
+    supports: for each state, the best supports of every size. rivals: other plausible supports, the
+    most likely first.
+    remarks: sentences on where the samples deviate from the assumptions: limits of sensors, noise
+    that is correlated in time, grows with the state or has outliers, and collinear states.
+    kurtosis: (d,), of the noise; 3 if it is normal, NaN if every sample is a limit. growth: (d,),
+    share of the noise variance that grows with the state. delays_s: (d,), the delay of each
+    channel. `align=True` shifts the channels back into step, and leaves out the samples at the ends
+    that this costs.
     """
 
     model: SparseModel
@@ -95,7 +99,7 @@ class Estimate:
 
     @property
     def note(self) -> str:
-        """What a reader must know of the fit, on one line."""
+        """The most important remark on the fit, on one line."""
         if self.misfit:
             return self.misfit
         if not self.rivals:
@@ -119,14 +123,14 @@ def estimate(
     provenance: Mapping[str, str] | None = None,
     progress: Progress | bool = False,
 ) -> Estimate:
-    """Estimate states at every sample and sparse coefficients together, by their likelihood.
+    """Estimate the states at every sample and sparse coefficients together, by maximum likelihood.
 
-    runs: share the coefficients; samples may come at unequal times. Inputs are taken as exact.
-    max_terms: of one equation. align: channels that are found to come late are brought forward;
-    else the model is said to be a misfit, with their delays. relations: between coefficients, held
-    in fit and search. terms: by state, all the terms of an equation that is known but for its
-    coefficients.
-    progress: True shows bars; see `Progress`.
+    runs: all runs share the coefficients. Samples may be spaced unequally. Inputs are taken as
+    exact. max_terms: the most terms of one equation. align: if True, channels found to be late are
+    shifted forward; if False, late channels make the model a misfit, and their delays are reported.
+    relations: between coefficients, held in fit and search. terms: for each state whose equation is
+    known but for its coefficients, all terms of that equation. progress: True shows bars; see
+    `Progress`.
     Raises ValueError for fewer than one term, a library that needs more samples than there are, or
     a variable that no run has.
     """
@@ -143,7 +147,7 @@ def estimate(
 
 
 def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progress) -> Estimate:
-    """What was found, in SI, beside what else may be."""
+    """Convert the solution to SI, and add its rivals."""
     problem, found = answer.problem, answer.found
     fit, few_terms = found.annealed.fit, max_terms_for(problem, max_terms)
     pair = gram(problem, fit, found.annealed.level)
@@ -172,9 +176,9 @@ def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progre
 
 @dataclass(frozen=True, eq=False)
 class _Reported:
-    """What is reported: of the samples as they are, or of those brought together, if asked for.
+    """The reported solution: of the samples as given, or of the aligned samples if asked for.
 
-    delays: (d,), in mean steps. said: what was done to the samples.
+    delays: (d,), in mean steps. said: remarks on how the samples were changed.
     """
 
     problem: EstimationProblem
@@ -197,7 +201,7 @@ def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Repo
 
 
 def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
-    """Raise ValueError for a variable that no run has, or runs too short to begin with."""
+    """Raise ValueError for a variable that no run has, or for runs that are too short."""
     if missing := [v for v in library.variables if v not in runs[0].names]:
         raise ValueError(
             f"the library needs {missing}, and the runs have {list(runs[0].names)}: states and "
@@ -229,7 +233,7 @@ def _coef_SI(
 def _named_coef(
     problem: EstimationProblem, free: Float[np.ndarray, " free"], block: int
 ) -> dict[str, float]:
-    """Term -> SI coefficient of one equation, those that are not zero."""
+    """Term -> SI coefficient of one equation, for the coefficients that are not zero."""
     values = _coef_SI(problem, free)
     own = (problem.equation == block) & (values != 0.0)
     names = [problem.term_names[j] for j in problem.column[own]]
@@ -247,7 +251,7 @@ def _model(
     used = values != 0.0
     order = np.lexsort((problem.column[used], problem.equation[used]))
     rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
-    # The intervals of a model that leaves more than noise would not hold the truth.
+    # If the residuals exceed the noise, intervals would not cover the truth.
     known = found.fits and not answer.misfit
     free_cov = covariance(problem, fit, found.annealed.level) if known else None
     cov = None if free_cov is None else rows @ free_cov @ rows.T
@@ -317,9 +321,9 @@ def _misfit(problem: EstimationProblem, found: Solution) -> str:
 
 
 def _at_limit(problem: EstimationProblem, found: Solution, max_terms: int) -> str:
-    """A word where an equation takes all the terms that it may: many that stand in for another."""
+    """Warning if an equation uses all terms allowed: many terms may stand in for a missing one."""
     if max_terms_for(problem, max_terms) < max_terms:
-        return ""  # too few samples: that is told of anyway
+        return ""  # too few samples: this is reported anyway
     used = _coef_SI(problem, found.annealed.fit.free) != 0.0
     full = [
         f"{state}'"
@@ -336,7 +340,7 @@ def _at_limit(problem: EstimationProblem, found: Solution, max_terms: int) -> st
 
 
 def remarks(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
-    """What sensors did, how the noise differs from white and normal, which states hang together."""
+    """Remarks on sensor limits, on noise that is not white and normal, and on collinear states."""
     limits = [w for r in problem.records if r.limits is not None for w in r.limits.words]
     return (
         *(f"{words}: read as limits, not as values" for words in dict.fromkeys(limits)),
@@ -346,7 +350,7 @@ def remarks(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
 
 
 def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
-    """`z comes 0.00333 s late (0.99 samples)`, of every state that does."""
+    """Delays in words, `z comes 0.00333 s late (0.99 samples)`, for every delayed state."""
     parts = [
         f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
         f"({abs(delay):.2f} samples)"
@@ -357,7 +361,7 @@ def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> 
 
 
 def late_words(problem: EstimationProblem, late: Aligned) -> str:
-    """Why samples with a late channel are a misfit, and the way out."""
+    """Explanation why samples with a late channel are a misfit, and what to do about it."""
     return (
         f"{delay_words(problem, late.delays)}: brought together, the samples are better explained "
         "by other equations; ask for those by ep.TrajectorySearch(align=True), in configs "
@@ -370,7 +374,7 @@ def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
     error = np.sqrt(24.0 / problem.n_samples)
     for k, state in enumerate(problem.states):
         if noise.std[k] <= FLOOR or noise.unexplained[k]:
-            continue  # rounding and integration, or the model's error, and no noise of samples
+            continue  # rounding, integration or model error, not noise
         if noise.memory[k]:
             words.append(f"noise of {state} lasts: {noise.memory[k]:.2f} from sample to sample")
         if noise.kurtosis[k] > max(HEAVY, 3.0 + STANDARD_ERRORS * error):
@@ -384,15 +388,15 @@ def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
 
 
 def _of_collinear_states(problem: EstimationProblem, noise: Noise) -> list[str]:
-    """States of which a sum varies no more than their noise."""
+    """Remark on states of which a linear combination varies no more than their noise."""
     d, n = len(problem.states), problem.n_samples
     if d < 2 or noise.unexplained.any():
-        return []  # what is left is then the model's error, which may be as large as the states
+        return []  # the residuals then hold model error, perhaps as large as the states
     samples = np.concatenate([record.samples for record in problem.records])
     variance, directions = np.linalg.eigh(np.cov(samples / noise.std, rowvar=False))
     if variance[0] > 1.0 + COLLINEAR * np.sqrt(2.0 / n):
         return []
-    # In SI, and beside the spread of every state.
+    # Weights in SI, and each state's part in the sum by its spread.
     weights = directions[:, 0] / noise.std / problem.scale
     parts = np.abs(weights) * samples.std(axis=0) * problem.scale
     held = [k for k in range(d) if parts[k] > PART * parts.max()]

@@ -1,11 +1,12 @@
 """Compiled kernels of the trajectory likelihood: sensitivities, filter, smoother.
 
-A record has n samples of d states; p coefficients are free. The flow takes a state over one step
-between samples; `flow`: (n - 1, d, d + p) holds its derivatives by the state, then by the
-coefficients. All is linear about a path: `misses` (n - 1, d) is flow minus the next state,
-`residuals` (n, d) samples minus states, and what is sought are departures from the path.
+A record has n samples of d states; p coefficients are free. The flow maps a state over one step
+between samples; `flow`: (n - 1, d, d + p) holds its derivatives with respect to the state, then to
+the coefficients. Everything is linearised about a path: `misses` (n - 1, d) is the flow minus the
+next state of the path, `residuals` (n, d) is the samples minus the path, and the unknowns are
+departures from the path.
 
-Loops in place of array expressions: those take seconds more to compile.
+The kernels are loops because array expressions take seconds more to compile.
 """
 
 import numpy as np
@@ -15,7 +16,7 @@ from ep2sindy.runtime.compilation import compiled
 
 @compiled
 def term_values(columns, table):
-    """Products of the columns that each row of a table names: (samples, rows)."""
+    """Products of the columns named by each row of a table: (samples, rows)."""
     n_factors = table.shape[1]
     values = np.empty((len(columns), len(table)))
     for k in range(len(columns)):
@@ -29,11 +30,12 @@ def term_values(columns, table):
 
 @compiled
 def sensitivity_stage(jacobian, terms, equation, column, start, lead, slope, weight, total):
-    """One Runge-Kutta stage of the sensitivities, at every sample at once.
+    """One Runge-Kutta stage of the sensitivities, at all samples at once.
 
-    start: (n, d, d + p) where the step began; lead: (n,), how far from there along `slope`, of
-    the stage before, this stage stands. slope becomes this stage's, and total grows by weight (n,)
-    times it. The coefficient c stands in equation[c] before terms[:, column[c]].
+    start: (n, d, d + p), the sensitivities at the start of the step. lead: (n,), the distance in
+    time of this stage from the start, to be covered along `slope` of the previous stage. slope is
+    overwritten by this stage's, and total grows by weight (n,) times it. Coefficient c multiplies
+    terms[:, column[c]] in equation[c].
     """
     n, d, width = start.shape
     here = np.empty((d, width))
@@ -56,7 +58,7 @@ def sensitivity_stage(jacobian, terms, equation, column, start, lead, slope, wei
 
 @compiled
 def _observe(i, residual, variance, mean, by_coef, cov, gain):
-    """Learn from one sample of state i; returns its innovation and the innovation's variance."""
+    """Update with one sample of state i; returns its innovation and the innovation's variance."""
     d, p = by_coef.shape
     spread = cov[i, i] + variance
     innovation = residual - mean[i]
@@ -78,7 +80,7 @@ def _observe(i, residual, variance, mean, by_coef, cov, gain):
 
 @compiled
 def _step(flow, miss, mean, by_coef, cov, process, buffer):
-    """Take mean, its derivatives by the coefficients and covariance over one step."""
+    """Propagate mean, its derivatives by the coefficients, and covariance over one step."""
     d, p = by_coef.shape
     for i in range(d):
         value = miss[i]
@@ -110,14 +112,13 @@ def _step(flow, miss, mean, by_coef, cov, process, buffer):
 
 @compiled
 def eliminate(flow, misses, residuals, variance, process, free_start):
-    """Eliminate all states: what is left of the squares as a function of the coefficients.
+    """Eliminate all states: the squares as a quadratic function of the coefficients alone.
 
     variance: (n, d), of the samples' noise; process: (n - 1, d), of the flow's error; free_start:
-    variance of the first state before any sample. A residual that is not finite is no sample.
-    Returns hessian (p, p) and gradient (p,), so that the squares are least - 2 gradient' c +
-    c' hessian c for a change c of the coefficients, then least, and the sum of the logarithms of
-    the innovations' variances. Exact for the linearised problem (de Jong 1991,
-    doi:10.1214/aos/1176348139).
+    prior variance of the first state. A residual that is not finite counts as a missing sample.
+    Returns hessian (p, p), gradient (p,), least, and the sum of the logarithms of the innovations'
+    variances. For a change c of the coefficients the squares are least - 2 gradient' c + c' hessian
+    c. Exact for the linearised problem (de Jong 1991, doi:10.1214/aos/1176348139).
     """
     n, d = residuals.shape
     p = flow.shape[2] - d
@@ -153,10 +154,11 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
 
 @compiled
 def departures(flow, misses, residuals, variance, process, free_start):
-    """The departures (n, d) of all states from the path that leave the least squares.
+    """Departures (n, d) of all states from the path that minimise the squares.
 
-    Arguments as for `eliminate`, of whose `flow` the first d columns count. Backwards by the
-    adjoint of the filter, which inverts no matrix (Bierman 1973, doi:10.1016/0005-1098(73)90089-3).
+    Arguments as for `eliminate`, but only the first d columns of `flow` are used. The backward pass
+    is the adjoint of the filter, which inverts no matrix (Bierman 1973,
+    doi:10.1016/0005-1098(73)90089-3).
     """
     n, d = residuals.shape
     means, covs = np.empty((n, d)), np.empty((n, d, d))

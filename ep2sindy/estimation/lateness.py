@@ -1,7 +1,7 @@
-"""Channels that come late: a delay of each state, one more parameter of how samples see it.
+"""Channels that come late: a delay of each state, as one more parameter of how it is sampled.
 
-With a delayed channel other equations look right, which have more terms and fit no worse. So the
-delay is not read from what a model leaves: it is asked whether fewer terms would do with it.
+With a delayed channel, wrong equations with more terms fit the data no worse. So the delay is not
+read from the residuals: the test is whether fewer terms suffice with it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, hessian
 from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
 from ep2sindy.estimation.supports import PenalisedFit, best_support, inverse_of, penalise
 
-PAYS = 1.0  # by which delays must lower squares and prices, beyond their own price
-MAX_SAMPLES = 10.0  # of a delay that is believed: a larger one is no small error of a clock
+PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
+MAX_SAMPLES = 10.0  # largest delay that is believed: more is no small clock error
 
 
 @dataclass(frozen=True, eq=False)
 class DelayedGram:
-    """The squares as a function of all free coefficients, and of delays of some states.
+    """The squares as a quadratic function of all free coefficients and of delays of some states.
 
-    Linear about a fit without delays. at_rest: without them. of_both: (free, delays); of_delays:
-    (delays, delays); linear: (delays,).
+    Linearised about a fit without delays. at_rest: the part without delays. of_both: (free,
+    delays), of_delays: (delays, delays), both quadratic; linear: (delays,).
     """
 
     at_rest: Gram
@@ -35,13 +35,13 @@ class DelayedGram:
     linear: Float[np.ndarray, " delays"]
 
     def of(self, late: Bool[np.ndarray, " delays"]) -> DelayedGram:
-        """With delays of some states alone."""
+        """Keep the delays of some states only."""
         own = self.of_delays[np.ix_(late, late)]
         return DelayedGram(self.at_rest, self.of_both[:, late], own, self.linear[late])
 
     @property
     def freed(self) -> Gram:
-        """With the best delays, whatever the coefficients are."""
+        """The squares as a function of the coefficients, minimised over the delays."""
         inverse = inverse_of(self.of_delays)
         share = self.of_both @ inverse
         return Gram(
@@ -53,7 +53,7 @@ class DelayedGram:
     def delays(
         self, support: Bool[np.ndarray, " free"]
     ) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, " delays"]]:
-        """The best ones beside a support's best coefficients, and their standard errors."""
+        """Best delays jointly with the coefficients on a support, and their standard errors."""
         quadratic = self.at_rest.quadratic[np.ix_(support, support)]
         share = self.of_both[support].T @ inverse_of(quadratic)
         inverse = inverse_of(self.of_delays - share @ self.of_both[support])
@@ -62,10 +62,11 @@ class DelayedGram:
 
 
 def delayed_gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> DelayedGram:
-    """Linearise about a fit, all states delayed: by as much, nothing would show but for inputs.
+    """Linearise about a fit, with a delay of every state.
 
-    A state read tau early is, to first order, tau times its rate further on: at the start of a
-    step that goes the way of the flow, at its end it is what the samples show.
+    Without inputs, a common delay of all states leaves no trace in the data. To first order, a
+    state that is read tau early lies tau times its rate further on. At the start of a step this
+    displacement goes through the flow; at the end of the step it is what the samples show.
     """
     d, n = len(problem.states), len(fit.support)
 
@@ -93,9 +94,9 @@ def suspect_delays(
     *,
     max_terms: int,
 ) -> Float[np.ndarray, " d"] | None:
-    """Delays by state, in mean steps, with which fewer or likelier terms would do; None without."""
+    """Delays by state, in mean steps, that make fewer or likelier terms suffice; None if none."""
     late = np.full(len(problem.states), True)
-    late[0] = problem.driven  # what drives has no delay; else the first stands for it
+    late[0] = problem.driven  # inputs set the time reference; without any, the first state does
     if not (late.any() and around.of(late).freed.finite):
         return None
     best = fit_delays(problem, around, late, support, prices, max_terms=max_terms)[0]
@@ -116,7 +117,7 @@ def fit_delays(
     *,
     max_terms: int,
 ) -> tuple[PenalisedFit, Float[np.ndarray, " d"]]:
-    """The best terms where some states have a delay, and these, in mean steps."""
+    """The best terms if some states are delayed, and the delays, in mean steps."""
     own = around.of(late)
     best = best_support(problem, own.freed, prices, support, max_terms=max_terms)
     delays = np.zeros(len(late))
@@ -130,8 +131,7 @@ def _those_that_show(
     support: Bool[np.ndarray, " free"],
     late: Bool[np.ndarray, " d"],
 ) -> Float[np.ndarray, " d"]:
-    """Delays, each of which pays for itself; among states as few as may be, and late rather than
-    early."""
+    """Delays that each pay for themselves: of as few states as possible, late rather than early."""
     delays = np.zeros(len(late))
     delays[late] = around.of(late).delays(support)[0]
     if not problem.driven:
@@ -153,10 +153,10 @@ def move_channels(
 ) -> EstimationProblem:
     """The problem with every channel brought forward by its delay, in mean steps.
 
-    A sample goes along the path that it lies beside, and keeps its distance: its noise stays white.
-    Samples whose place is beyond either end are left out.
+    A sample moves along the fitted path beside it and keeps its distance, so its noise stays white.
+    Samples that would lie beyond either end are left out.
     """
-    from scipy.interpolate import CubicSpline  # for those alone whose channels are late
+    from scipy.interpolate import CubicSpline  # imported only if channels are late
 
     records = []
     for record, path in zip(problem.records, paths, strict=True):

@@ -1,13 +1,13 @@
 """The likelihood of whole trajectories: states at every sample and coefficients, fitted together.
 
-What is least is the sum of ((sample - state) / noise)^2 and, from each sample to the next, of
-((flow of the state - next state) / (rho noise))^2. With rho large the states are nearly free;
-as it falls they become an exact trajectory of the model, and the squares its chi-squared.
+The objective is the sum over all samples of ((sample - state) / noise)^2, plus the sum over all
+steps of ((flow of the state - next state) / (rho noise))^2. With rho large the states are nearly
+free; as rho falls they become an exact trajectory of the model, and the objective its chi-squared.
 
-Samples are values, or limits that a sensor put in their place. Of a value all is plain: the square
-of its distance in units of the noise. Of limits, -2 log of the normal probability between them
-takes its place, and one step of Fisher's scoring reads as a value at some distance with a noise of
-its own, so that the same filter serves both.
+A sample is either a value or a pair of limits, if the sensor clipped or rounded it. A value
+contributes its squared distance in units of the noise. A pair of limits contributes -2 log of the
+normal probability between them. One step of Fisher scoring turns this into an apparent value with
+an apparent noise, so that the same filter serves both.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
 
-FREE_START = 100.0  # variance of the first state before any sample: ten times its RMS
-MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of one taken
-SETTLED = 1e-2  # a step that lowers the squares by less is the last: a term costs ten
-# Squares so many times their number, falling by less than this share a step, come to nothing.
+FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
+MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of a step tried
+SETTLED = 1e-2  # a fall of the squares that ends the fit; a term's price is about ten
+# Give up on a fit with mean square above FAR that falls by less than this share per step.
 FAR, CRAWLS = 10.0, 0.02
-RIDGE = 1e-12  # of a Hessian of unit diagonal
-# What samples that resolve the motion never need: then it is coefficients that run away, and each
-# substep costs as much as the first.
+RIDGE = 1e-12  # added to a Hessian of unit diagonal
+# Samples that resolve the motion never need more substeps. Runaway coefficients may ask for more,
+# and each substep costs as much as the first.
 MAX_SUBSTEPS, MIN_ALLOWED, MAX_IN_ALL = 32, 4, 20_000
-FAR_OUT = 1e3  # noise beyond a limit, where it is a value to all digits
-TELLS = 1e-3  # share of a value's weight, below which limits say nothing of a state between them
+FAR_OUT = 1e3  # distance beyond a limit, in noise, from which the limit acts as a value
+TELLS = 1e-3  # weight, relative to a value's, below which limits carry no information
 LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """How exact samples and flow are held to be.
+    """How closely states must follow the samples and the flow.
 
-    noise: by record, (samples, d), the samples' standard deviations, scaled. rho: the flow's share
-    of it.
+    noise: for each record, (samples, d), standard deviations of the samples, scaled. rho: the
+    flow's error as a share of the noise.
     """
 
     noise: tuple[np.ndarray, ...]
@@ -61,8 +61,11 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryFit:
-    """States and coefficients. paths: by record, (samples, d), scaled. free: (free,), zero
-    outside the support. squares: (d,), what is least, by state; infinite where the flow is."""
+    """Fitted states and coefficients.
+
+    paths: for each record, (samples, d), scaled. free: (free,), zero outside the support.
+    squares: (d,), the objective by state; infinite if the flow is not finite.
+    """
 
     paths: tuple[np.ndarray, ...]
     free: Float[np.ndarray, " free"]
@@ -71,13 +74,13 @@ class TrajectoryFit:
 
     @property
     def total(self) -> float:
-        with np.errstate(over="ignore"):  # infinite then, as where one of them is
+        with np.errstate(over="ignore"):  # the sum is infinite then, as if one of them were
             return float(self.squares.sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """The squares as a function of all free coefficients, the states following them.
+    """The squares as a quadratic function of all free coefficients, the states eliminated.
 
     squares(z) = offset - 2 linear' z + z' quadratic z, exact where the fit is linear.
     """
@@ -88,14 +91,14 @@ class Gram:
 
     @property
     def finite(self) -> bool:
-        """False where terms that no fit has yet overflow between two samples."""
+        """False if terms outside the present support overflow between two samples."""
         return bool(np.isfinite(self.quadratic).all() and np.isfinite(self.linear).all())
 
 
 def squares(
     problem: EstimationProblem, paths: Sequence[np.ndarray], free: np.ndarray, level: Level
 ) -> Float[np.ndarray, " d"]:
-    """What is least, by state."""
+    """The objective (see the module), by state."""
     total = np.zeros(len(problem.states))
     with np.errstate(over="ignore", invalid="ignore"):
         for record, path, variance, process in zip(
@@ -108,15 +111,18 @@ def squares(
 
 
 def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> TrajectoryFit:
-    """The nearest least squares over states and coefficients, by Gauss-Newton with halved steps."""
+    """Minimise the squares over states and coefficients by Gauss-Newton with step halving.
+
+    The result is the nearest local minimum.
+    """
     fit = replace(fit, squares=squares(problem, fit.paths, fit.free, level))
     if not np.isfinite(fit.total):
-        return fit  # there is no slope to follow
+        return fit  # no gradient to follow
     for _ in range(MAX_STEPS):
         problem.advance(1)
         change, moves = _step(problem, fit, level)
         if not np.isfinite(change).all():
-            return fit  # derivatives overflow where the flow itself does not yet
+            return fit  # derivatives overflow before the flow itself does
         share = 1.0
         while share > SHORTEST:
             paths = tuple(p + share * m for p, m in zip(fit.paths, moves, strict=True))
@@ -148,7 +154,7 @@ def gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Gram:
 def covariance(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> Float[np.ndarray, "support support"] | None:
-    """Of the support's free coefficients, scaled; None where the fit runs away."""
+    """Covariance of the support's free coefficients, scaled; None if the fit is not finite."""
     hessian = _hessian(problem, fit, fit.support, level)[0]
     if not np.isfinite(hessian).all():
         return None
@@ -159,7 +165,7 @@ def covariance(
 def enough_substeps(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level, *, share: float = 0.1
 ) -> int:
-    """Runge-Kutta steps between samples that err by less than a share of what the flow may."""
+    """Number of Runge-Kutta steps between samples for an error below a share of the flow's."""
     n = level.n_substeps
     most = min(MAX_SUBSTEPS, max(MIN_ALLOWED, MAX_IN_ALL // problem.n_samples))
     while 2 * n <= most:
@@ -183,7 +189,7 @@ def enough_substeps(
 def _step(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[Float[np.ndarray, " free"], list[np.ndarray]]:
-    """One Gauss-Newton step: of the free coefficients, and of every path."""
+    """One Gauss-Newton step: changes of the free coefficients and of every path."""
     hessian, gradient, _, flows = _hessian(problem, fit, fit.support, level)
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         return np.full_like(fit.free, np.nan), []
@@ -207,7 +213,7 @@ def _step(
 def _hessian(
     problem: EstimationProblem, fit: TrajectoryFit, support: Bool[np.ndarray, " free"], level: Level
 ) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
-    """`hessian` by a support's coefficients."""
+    """`hessian` with respect to the coefficients of a support."""
     return hessian(
         problem,
         fit,
@@ -222,8 +228,11 @@ def hessian(
     level: Level,
     flow_of: Callable[[ScaledRecord, np.ndarray], Flow],
 ) -> tuple[np.ndarray, np.ndarray, float, list[Flow]]:
-    """Half the second derivatives by what the flow has slopes of, minus half the first, the least
-    squares with none of it changed, and the flows."""
+    """Derivatives of the squares by the parameters that the flow has slopes of, states eliminated.
+
+    Returns half the second derivatives, minus half the first, the least squares with these
+    parameters unchanged, and the flows.
+    """
     total: list[Any] = [0.0, 0.0, 0.0]
     flows = []
     for record, path, variance, process in zip(
@@ -240,15 +249,15 @@ def hessian(
 
 
 def unit_sizes(hessian: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
-    """Roots of the diagonal; one for a term that has no part, whose row is zero or rounding."""
+    """Roots of the diagonal; one for a term without effect, whose row is zero or rounding."""
     return np.sqrt(zero_to_one(np.maximum(np.diag(hessian), 0.0)))
 
 
 class Seen(NamedTuple):
-    """A record beside a path, all (samples, d).
+    """Comparison of a record with a path; all arrays (samples, d).
 
-    residuals: NaN where a sample says nothing; variance: that of the noise that they stand for.
-    squares: what is least, zero where a sample is met.
+    residuals: NaN where a sample carries no information. variance: of the noise of these residuals.
+    squares: contributions to the objective, zero for a sample that the path meets.
     """
 
     residuals: Float[np.ndarray, "samples d"]
@@ -261,7 +270,7 @@ def observe(
     path: Float[np.ndarray, "samples d"],
     variance: Float[np.ndarray, "samples d"],
 ) -> Seen:
-    """How samples of a noise see a path."""
+    """Compare the samples of a record with a path, given the variance of the noise."""
     residuals = record.samples - path
     squares = np.square(residuals) / variance
     if record.limits is None:
@@ -280,17 +289,20 @@ def observe(
 def between(
     lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Of a unit normal variable known to lie between limits: its mean, what knowing them tells
-    (one minus its variance), and -2 log of their probability."""
-    from scipy.special import log_ndtr  # for those alone whose sensors have limits
+    """Statistics of a unit normal variable that is known to lie between two limits.
 
-    turned = lower > -upper  # the lower tail keeps its digits
+    Returns its mean, one minus its variance (the information in the limits), and -2 log of the
+    probability between the limits.
+    """
+    from scipy.special import log_ndtr  # imported only if a sensor has limits
+
+    turned = lower > -upper  # computed in the lower tail, which keeps its digits
     low, high = np.where(turned, -upper, lower), np.where(turned, -lower, upper)
     log_high = log_ndtr(high)
     log_p = log_high + np.log1p(-np.exp(log_ndtr(low) - log_high))
     at_low, at_high = (np.exp(-0.5 * np.square(x) - LOG_ROOT_2PI - log_p) for x in (low, high))
     mean = at_low - at_high
-    # Of an infinite limit the density is zero. Far out digits are lost: there it is a value.
+    # The density at an infinite limit is zero. Far out digits are lost: use a value there.
     slope = np.where(np.isfinite(low), low, 0.0) * at_low
     slope -= np.where(np.isfinite(high), high, 0.0) * at_high
     tells = np.where(high < -FAR_OUT, 1.0, np.clip(np.square(mean) - slope, 0.0, 1.0))

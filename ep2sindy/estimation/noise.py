@@ -1,4 +1,4 @@
-"""The noise that a fit leaves: how large, whether it lasts, and whether the model explains it."""
+"""The noise that a fit leaves: its size, its correlation, and whether the model explains it."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, fit
 from ep2sindy.estimation.likelihood import squares as squares_of
 from ep2sindy.estimation.problem import EstimationProblem
 
-FLOOR = 1e-3  # of the RMS: no model and no integration is exact
+FLOOR = 1e-3  # least noise, as a share of the RMS: no model and no integration is exact
 SIGNIFICANT = 3.5  # standard errors of an autocorrelation
 MAX_LASTING = 0.98
-ALIKE = 7.0  # of the logarithm of their mean square, which scatters by 2.15 over sqrt(n)
-LONGER = 6.0  # of autocorrelations, which scatter by up to 1.7 over sqrt(n)
-NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # that are tried beside limits
+ALIKE = 7.0  # tolerance of the log mean square of differences, which scatters by 2.15/sqrt(n)
+LONGER = 6.0  # tolerance of autocorrelations, which scatter by up to 1.7/sqrt(n)
+NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # of the residuals' RMS, tried for limits
 LAGS = (2, 3, 4, 5, 6)
 TINY = float(np.finfo(np.float64).tiny)
-SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of variance that grows
-GROWTH_SHOWS = 12.0  # by which growing noise must be likelier, twice its logarithm
+SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of growing variance, tried in turn
+GROWTH_SHOWS = 12.0  # least gain in 2 log likelihood for noise that grows
 OUTLYING = 5.0  # standard deviations
-ORDER = 3  # of differences: they leave little of a signal that the samples resolve
-LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of error of the flow that are tried
-# What is believed beforehand, worth so many samples: noise is alike in all states. Else, with few
-# samples, a model is likeliest that follows one state exactly and lets go of another.
+ORDER = 3  # of differences, which remove most of a signal that the samples resolve
+LEVELS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # rho: errors of the flow that are tried
+# Prior, worth this many samples: the noise is alike in all states. Without it, for few samples,
+# the likeliest model follows one state exactly and ignores another.
 ALIKE_SAMPLES = 5.0
-ERROR_SHOWS = 2.0  # by which a flow with error must be likelier, twice its logarithm
+ERROR_SHOWS = 2.0  # least gain in 2 log likelihood for a flow with error
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """What is left of the samples beside a fit.
+    """Statistics of the residuals of a fit.
 
-    std: (d,), RMS over all samples, scaled, no lower than the floor. shape: by record,
-    (samples, d), the size at a sample in units of std: one, or growing with the state. memory:
-    (d,), correlation from one sample to the next where noise lasts, else 0. unexplained: (d,), the
-    same where the samples show no such noise: then it is the model's error. growth: (d,), share of
-    the variance that grows with the state. kurtosis: (d,), of normal noise 3, NaN where all
-    samples are limits; outliers: (d,), how
-    many samples are off by five standard deviations of what most show. deviance: -2 log likelihood
-    of the residuals.
+    std: (d,), RMS over all samples, scaled, no lower than the floor. shape: for each record,
+    (samples, d), relative size of the noise at each sample in units of std: one, or growing with
+    the state. memory: (d,), correlation from one sample to the next if the noise is correlated in
+    time, else 0. unexplained: (d,), the same correlation if the samples themselves do not show such
+    noise: then it is the model's error. growth: (d,), share of the variance that grows with the
+    state. kurtosis: (d,), 3 for normal noise, NaN if all samples are limits. outliers: (d,), number
+    of samples off by more than five standard deviations, estimated from the median. deviance: -2
+    log likelihood of the residuals.
     """
 
     std: Float[np.ndarray, " d"]
@@ -57,22 +57,22 @@ class Noise:
 
     @property
     def white(self) -> tuple[np.ndarray, ...]:
-        """Standard deviations, by record (samples, d)."""
+        """Standard deviations, for each record (samples, d)."""
         return tuple(np.maximum(self.std * shape, FLOOR) for shape in self.shape)
 
     @property
     def effective(self) -> tuple[np.ndarray, ...]:
-        """Those of white noise that tells as little about slow signals."""
+        """Standard deviations of white noise that tells equally little about slow signals."""
         return tuple(noise / np.sqrt(self.independent) for noise in self.white)
 
     @property
     def independent(self) -> Float[np.ndarray, " d"]:
-        """Share of the samples that count."""
+        """Effective share of independent samples."""
         return (1.0 - self.memory) / (1.0 + self.memory)
 
 
 def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
-    """Size, shape and memory of what a fit leaves; memory as AR(1)."""
+    """Size, shape and memory of the residuals of a fit; the memory is that of an AR(1) process."""
     left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
     n = problem.n_samples
     per_state = fit.support.sum() / len(problem.states) + len(left)
@@ -112,8 +112,10 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
 def _likeliest_std(
     problem: EstimationProblem, fit: TrajectoryFit, std: Float[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-    """Where sensors have limits: the noise under which the samples are likeliest, and -2 log of
-    their likelihood, beside that of values alone."""
+    """For sensors with limits: the likeliest noise, and -2 log of the likelihood under it.
+
+    The second value replaces that of `noise_beside` for states with limits.
+    """
     best, found = np.full(len(std), np.inf), std
     n_values = np.sum(
         [np.isfinite(record.values).sum(axis=0) for record in problem.records], axis=0
@@ -132,7 +134,7 @@ def _likeliest_std(
 def _pulls(
     problem: EstimationProblem, fit: TrajectoryFit, std: Float[np.ndarray, " d"]
 ) -> list[Float[np.ndarray, "samples d"]]:
-    """What is left of values; of limits, what the noise is thought to have been."""
+    """Residuals of values; for limits, the expected noise."""
     pulls = []
     for record, path in zip(problem.records, fit.paths, strict=True):
         by_sample = observe(record, path, np.broadcast_to(np.square(std), path.shape))
@@ -142,7 +144,7 @@ def _pulls(
 
 
 def _memory(left: Sequence[Float[np.ndarray, "samples d"]]) -> Float[np.ndarray, " d"]:
-    """Correlation from one sample to the next."""
+    """Correlation of residuals from one sample to the next."""
     squares = sum(np.square(e).sum(axis=0) for e in left)
     lagged = sum((e[1:] * e[:-1]).sum(axis=0) for e in left)
     return np.clip(lagged / np.maximum(squares, TINY), 0.0, MAX_LASTING)
@@ -151,14 +153,14 @@ def _memory(left: Sequence[Float[np.ndarray, "samples d"]]) -> Float[np.ndarray,
 def _shapes(
     paths: Sequence[Float[np.ndarray, "samples d"]], left: Sequence[Float[np.ndarray, "samples d"]]
 ) -> tuple[tuple[np.ndarray, ...], Float[np.ndarray, " d"]]:
-    """How noise grows with the state: variance of 1 - w + w x^2 / mean of x^2, w by likelihood.
+    """Growth of the noise with the state: variance 1 - w + w x^2 / mean of x^2, w by likelihood.
 
-    Returns its root, by record, and w.
+    Returns the root of this variance, by record, and w.
     """
     x2, e2 = (np.square(np.concatenate(list(parts))) for parts in (paths, left))
     relative = x2 / np.maximum(x2.mean(axis=0), TINY)
     variance, growth = np.ones_like(x2), np.zeros(x2.shape[1])
-    # Squares of noise that lasts come in groups: fewer of them are independent.
+    # Squares of correlated noise are correlated too: fewer of them are independent.
     square = np.square(_memory(left))
     shows = GROWTH_SHOWS * (1.0 + square) / (1.0 - square)
     best = len(x2) * np.log(np.maximum(e2.mean(axis=0), TINY)) - shows
@@ -179,8 +181,7 @@ def _tails(
     left: Sequence[Float[np.ndarray, "samples d"]],
     memory: Float[np.ndarray, " d"],
 ) -> tuple[Float[np.ndarray, " d"], Int[np.ndarray, " d"]]:
-    """Kurtosis of what is new in residuals of values from one sample to the next, and how many of
-    them are outliers."""
+    """Kurtosis of the AR(1) innovations of the residuals of values, and the number of outliers."""
     kurtosis, outliers = np.full(len(memory), np.nan), np.zeros(len(memory), dtype=np.int64)
     values = [np.isfinite(record.values) for record in problem.records]
     new = np.concatenate([e[1:] - memory * e[:-1] for e in left])
@@ -194,9 +195,10 @@ def _tails(
 
 
 def flow_error(problem: EstimationProblem, fit: TrajectoryFit, noise: Noise, exact: Level) -> float:
-    """rho under which the fit's support is most likely; 0 where an exact flow is.
+    """The rho under which the fit's support is most likely; 0 if an exact flow is.
 
-    An exact flow is weighed with noise that lasts, where it does; one with error in white noise.
+    The exact flow is weighed with correlated noise if the noise is correlated; a flow with error is
+    weighed with white noise.
     Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
     white = replace(exact, noise=noise.white)
@@ -214,7 +216,8 @@ def flow_error(problem: EstimationProblem, fit: TrajectoryFit, noise: Noise, exa
 def _deviance(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> float:
     """-2 log likelihood of the samples by their innovations, all noise scaled to its best size.
 
-    Where there are limits, by Laplace's approximation, and the noise as it is: it is no scale then.
+    With limits it uses Laplace's approximation and does not rescale the noise, which is then no
+    mere scale factor.
     """
     least = spread = by_limits = 0.0
     none = np.zeros_like(fit.support)
@@ -239,8 +242,10 @@ def _deviance(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> f
 def _forgets(
     left: Sequence[Float[np.ndarray, "samples d"]], memory: Float[np.ndarray, " d"]
 ) -> Bool[np.ndarray, " d"]:
-    """Whether residuals forget as fast as noise of this memory; what a model leaves of a signal
-    lasts longer beside white noise than from one sample to the next."""
+    """True if the residuals' autocorrelation falls as fast as that of AR(1) noise of this memory.
+
+    The error of a model on a signal with white noise stays correlated over longer lags.
+    """
     squares = sum(np.square(e).sum(axis=0) for e in left)
     n = sum(map(len, left))
     faster = np.ones(len(memory), dtype=np.bool_)
@@ -256,10 +261,11 @@ def _shown_by_samples(
     std: Float[np.ndarray, " d"],
     memory: Float[np.ndarray, " d"],
 ) -> Bool[np.ndarray, " d"]:
-    """Whether noise of this size and memory would leave differences as large as the samples'.
+    """True if noise of this size and memory would leave differences as large as the samples'.
 
-    What a model leaves of a signal is smooth: it would make them smaller than they are. What the
-    samples do not resolve of a signal makes them larger; then those of the residuals count.
+    The error of a model on a signal is smooth: it would make the differences smaller than they are.
+    A signal that the samples do not resolve makes them larger; then the differences of the
+    residuals count.
     """
     samples = [record.values for record in problem.records]
     left = [values - path for values, path in zip(samples, fit.paths, strict=True)]
@@ -274,7 +280,7 @@ def _shown_by_samples(
 def _squared_differences(
     values: Sequence[Float[np.ndarray, "samples d"]],
 ) -> Float[np.ndarray, " d"]:
-    """Mean squares, NaN left out; zero where there is none."""
+    """Mean squares of the third differences, NaN left out; zero where there are none."""
     differences = np.concatenate([np.diff(each, ORDER, axis=0) for each in values])
     count = np.maximum(np.isfinite(differences).sum(axis=0), 1)
     return np.nansum(np.square(differences), axis=0) / count

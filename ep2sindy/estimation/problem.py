@@ -1,6 +1,6 @@
-"""What is estimated: records in scaled variables, and all coefficients that a model may have.
+"""The estimation problem: records in scaled variables, and all coefficients that a model may have.
 
-What an estimation costs is known before it begins (`check_size`).
+`check_size` tells the cost of an estimation before it begins.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from ep2sindy.library.relations import Relation, constraint
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.trust.memory import check_memory
 
-NUMBERS = 3.5  # held at once for each pair of coefficients, and for each coefficient and state
+NUMBERS = 3.5  # held in memory per pair of coefficients, and per coefficient, sample and state
 
-SOON = 300  # coefficients that are searched within a minute or so
-# Where each Runge-Kutta stage stands in its step, and the share of its slope in the sum.
+SOON = 300  # number of coefficients that a search handles within a minute or so
+# Position of each Runge-Kutta stage in its step, and the weight of its slope in the sum.
 STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 
 
@@ -33,8 +33,8 @@ STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 class ScaledRecord:
     """One trajectory in scaled variables.
 
-    steps: (samples - 1,), in units of the mean step. samples: (samples, d). inputs: cubics
-    through the samples' inputs, of time in units of the mean step; times: (samples,) so.
+    times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
+    inputs: at the samples; between them they are interpolated by cubics, or linearly if switched.
     limits: of samples that are clipped or rounded.
     """
 
@@ -45,7 +45,7 @@ class ScaledRecord:
 
     @property
     def values(self) -> Float[np.ndarray, "samples d"]:
-        """Samples that are values; NaN for limits."""
+        """The samples, with NaN in place of limits."""
         return (
             self.samples if self.limits is None else np.where(self.limits.at, np.nan, self.samples)
         )
@@ -53,7 +53,7 @@ class ScaledRecord:
     def kept(
         self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
     ) -> ScaledRecord:
-        """Some samples alone, with others in their place."""
+        """Keep some of the samples, and replace their values; limits shift with them."""
         limits, by = self.limits, samples - self.samples[kept]
         if limits is not None:
             limits = replace(limits, lower=limits.lower[kept] + by, upper=limits.upper[kept] + by)
@@ -64,16 +64,16 @@ class ScaledRecord:
         return np.diff(self.times)
 
     def inputs_at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
-        """Inputs where a share of every step has passed."""
+        """Inputs at a given share of every step."""
         if not self.inputs.shape[1]:
             return np.empty((len(self.steps), 0))
         return self._curve(self.times[:-1] + share * self.steps)
 
     @cached_property
     def _curve(self) -> Callable[[np.ndarray], np.ndarray]:
-        from scipy.interpolate import make_interp_spline  # for those alone who have inputs
+        from scipy.interpolate import make_interp_spline  # imported only if there are inputs
 
-        # What is switched is held for most steps, and cubics would overshoot.
+        # A switched input is constant over most steps, and cubics would overshoot at its jumps.
         switched = (np.diff(self.inputs, axis=0) == 0.0).mean(axis=0) > 0.5
         degree = 1 if switched.any() else min(3, len(self.inputs) - 1)
         return make_interp_spline(self.times, self.inputs, k=degree)
@@ -81,9 +81,10 @@ class ScaledRecord:
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """Where a model takes states over each step, and how that depends on them.
+    """States at the end of each step of a model, and their derivatives.
 
-    ends: (steps, d). slopes: (steps, d, d + coefficients): by the state, then by coefficients.
+    ends: (steps, d). slopes: (steps, d, d + coefficients), derivatives by the state, then by the
+    coefficients.
     """
 
     ends: Float[np.ndarray, "steps d"]
@@ -94,11 +95,13 @@ class Flow:
 class EstimationProblem:
     """Records, the library of their variables, and the coefficients: coef = C free + fixed.
 
-    library: of scaled variables, states first. term_names: of its terms, variables in SI. equation,
-    column: (coefficients,), where each stands. C: (coefficients, free), fixed: (coefficients,),
-    both scaled; without relations C is the identity. required: (free,), those that are never left
-    out. to_SI: (coefficients,), what takes each from scaled to SI. scale: (d,), RMS of the states
-    in SI; step_s: the unit of time. advance: told of every step of a fit.
+    library: of scaled variables, states first. term_names: names of its terms in SI variables.
+    equation, column: (coefficients,), the equation and the term of each coefficient.
+    C: (coefficients, free), fixed: (coefficients,), both scaled; without relations C is the
+    identity.
+    required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
+    scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
+    advance: called at every step of a fit.
     """
 
     library: Library
@@ -121,28 +124,28 @@ class EstimationProblem:
 
     @cached_property
     def limited(self) -> Bool[np.ndarray, " d"]:
-        """States of which some samples are limits."""
+        """Mask of the states that have limits among their samples."""
         limits = [r.limits.at.any(axis=0) for r in self.records if r.limits is not None]
         return np.any([np.zeros(len(self.states), dtype=np.bool_), *limits], axis=0)
 
     @property
     def n_squares(self) -> int:
-        """Samples times states: about what the squares are where a model fits."""
+        """Samples times states, about the value of the squares if a model fits."""
         return self.n_samples * len(self.states)
 
     @property
     def related(self) -> bool:
-        """Whether relations hold between coefficients."""
+        """True if relations hold between coefficients."""
         return self.C.shape[0] != self.C.shape[1] or not np.array_equal(self.C, np.eye(len(self.C)))
 
     @cached_property
     def block(self) -> Int[np.ndarray, " free"]:
-        """The equation that each free coefficient belongs to; a shared one, to its first."""
+        """Equation that each free coefficient belongs to; the first one, if several share it."""
         return self.equation[np.argmax(self.C != 0.0, axis=0)]
 
     @cached_property
     def degrees(self) -> Int[np.ndarray, " free"]:
-        """Of each free coefficient's term; of several, the least."""
+        """Degree of each free coefficient's term; the least, if several terms share it."""
         degrees = self.library.degrees[self.column]
         return np.where(self.C != 0.0, degrees[:, None], degrees.max()).min(axis=0)
 
@@ -154,13 +157,13 @@ class EstimationProblem:
 
     @property
     def driven(self) -> bool:
-        """Whether inputs drive the states."""
+        """True if inputs drive the states."""
         return any(record.inputs.shape[1] for record in self.records)
 
     def rates(
         self, record: ScaledRecord, states: Float[np.ndarray, "samples d"], free: np.ndarray
     ) -> Float[np.ndarray, "samples d"]:
-        """Derivatives at the samples, by the mean step."""
+        """Derivatives of the states at the samples, per mean step."""
         values = self._product_values(states, record.inputs)
         return values @ (self._shares[:, 0].T @ self.coef(free))
 
@@ -171,7 +174,7 @@ class EstimationProblem:
         free: Float[np.ndarray, " free"],
         n_substeps: int,
     ) -> Float[np.ndarray, "steps d"]:
-        """Where the flow takes states over each step, by `n_substeps` classical RK4 steps."""
+        """States at the end of each step, by `n_substeps` classical RK4 steps."""
         rates = self._shares[:, 0].T @ self.coef(free)
         h = record.steps[:, None] / n_substeps
         for k in range(n_substeps):
@@ -191,7 +194,7 @@ class EstimationProblem:
         support: Bool[np.ndarray, " free"],
         n_substeps: int,
     ) -> Flow:
-        """The same with its derivatives, by the states and by the free ones of a support."""
+        """`ends` with its derivatives by the states and by the free coefficients of a support."""
         d = len(self.states)
         involved = np.flatnonzero(self.C[:, support].any(axis=1))
         equation, column = self.equation[involved], self._places[self.column[involved]]
@@ -245,7 +248,7 @@ class EstimationProblem:
 
     @cached_property
     def _places(self) -> Int[np.ndarray, " terms"]:
-        """Which product each term is."""
+        """Index of the product that equals each term."""
         return np.argmax(self._shares[:, 0] != 0.0, axis=1)
 
 
@@ -257,10 +260,10 @@ def scale_problem(
     *,
     advance: Advance = nothing,
 ) -> EstimationProblem:
-    """Scale records and library, and gather the coefficients that may be in the model.
+    """Scale records and library, and collect the coefficients that may be in the model.
 
-    relations: hold between coefficients. terms: by state, all the terms of an equation that is
-    known but for its coefficients.
+    relations: hold between coefficients. terms: for each state whose equation is known but for its
+    coefficients, all terms of that equation.
     """
     states, names = runs[0].state_names, runs[0].names
     over = library.over(names)
@@ -307,7 +310,7 @@ def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:
 
 
 class SlowSearch(UserWarning):
-    """So much is to be searched at once that it takes long."""
+    """Warning that a search over so many coefficients at once takes long."""
 
 
 def check_size(
@@ -315,7 +318,8 @@ def check_size(
 ) -> None:
     """Raise ValueError for more coefficients than memory holds; warn of a long search.
 
-    terms: by state, all the terms of an equation that is known but for its coefficients.
+    terms: for each state whose equation is known but for its coefficients, all terms of that
+    equation.
     """
     states = runs[0].state_names
     n = sum(len(terms.get(state, library)) for state in states)

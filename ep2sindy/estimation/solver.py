@@ -1,8 +1,8 @@
-"""The estimator of states and coefficients together: from free states to exact trajectories.
+"""The joint estimator of states and coefficients: annealing from free states to exact trajectories.
 
-It begins with smoothed states, and every coefficient from their derivatives. Supports are chosen at
-every level on the way (`anneal`), weighed again at its end (`polish`), and with channels that come
-late brought forward (`solve`).
+It starts from smoothed states, and from all coefficients regressed on their derivatives. Supports
+are chosen at every level on the way (`anneal`), compared again at its end (`polish`), and once more
+with late channels brought forward (`solve`).
 """
 
 from __future__ import annotations
@@ -38,44 +38,44 @@ from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.supports import alternatives, best_support, excess, term_prices
 from ep2sindy.signals.kalman import KalmanSmoother
 
-SAMPLES_PER_TERM = 5  # of the library: fewer do not tell which
-SAMPLES_PER_COEFFICIENT = 10  # of an equation, where they do not: more terms follow the noise
-LET_GO = 0.5  # of a state's spread: what is left of a state that the model does not follow
-ENOUGH_SAMPLES = 300  # to trust the first start: fewer are quickly tried from all
-# Moves of late channels, since the model of a delay is linear; mean steps that need no other.
+SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
+SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
+LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
+ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
+# Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
 MAX_MOVES, SETTLED = 3, 0.05
-MIN_LEFT = 5  # samples of a record, that a smoother takes
-MAX_PASSES = 4  # until noise and support agree: two are the rule
-# Of the smoother, by log10 of process to measurement noise: where the likely one leads astray.
+MIN_LEFT = 5  # fewest samples of a record that a smoother accepts
+MAX_PASSES = 4  # until noise and support agree; usually two
+# Smoother settings (log10 of process to measurement noise) to try if the likeliest one fails.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
-# rho, and the share of a term's price that is asked there: free states hide part of what a term
-# explains, and what is dropped too early would have to be found again.
+# rho, and the share of a term's price charged at that level. Free states hide part of what a term
+# explains, and a term dropped too early would have to be found again.
 COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
 COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
-MAX_EXCHANGES = 3  # of supports at one level
-# Where supports are weighed again: colder, a linear model of the flow tells too little of others;
-# warmer, free states hide what tells them apart.
+MAX_EXCHANGES = 3  # exchanges of supports at one level
+# rho at which supports are compared again. At lower rho the linearised flow says too little about
+# other supports; at higher rho free states hide their differences.
 WEIGHED_AT = 0.003
-WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # above the chosen score; of each round; of all
-UNSURE = 0.05  # of the RMS: noise taken for a start where the smoother's is not believed
-CUTOFF = 1e-8  # singular values of unit columns: smaller ones follow noise
+WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # score above the chosen one; supports per round; rounds
+UNSURE = 0.05  # share of the RMS: least noise at a start where the smoother's is not trusted
+CUTOFF = 1e-8  # of singular values of unit columns: smaller ones fit noise
 
 
 def max_terms_for(problem: EstimationProblem, max_terms: int) -> int:
-    """Terms that one equation may have: fewer than asked for where the samples are few."""
+    """Most terms allowed in one equation; fewer than asked for if the samples are few."""
     if enough_samples(problem):
         return max_terms
     return max(1, min(max_terms, problem.n_samples // SAMPLES_PER_COEFFICIENT))
 
 
 def enough_samples(problem: EstimationProblem) -> bool:
-    """Whether they can tell which terms of the library there are."""
+    """True if there are enough samples to tell which terms of the library are present."""
     return problem.n_samples >= SAMPLES_PER_TERM * len(problem.library)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The end of one start. score: -2 log likelihood plus prices, comparable between starts."""
+    """Result from one start. score: -2 log likelihood plus prices, comparable between starts."""
 
     annealed: AnnealedFit
     noise: Noise
@@ -90,14 +90,14 @@ class Solution:
 
     @property
     def fits(self) -> bool:
-        """Whether what is left looks like noise."""
+        """True if the residuals look like noise."""
         exact = self.flow_error == 0.0 and not self.noise.unexplained.any()
         return exact and bool(np.isfinite(self.score))
 
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """What fits samples whose channels were brought forward by their delays.
+    """The solution for samples whose channels were brought forward by their delays.
 
     delays: (d,), in mean steps.
     """
@@ -108,12 +108,15 @@ class Aligned:
 
 
 def solve(problem: EstimationProblem, *, max_terms: int) -> tuple[Solution, Aligned | None]:
-    """The most likely support from the likely smoothing, and from others where it fits badly; and
-    what explains the samples better, if some channels come late."""
+    """The most likely support, and a better explanation with late channels if there is one.
+
+    The search starts from the likeliest smoothing, and from other smoothings if that fits badly or
+    the samples are few.
+    """
     spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
 
     def rank(each: Solution) -> tuple[int, float]:
-        # A crude model may be likeliest where it follows one state exactly and another not at all.
+        # A crude model may score best by following one state exactly and ignoring another.
         let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
         return int(let_go.sum()), each.score
 
@@ -127,7 +130,7 @@ def solve(problem: EstimationProblem, *, max_terms: int) -> tuple[Solution, Alig
 
 
 def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Aligned | None:
-    """What fits, and is likelier, with channels that come late; None where none does."""
+    """A solution with late channels that fits and is likelier; None if there is none."""
     around = found.annealed.around
     if around is None:  # no model follows the samples
         return None
@@ -140,7 +143,7 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
         delays = delays + step
         here = move_channels(here, now.annealed.fit.paths, step)
         if min(len(record.samples) for record in here.records) < MIN_LEFT:
-            return None  # brought as far apart as a record is long: that is no delay
+            return None  # shifts as long as a record are no delays
         now = _from_start(here, None, max_terms)
         if now.annealed.around is None:
             return None
@@ -148,15 +151,14 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
         step = fit_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
         if np.abs(step).max() < SETTLED:
             break
-    # Samples at the ends are left out: their share of the likelihood is that of the others.
+    # Samples at the ends are left out: scale the likelihood to the full number of samples.
     score = now.score + now.noise.deviance * (problem.n_samples / here.n_samples - 1.0)
     price = late.sum() * log(problem.n_samples) + PAYS
     return Aligned(here, now, delays) if now.fits and score + price < found.score else None
 
 
 def _from_start(problem: EstimationProblem, log10_ratio: float | None, max_terms: int) -> Solution:
-    """Anneal with the smoother's noise, then with the noise that the model leaves, until both
-    and the support agree."""
+    """Anneal with the smoother's noise, then with the residuals', until noise and support agree."""
     fit, std = start_from_smooth(problem, log10_ratio)
     prices = term_prices(problem, float(problem.n_samples))
     found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)
@@ -176,9 +178,9 @@ def _from_start(problem: EstimationProblem, log10_ratio: float | None, max_terms
 
 @dataclass(frozen=True, eq=False)
 class AnnealedFit:
-    """A fit, the level that it ended at, and its squares plus the prices of its terms.
+    """A fit, the level that it ended at, and its score: the squares plus the prices of its terms.
 
-    around: what is near it, where its support was weighed against others.
+    around: linearisation about the fit at the level where its support was compared with others.
     """
 
     fit: TrajectoryFit
@@ -196,7 +198,7 @@ def anneal(
     *,
     max_terms: int,
 ) -> AnnealedFit:
-    """Fit level by level; at each, exchange terms as long as squares plus prices fall."""
+    """Fit level by level; at each level, exchange terms as long as squares plus prices fall."""
     n_substeps, score = 1, np.inf
     for rho, share in schedule:
         fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
@@ -212,9 +214,9 @@ def polish(
     *,
     max_terms: int,
 ) -> AnnealedFit:
-    """Fit again whatever is nearly as likely by a linear model, and keep what is likelier.
+    """Refit each support that is nearly as likely by the linear model, and keep a likelier one.
 
-    What does not follow its samples is left: a linear model of that tells nothing.
+    A fit that does not follow its samples is returned unchanged: its linearisation tells nothing.
     """
     if not found.fit.total < FAR * problem.n_squares:
         return found
@@ -246,10 +248,10 @@ def polish(
 def at_level(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
 ) -> tuple[TrajectoryFit, Level]:
-    """Fit at a level, with as many substeps as that asks for."""
+    """Fit at a level, with as many substeps as it needs."""
     level = replace(level, n_substeps=enough_substeps(problem, fit, level))
     if not np.isfinite(squares(problem, fit.paths, fit.free, level)).all():
-        fit = replace(fit, free=np.zeros_like(fit.free))  # a flow that stands still is finite
+        fit = replace(fit, free=np.zeros_like(fit.free))  # the zero flow is finite
     return fit_paths(problem, fit, level), level
 
 
@@ -260,7 +262,7 @@ def _exchange_terms(
     prices: Float[np.ndarray, " free"],
     max_terms: int,
 ) -> tuple[TrajectoryFit, float]:
-    """Exchange terms by the Gram pair, fit again, and accept what lowers squares plus prices."""
+    """Exchange terms by the Gram matrix, refit, and accept any fall of squares plus prices."""
     score = fit.total + prices[fit.support].sum()
     for _ in range(MAX_EXCHANGES):
         pair = gram(problem, fit, level)
@@ -281,10 +283,11 @@ def _exchange_terms(
 def start_from_smooth(
     problem: EstimationProblem, log10_ratio: float | None
 ) -> tuple[TrajectoryFit, tuple[np.ndarray, ...]]:
-    """All coefficients free, on smoothed states; and the noise beside them, by record (samples, d).
+    """Start on smoothed states with all coefficients free.
 
-    log10_ratio: of the smoother; None finds the most likely one of each record and state. Below
-    some twenty samples a period the likely one may take signal for noise.
+    log10_ratio: of the smoother, process to measurement noise; None takes the most likely ratio of
+    each record and state. Below about twenty samples a period this ratio may take signal for noise.
+    Returns the fit, and the residuals' standard deviations, by record (samples, d).
     """
     smoother = KalmanSmoother(log10_ratio)
     estimates = [smoother.estimate(r.times, r.samples) for r in problem.records]
@@ -310,7 +313,7 @@ def _regress(
     theta: Float[np.ndarray, "samples terms"],
     rates: Float[np.ndarray, "samples d"],
 ) -> Float[np.ndarray, " free"]:
-    """Least squares of all equations at once, relations held."""
+    """Least squares of all equations at once, under the relations."""
     n, d = rates.shape
     rows = np.zeros((n, d, len(problem.equation)))
     for k, (equation, column) in enumerate(zip(problem.equation, problem.column, strict=True)):
@@ -319,7 +322,7 @@ def _regress(
     if problem.related:
         return _solve(rows.reshape(n * d, -1) @ problem.C, target)
     free = np.zeros(problem.C.shape[1])
-    for equation in range(d):  # far smaller, equation by equation
+    for equation in range(d):  # far smaller systems, one per equation
         own = problem.equation == equation
         free[own] = _solve(rows[:, equation, own], target.reshape(n, d)[:, equation])
     return free

@@ -1,4 +1,4 @@
-"""Which coefficients pay for themselves: supports of all equations from one Gram pair."""
+"""Choice of supports of all equations, from one Gram matrix and the prices of the terms."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ep2sindy.estimation.likelihood import Gram, unit_sizes
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.regression.searches import BestSubset
 
-MAX_SWEEPS = 10  # over the equations: two or three are the rule
+MAX_SWEEPS = 10  # over the equations; two or three usually suffice
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
-MAX_ALTERNATIVES = 24  # of one equation, about which the others' are sought again
+MAX_ALTERNATIVES = 24  # supports of one equation for which the others are searched again
 CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which terms are dependent
 
 
@@ -28,10 +28,11 @@ class PenalisedFit:
 
 
 def term_prices(problem: EstimationProblem, n_samples: float) -> Float[np.ndarray, " free"]:
-    """What a coefficient must lower the squares by: log n, and what singles it out.
+    """Price of each coefficient: the fall of the squares that justifies it.
 
-    A term of degree q is one of d C(d + q, q), and every degree above the first is half as likely
-    to be there as the one below; a constant is no simpler than a variable.
+    The price is log n plus a cost of choosing among terms. A term of degree q is one of d C(d + q,
+    q), and every degree above the first is half as likely a priori as the one below; a constant is
+    no simpler than a variable.
     Source: Schwarz 1978, doi:10.1214/aos/1176344136, for log n; Chen & Chen 2008,
     doi:10.1093/biomet/asn034, for the count.
     """
@@ -49,9 +50,10 @@ def best_support(
     max_terms: int,
     held: int | None = None,
 ) -> PenalisedFit:
-    """The support of least score: every equation's exactly, given the others', until none changes.
+    """The support of least score, by sweeps over the equations until none changes.
 
-    max_terms: of one equation. Those required are always in. held: an equation left as it is.
+    Each equation's support is found exactly, given the others'. max_terms: of one equation.
+    Required terms are always in. held: an equation that is not changed.
     """
 
     def rank(each: PenalisedFit) -> tuple[int, float]:
@@ -72,7 +74,7 @@ def best_support(
 
 
 def excess(problem: EstimationProblem, support: Bool[np.ndarray, " free"], max_terms: int) -> int:
-    """By how many terms a support is too large, of those that are not required."""
+    """Number of terms above max_terms, summed over the equations, required terms not counted."""
     sizes = np.bincount(problem.block[support & ~problem.required], minlength=1)
     return int(np.maximum(sizes - max_terms, 0).sum())
 
@@ -85,7 +87,7 @@ def supports_by_size(
     *,
     max_terms: int,
 ) -> list[Bool[np.ndarray, " free"]]:
-    """The best few supports of every size of one equation, the others as chosen."""
+    """The best few supports of every size of one equation, the other equations as chosen."""
     return _offer_supports(problem, gram, chosen, problem.block == block, max_terms)
 
 
@@ -100,8 +102,8 @@ def alternatives(
 ) -> list[PenalisedFit]:
     """Supports whose score lies no further than `within` above the chosen one's, best first.
 
-    Each is an equation's own, with what is then best for the others: exchanges in two equations
-    of which neither pays alone are among them.
+    Each takes another support of one equation, and the best ones of the others given that. So they
+    include exchanges in two equations that pay only together.
     """
     limit = penalise(gram, chosen, prices).score + within
     found: dict[bytes, PenalisedFit] = {}
@@ -122,12 +124,12 @@ def alternatives(
 def penalise(
     gram: Gram, support: Bool[np.ndarray, " free"], prices: Float[np.ndarray, " free"]
 ) -> PenalisedFit:
-    """The least squares on a support, with its terms' prices."""
+    """Least squares on a support, and their score: the squares plus its terms' prices."""
     free = np.zeros(len(support))
     quadratic, linear = gram.quadratic[np.ix_(support, support)], gram.linear[support]
     inverse = inverse_of(quadratic)
     free[support] = inverse @ linear
-    # One refinement: what the cutoff dropped has no part in it.
+    # One step of iterative refinement; directions below the cutoff stay out.
     free[support] += inverse @ (linear - quadratic @ free[support])
     rest = gram.offset - 2.0 * gram.linear @ free + free @ gram.quadratic @ free
     return PenalisedFit(support, free, float(rest + prices[support].sum()))
@@ -140,7 +142,7 @@ def _offer_supports(
     own: Bool[np.ndarray, " free"],
     max_terms: int,
 ) -> list[Bool[np.ndarray, " free"]]:
-    """Supports of one equation's coefficients, the others' and those required kept free."""
+    """Best supports of one equation; the other equations' and required coefficients stay free."""
     kept = (chosen & ~own) | problem.required
     own = own & ~problem.required
     if not own.any():
@@ -150,7 +152,7 @@ def _offer_supports(
     xx = gram.quadratic[np.ix_(own, own)] - share @ gram.quadratic[np.ix_(kept, own)]
     xy = gram.linear[own] - share @ gram.linear[kept]
     yy = max(gram.offset - gram.linear[kept] @ inverse @ gram.linear[kept], 1.0)
-    # A column that those kept make up leaves rounding: it is not at hand.
+    # A column that the kept ones span leaves only rounding: it is not available.
     square = np.diag(xx).copy()
     square[square <= CUTOFF * np.diag(gram.quadratic)[own]] = 0.0
     size = np.sqrt(zero_to_one(square))

@@ -1,4 +1,4 @@
-"""The law of one cycle's records: its structure and order, points left out, and a map."""
+"""The law of the operating point for records on one cycle: structure, degree, tests and map."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 
-MAX_PARAMETERS = 2  # of a map that can be drawn
-N_TOGETHER = 24  # points of a map that are computed as one piece: the records travel with each
-CLOSE = 0.05  # of its bound: a deviation that is no reason for another term
+MAX_PARAMETERS = 2  # most parameters of a map that can be drawn
+N_TOGETHER = 24  # points of a map computed as one piece: the records are sent with each piece
+CLOSE = 0.05  # deviation, as a share of its bound, that does not justify another term
 
 
 @dataclass(frozen=True, eq=False)
 class StructureTrial:
-    """A structure with laws of one degree, weighted by information, at points left out.
+    """A structure with weighted laws of one degree, tested by leaving out each point in turn.
 
-    errors: by record, the largest deviation from its cycle in units of its bound, ten at most, and
-    no less than a twentieth: what is closer buys no term.
+    errors: for each record, the largest deviation from its cycle in units of the bound, at most ten
+    and at least a twentieth: smaller deviations do not justify another term.
     """
 
     fit: OperatingFit
@@ -68,9 +68,10 @@ def candidate_structures(
     max_terms: int,
     progress: Progress = SILENT,
 ) -> list[Structure]:
-    """The best support of every size from two on for each equation, in all combinations.
+    """All combinations of the best supports, of each size from two terms on, of every equation.
 
-    One search over all records: a term is in or out everywhere. Rows are those of the derivative.
+    One search over all records finds the supports: a term is in or out everywhere. The rows are
+    those of the derivative.
     """
     method = Regression(formulation=Differential(), search=BestSubset(max_terms=max_terms))
     runs = {record.label: [record.run] for record in records}
@@ -93,9 +94,9 @@ def try_structures(
     workers: Workers | None = None,
     progress: Progress = SILENT,
 ) -> list[StructureTrial]:
-    """Every structure with every degree that leaves a point over.
+    """Try every structure with every degree for which the points suffice with one left out.
 
-    Raises ValueError where the records suffice for none.
+    Raises ValueError if they suffice for none.
     """
     one = partial(
         _try_structure,
@@ -118,9 +119,9 @@ def try_structures(
 
 
 def choose(found: Sequence[StructureTrial]) -> StructureTrial:
-    """The one of fewest numbers whose mean error is not told apart from the least.
+    """The trial with fewest numbers whose mean error is not distinguishable from the least.
 
-    That is within one standard error of the difference, point by point.
+    The difference of the errors, point by point, must be within one standard error.
     """
     best = min(found, key=lambda each: (float(each.errors.mean()), each.n_numbers))
     near = []
@@ -153,7 +154,7 @@ def _try_structure(
 
 @dataclass(frozen=True, eq=False)
 class BranchSettings:
-    """BranchSettings the law of a branch is found.
+    """Settings for finding the law of a branch.
 
     structure: None tries supports of two to `max_terms` terms in each equation. degrees: of the
     polynomials, tried in turn. n_map: points of the map along each parameter.
@@ -170,11 +171,11 @@ class BranchSettings:
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """One cycle's records and their law.
+    """The records on one cycle, and their law.
 
-    smooth: relative errors of frequency and amplitude, interpolated themselves at points left out
-    by the law's functions. at_points: the law's models at all points of the study; map: over a
-    grid that encloses these, empty for more than two parameters.
+    smooth: relative errors of frequency and amplitude if these are themselves interpolated, at
+    points left out, by the law's functions. at_points: the law's models at all points of the study.
+    map: the same over a grid that encloses these, empty for more than two parameters.
     """
 
     name: str
@@ -193,7 +194,7 @@ class Branch:
 
 
 def group_by_cycle(records: Sequence[OperatingRecord]) -> dict[str, list[OperatingRecord]]:
-    """Records by cycle: all, or strong and weak."""
+    """Records grouped by cycle: one group "all", or "strong" and "weak"."""
     check_records(records)
     number = branches_of(records)
     if not number.any():
@@ -214,9 +215,9 @@ def find_branch(
     *,
     progress: Progress = SILENT,
 ) -> Branch:
-    """Find the law of one cycle's records, and follow it over points and a map.
+    """Find the law of the records on one cycle, and evaluate it at points and over a map.
 
-    Raises ValueError where the records do not suffice for a law.
+    Raises ValueError if the records do not suffice for a law.
     """
     check_records(records)
     if how.structure is None:

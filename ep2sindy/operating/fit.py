@@ -1,4 +1,4 @@
-"""Laws of the operating point, fitted to records, and judged at points that are left out."""
+"""Laws of the operating point: fit to the records of all points, and leave-one-out tests."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.signals.spectrum import samples_in
 
-MOST = 10.0  # deviations count no more, however far a run is off, or where there is none
+MOST = 10.0  # upper bound on the reported deviation, also used if there is none
 
 Structure = Mapping[str, Sequence[str]]
 
 
-# States count by their standard deviation, as free runs are judged: without passes of weights.
+# No reweighting: states are scaled by their standard deviation, as in the judging of free runs.
 SETTINGS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
 
 
 def in_samples(
     settings: RefinementSettings, records: Sequence[OperatingRecord]
 ) -> RefinementSettings:
-    """The same for records of one law: windows hold as many samples in all of them.
+    """Settings for the records of one law: windows have the same number of samples in all of them.
 
     Periods are those of the median frequency; no window is longer than half of any record.
     """
@@ -59,9 +59,9 @@ def in_samples(
 
 @dataclass(frozen=True, eq=False)
 class OperatingFit:
-    """Records of one branch, each refined alone with the same terms; laws are made of these.
+    """Records of one branch, each refined on its own with the same terms, as input for laws.
 
-    structure: state -> terms. fits: by record.
+    structure: state -> terms. fits: one per record.
     """
 
     records: Sequence[OperatingRecord]
@@ -80,7 +80,7 @@ class OperatingFit:
 
     @cached_property
     def information(self) -> Float[np.ndarray, "records coefs coefs"]:
-        """Of each record's coefficients; zero where its refinement came to nothing."""
+        """Information matrix of each record's coefficients; zero if its refinement failed."""
         nothing = np.zeros((self.n_coefs, self.n_coefs))
         return np.stack(
             [
@@ -91,7 +91,7 @@ class OperatingFit:
 
     @property
     def own_runs(self) -> list[FreeRun]:
-        """Every point run freely with coefficients of its own: what no law can better by much."""
+        """Free runs of every point with its own coefficients; no law can be much better."""
         pairs = zip(self.fits, self.records, strict=True)
         return [free_run(fit.model, record.from_slowest) for fit, record in pairs]
 
@@ -107,13 +107,13 @@ class OperatingFit:
         return functions.evaluate(values_of(self.records))
 
     def functions(self, degree: int) -> Library:
-        """Polynomials of the parameters; ValueError where the records do not suffice."""
+        """Polynomials of the parameters. Raises ValueError if the records do not suffice."""
         found = polynomial(list(self.records[0].parameters), degree=degree)
         law_basis(found, values_of(self.records))
         return found
 
     def weighted(self, functions: Library) -> OperatingLaw:
-        """The law through the separate refinements, each weighted by its information."""
+        """The law fitted to the separate refinements, each weighted by its information."""
         law = weighted_law(self.coefficients, self.information, self.basis(functions))
         return self._law(functions, law, None, "weighted")
 
@@ -126,7 +126,8 @@ class OperatingFit:
     ) -> tuple[OperatingLaw, LawRefinement]:
         """The law refined over all records at once, with intervals.
 
-        start: a law that is close; the weighted one, and all stages, otherwise.
+        start: a law close to the result, which shortens the refinement. None starts from the
+        weighted law, with all stages.
         """
         near = self.weighted(functions) if start is None else start
         settings = in_samples(self.settings, self.records)
@@ -176,9 +177,9 @@ def operating_fit(
 ) -> OperatingFit:
     """Refine every record on its own with the same terms, from least squares of the derivative.
 
-    settings: of these refinements and of the law's; their windows are as long in all records.
-    Raises ValueError for records whose parameters do not vary or whose states differ, or a state
-    or term that is not there.
+    settings: of these refinements and of the law's; windows have the same length in all records.
+    Raises ValueError for records whose parameters do not vary or whose states differ, or for an
+    unknown state or term.
     """
     check_records(records)
     states = list(records[0].run.state_names)
@@ -203,9 +204,10 @@ def operating_fit(
 
 @dataclass(frozen=True, eq=False)
 class LeaveOneOut:
-    """A point read off the law of the others, and run freely from one sample of its record.
+    """A free run of one point with the law fitted to the other points.
 
-    inside: whether the others enclose it.
+    The run starts at one sample of the point's record. inside: True if the other points enclose
+    this one.
     """
 
     record: OperatingRecord
@@ -224,10 +226,10 @@ class LeaveOneOut:
 
 
 def error_statistics(left_out: Sequence[LeaveOneOut]) -> dict[str, float | int]:
-    """How far points that were left out are missed: counts, medians, and nine in ten.
+    """Statistics of the errors at points left out: counts, medians, and the 90 % quantile.
 
-    A point without a frequency counts as infinitely far off in it, and not in the medians of
-    amplitude and waveform, which are those of each point's worst state.
+    A point without a frequency counts as an infinite frequency error, and does not enter the
+    medians of amplitude and waveform. These are taken over each point's worst state.
     """
     f = np.array([abs(each.run.f_error) for each in left_out])
     f[np.isnan(f)] = np.inf
@@ -258,9 +260,10 @@ def leave_one_out(
     workers: Workers | None = None,
     progress: Progress | bool = False,
 ) -> list[LeaveOneOut]:
-    """Every point in turn by the law of the others: weighted, or tied, beginning at `start`.
+    """Test each point in turn with the law of the others: weighted, or tied if `start` is given.
 
-    Raises ValueError where points without one do not suffice for the law.
+    start: the law that the tied laws start from.
+    Raises ValueError if the points without one do not suffice for the law.
     """
     for k, record in enumerate(fit.records):
         try:

@@ -34,19 +34,19 @@ from ep2sindy.selection.rule import FLOOR
 
 FORMAT = "ep2sindy.OperatingLaw/1"
 
-# Steps of weighting and correction of the last fit, as `reweight` takes them.
+# Steps of weighting and correction of the final fit, as in `reweight`.
 N_STEPS = 8
 
-INSIDE = 1e-6  # a point this far outside the hull, in ranges of the parameters, lies on its edge
+INSIDE = 1e-6  # tolerance of the hull, in ranges of the parameters
 
 
 @dataclass(frozen=True, eq=False)
 class OperatingLaw:
-    """One structure, coefficients by law: coef[k] at a point = coef[k] @ functions(parameters).
+    """One structure, coefficients by a law: coef[k] at a point = coef[k] @ functions(parameters).
 
-    functions: of the parameters; library: of the states. coefficients: (state, term) of each row
-    of coef, in SI. covariance: of coef.ravel(), None where it is not known. points: the operating
-    points that it was fitted to, columns in the order of the functions' variables.
+    functions: of the parameters; library: of the states. coefficients: (state, term) of each row of
+    coef, in SI. covariance: of coef.ravel(), None if unknown. points: the operating points of the
+    fit, columns in the order of the functions' variables.
     """
 
     functions: Library
@@ -97,7 +97,7 @@ class OperatingLaw:
 
     @property
     def numbers(self) -> dict[str, dict[str, dict[str, float]]]:
-        """State -> term -> function -> its number in that term's coefficient."""
+        """State -> term -> function -> the factor of that function in the term's coefficient."""
         found: dict[str, dict[str, dict[str, float]]] = {state: {} for state in self.states}
         for (state, term), row in zip(self.coefficients, self.coef.tolist(), strict=True):
             found[state][term] = dict(zip(self.functions.names, row, strict=True))
@@ -106,10 +106,10 @@ class OperatingLaw:
     def model_at(
         self, parameters: Mapping[str, float], *, extrapolate: bool = False
     ) -> SparseModel:
-        """The model at an operating point, which need not be among those of the fit.
+        """The model at an operating point, which need not be one of the fitted points.
 
-        Raises ValueError unless `parameters` has a finite value for each of the law's, or outside
-        the convex hull of the points that it was fitted to, but for extrapolate=True.
+        Raises ValueError unless `parameters` has a finite value for each parameter of the law. Also
+        raises ValueError outside the convex hull of the fitted points, unless extrapolate=True.
         """
         values = self._values(parameters)
         if not extrapolate and not self._holds(values):
@@ -131,11 +131,11 @@ class OperatingLaw:
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
 
     def is_inside(self, parameters: Mapping[str, float]) -> bool:
-        """Whether a point lies in the convex hull of those of the fit."""
+        """True if a point lies in the convex hull of the fitted points."""
         return self._holds(self._values(parameters))
 
     def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
-        """(state, term) -> function -> lower and upper bound of its number, for Gaussian errors.
+        """(state, term) -> function -> lower and upper bound of its factor, for Gaussian errors.
 
         Raises ValueError for a law without covariance.
         """
@@ -170,7 +170,7 @@ class OperatingLaw:
         return f"{head}\n{self.text()}"
 
     def to_json(self) -> str:
-        """Everything in the law; floats in their shortest exact form."""
+        """The complete law as JSON; floats in their shortest exact form."""
         content = {
             "format": FORMAT,
             "parameters": list(self.parameters),
@@ -207,7 +207,7 @@ class OperatingLaw:
                 provenance=texts_in(content["provenance"], "provenance"),
             )
         except UnknownFunctionError:
-            raise  # the file is sound: a function must be registered before it is read
+            raise  # the file is valid, but a function in it must be registered before reading
         except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
             raise ValueError(f"a law file must hold {FORMAT} JSON: {error}") from error
 
@@ -240,7 +240,7 @@ class OperatingLaw:
 def in_hull(
     points: Float[np.ndarray, "points parameters"], value: Float[np.ndarray, " parameters"]
 ) -> bool:
-    """Whether a value is an average of points, with weights that are not negative."""
+    """True if a value lies in the convex hull of points."""
     scale = zero_to_one(np.ptp(points, axis=0))
     columns = np.vstack([((points - value) / scale).T, np.ones(len(points))])
     target = np.append(np.zeros(points.shape[1]), 1.0)
@@ -254,11 +254,11 @@ def law_basis(
     n_spare: int = 0,
     remedy: str = "leave it out, or add points",
 ) -> Basis:
-    """The functions of a law at the points that it is to be fitted to: the check of all laws.
+    """The functions of a law at the points of its fit, with the checks common to all laws.
 
-    points: columns in the order of the functions' variables. n_spare: points that must be left
-    over. remedy: what to do about a parameter that does not vary.
-    Raises ValueError where the points do not suffice; it names a parameter if one is to blame.
+    points: columns in the order of the functions' variables. n_spare: number of points required
+    beyond the number of functions. remedy: advice on a parameter that does not vary.
+    Raises ValueError if the points do not suffice, naming the parameter if one is to blame.
     """
     try:
         if n_spare and len(points) < len(functions) + n_spare:
@@ -274,12 +274,12 @@ def law_basis(
 
 @dataclass(frozen=True, eq=False)
 class LawTest:
-    """Whether the coefficients of one equation follow a law.
+    """Test whether the coefficients of one equation follow a law.
 
-    r2_free, r2_tied: by point, on its training rows, with coefficients of its own and with those
-    of the law. F: growth of the residual per coefficient given up, in variances of a row; p_value:
-    the chance of more if the law holds, for rows with independent Gaussian errors; both NaN if the
-    law gives up none.
+    r2_free, r2_tied: for each point, R2 on its training rows with its own coefficients and with
+    those of the law. F: growth of the residual squares per coefficient given up, in variances of a
+    row. p_value: probability of a larger F if the law holds, for rows with independent Gaussian
+    errors. F and p_value are NaN if the law gives up no coefficient.
     """
 
     r2_free: Mapping[str, float]
@@ -290,7 +290,7 @@ class LawTest:
 
 @dataclass(frozen=True, eq=False)
 class LawFit:
-    """A law fitted to the rows of all points, and whether it holds, by state."""
+    """A law fitted to the rows of all points, and for each state the test whether it holds."""
 
     law: OperatingLaw
     tests: Mapping[str, LawTest]
@@ -299,13 +299,14 @@ class LawFit:
 def fit_law(
     shared: SharedDiscovery, functions: Library, *, parameters: Mapping[str, Mapping[str, float]]
 ) -> LawFit:
-    """Fit the chosen supports again, all points at once, their coefficients tied by a law.
+    """Refit the chosen supports to all points at once, with coefficients tied by a law.
 
-    coef_j(point) = sum_m coef_jm f_m(parameters of the point): one least squares per equation
-    with columns theta_j f_m. Rows are weighted by their covariance where it is known, and every
-    point by the residual variance of its free fit, so that neither units nor noise of one point
-    lead. Compare `r2_tied` to `r2_free` and see F: a law that does not hold costs R2 at the
-    points that depart from it. Rows that are not independent (`Differential`) make F too large.
+    coef_j(point) = sum_m coef_jm f_m(parameters of the point): one least-squares problem per
+    equation with columns theta_j f_m. Rows are weighted by their covariance if it is known, and
+    every point by the residual variance of its free fit, so that neither the units nor the noise of
+    one point dominate. Compare `r2_tied` to `r2_free` and see F: a law that does not hold lowers R2
+    at the points that depart from it. Rows that are not independent (`Differential`) make F too
+    large.
     functions: of the parameters. parameters: point -> {variable of the law: value}, in any units.
     Raises ValueError for points or variables that are missing or unknown, and for points that
     cannot tell the functions apart.
@@ -350,7 +351,7 @@ def _values_at(
 
 @dataclass(frozen=True, eq=False)
 class _Tied:
-    """One equation's part of a law. covariance: where noise has been followed to it."""
+    """One equation's part of a law. covariance: None if the noise of the rows is unknown."""
 
     terms: tuple[str, ...]
     coef: Float[np.ndarray, "support functions"]
@@ -363,7 +364,7 @@ def _tied(
     shared: SharedDiscovery,
     law_at: Mapping[str, Float[np.ndarray, " functions"]],
 ) -> _Tied:
-    """One least squares over the rows of all points."""
+    """Fit one equation by least squares over the rows of all points."""
     terms = shared.chosen[front.equation]
     fits = {
         p: _FreeFit.of(each, front.supports.index(terms), terms) for p, each in front.points.items()
@@ -401,9 +402,9 @@ def _tied(
 
 @dataclass(frozen=True, eq=False)
 class _FreeFit:
-    """Rows of one point, for coefficients in SI, whose own fit leaves residuals of variance 1.
+    """Rows of one point for coefficients in SI, scaled to unit residual variance of its free fit.
 
-    n_terms: terms that the point determines. squares: of the residuals of its own fit.
+    n_terms: terms that the point determines. squares: of the residuals of its free fit.
     """
 
     theta: Float[np.ndarray, "rows support"]
@@ -425,7 +426,7 @@ class _FreeFit:
         columns = [problem.library.index(name) for name in terms]
         theta = theta[:, columns]
         left = target - theta @ np.linalg.lstsq(theta, target)[0]
-        # Rows without noise: what is left is rounding, and no scale to judge by.
+        # For rows without noise the residuals are rounding, which is no scale to judge by.
         squares = max(float(left @ left), FLOOR * float(target @ target))
         spread = np.sqrt(squares / max(len(target) - candidate.n_terms, 1))
         return _FreeFit(

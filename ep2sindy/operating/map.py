@@ -1,4 +1,4 @@
-"""What a law says over a map of operating points: cycles, fixed points, and where cycles end."""
+"""A law over a map of operating points: cycles, fixed points, and the limits of oscillation."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.records import OperatingRecord, values_of
 from ep2sindy.signals.oscillation import SIMULATED, relative_amplitude
 
-# Growth per period below which a fixed point counts as one that rests: e-fold in a hundred periods.
+# Least decay rate per period of a fixed point at which a diverging run counts as resting: e-fold in
+# a hundred periods.
 NEUTRAL = 0.01
 
-STILL = SIMULATED.spread  # of the mean: what the simulator would call steady is no cycle
+STILL = SIMULATED.spread  # of the mean: a smaller spread is no cycle (the simulator's "steady")
 
-N_PERIODS = 40  # of a run that may settle
+N_PERIODS = 40  # length of a run, in which it may settle
 
-RESTING = 1e-8  # rates at a fixed point, of those half a standard deviation away
+RESTING = 1e-8  # rates at a fixed point, relative to those half a standard deviation away
 
 STEP = 1e-6  # of central differences, in units of the states
 
 
 class Fate(StrEnum):
-    """What a model does at an operating point, started near the cycle of the nearest record."""
+    """Behaviour of a model at an operating point, started near the cycle of the nearest record."""
 
     OSCILLATES = "oscillates"
     RESTS = "rests"
@@ -41,10 +42,12 @@ class Fate(StrEnum):
 class MapPoint:
     """A law's model at one operating point.
 
-    inside: of the hull of the records. frequency_Hz, relative_amplitude: of its cycle (standard
-    deviation over mean, root mean square over the states); NaN without one. growth_per_s: largest
-    real part of the fixed point's eigenvalues, in 1/s: positive where it is unstable; NaN where
-    there is none near. second: modulus of the second Floquet multiplier.
+    inside: True in the hull of the records.
+    frequency_Hz, relative_amplitude: of its cycle (standard deviation over mean, root mean square
+    over the states); NaN without a cycle.
+    growth_per_s: largest real part of the fixed point's eigenvalues, in 1/s, positive if it is
+    unstable; NaN if there is no fixed point near. second: modulus of the second Floquet multiplier;
+    NaN without a cycle.
     """
 
     parameters: Mapping[str, float]
@@ -59,7 +62,7 @@ class MapPoint:
 def law_map(
     law: OperatingLaw, records: Sequence[OperatingRecord], points: Sequence[Mapping[str, float]]
 ) -> list[MapPoint]:
-    """The law's models at any operating points, each started as the nearest record begins."""
+    """The law's models at given operating points, each started from the nearest record."""
     values = values_of(records)
     scale = zero_to_one(np.ptp(values, axis=0))
     found = []
@@ -95,7 +98,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
     if fixed is not None:
         growth = float(eigenvalues(model, fixed, scale=scale).real.max())
     if fate is Fate.DIVERGES and growth * period_s < -NEUTRAL:
-        # The nearest record's cycle lies beyond what rests here: the model is quiet.
+        # The fixed point is stable, but the record's cycle lies outside its basin: the model rests.
         fate = Fate.RESTS
     return MapPoint(
         parameters=dict(point),
@@ -111,7 +114,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Mapping[str, f
 def _run(
     model: SparseModel, start: Float[np.ndarray, " n_states"], period_s: float
 ) -> tuple[Fate, Float[np.ndarray, " n_states"]]:
-    """What becomes of a start, and where it is in the end."""
+    """Fate of a run from a start, and its final state."""
     n = 50
     t = np.linspace(0.0, N_PERIODS * period_s, N_PERIODS * n + 1)
     run = model.simulate(t, start, blow_up=1e3, rtol=1e-7)
@@ -129,9 +132,9 @@ def fixed_point(
     scale: Float[np.ndarray, " n_states"],
     positive: Bool[np.ndarray, " n_states"],
 ) -> Float[np.ndarray, " n_states"] | None:
-    """Where an autonomous model rests, by Newton's method from a state; None where there is none.
+    """Fixed point of an autonomous model, by Newton's method from a nearby state; None if none.
 
-    scale: of the states. positive: which of them must be, as densities.
+    scale: of the states. positive: mask of the states that must be positive, such as densities.
     """
     rates = model.derivative(near + 0.5 * np.diag(scale), np.empty((len(near), 0)))
     size = zero_to_one(np.abs(rates).max(axis=0))
@@ -147,7 +150,7 @@ def eigenvalues(
     *,
     scale: Float[np.ndarray, " n_states"],
 ) -> Complex[np.ndarray, " n_states"]:
-    """Of the Jacobian of an autonomous model, in 1/s. scale: of the states."""
+    """Eigenvalues of the Jacobian of an autonomous model, in 1/s. scale: of the states."""
     steps = STEP * np.diag(scale)
     ahead, behind = (
         model.derivative(state + sign * steps, np.empty((len(state), 0))) for sign in (1.0, -1.0)

@@ -1,4 +1,4 @@
-"""One model at several operating points: its quantities and intervals, and what a search finds."""
+"""Fits at several operating points: quantities with intervals for each, and searches of terms."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
 from ep2sindy.signals.spectrum import dominant_frequency, samples_in
 
-MIN_BLOCKS = 5  # in a record: fewer draws of blocks than these differ too little from another
+MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
 
 
 @dataclass(frozen=True)
 class Refining:
-    """What models are refined on: this many windows, each of so many periods."""
+    """Settings of the refinement: number of windows, periods of each, and most iterations."""
 
     n_windows: int
     periods: float
@@ -64,7 +64,7 @@ class Refining:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One way to fit the terms: under these relations, read as these quantities."""
+    """One way to fit the terms: relations of the coefficients, and quantities read from them."""
 
     constraint: Constraint
     quantities: Mapping[str, Quantity]
@@ -72,10 +72,10 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class PointStudy:
-    """What is done at every operating point.
+    """Settings of the fits and searches at every operating point.
 
     library: holds the terms of all cases, which are fitted to the rows of the formulation.
-    searched: the library that terms are looked for in, by the recipe.
+    searched: the library in which the recipe searches for terms.
     Raises ValueError for a quantity whose coefficient a case does not have.
     """
 
@@ -94,7 +94,7 @@ class PointStudy:
 
     @property
     def fits(self) -> dict[str, Case]:
-        """By name all fits of a point: every case, and its refinement."""
+        """All fits of a point by name: every case, and its refinement."""
         return {name + end: case for name, case in self.cases.items() for end in ("", REFINED)}
 
 
@@ -107,12 +107,12 @@ def fit_points(
     tell: Callable[[int, PointResult], None] = lambda number, result: None,
     progress: Progress = SILENT,
 ) -> list[PointResult]:
-    """Every point on its own samples: all cases fitted and refined, and terms searched for.
+    """Fit and refine all cases at every point, each on its own samples, and search for terms.
 
-    A result depends on its data and its place in the list, not on the workers or on what the other
-    points are. tell: is given the number of a point and its result as it comes.
-    Raises ValueError, naming the point, where one lacks a state or a variable, differs in its
-    unit, or is too short a record.
+    The result of a point depends on its data and its place in the list, not on the workers or on
+    the other points. tell: called with the number of a point and its result as soon as it is known.
+    Raises ValueError, naming the point, for one that lacks a state or a variable, has another unit,
+    or has too short a record.
     """
     variables = [*study.library.variables, *study.searched.variables]
     check_alike(points, list(dict.fromkeys(variables)))
@@ -168,7 +168,7 @@ def _least_squares(
     *,
     rng: np.random.Generator,
 ) -> Fitted:
-    """The case's fit, its intervals and covariance from rows redrawn in blocks of time."""
+    """Least squares of a case, with intervals and covariance from a bootstrap in blocks of time."""
     provenance = {"formulation": repr(study.formulation), "trajectories": run.label}
     model = constrained_fit(problems, case.constraint, units=run.units, provenance=provenance)
     n_groups = len(np.unique(np.concatenate([p.groups[~p.test] for p in problems])))
@@ -205,7 +205,7 @@ def _refined(
     start: SparseModel,
     rng: np.random.Generator,
 ) -> Fitted:
-    """The same coefficients, moved until integrated windows follow the data."""
+    """The case's coefficients, refined so that integrated windows follow the data."""
     samples = samples_in(study.refining.periods, frequency_Hz=1.0 / period_s, dt_s=run.dt_s)
     settings = RefinementSettings(
         n_windows=study.refining.n_windows,
@@ -232,12 +232,12 @@ def _search_point(run: Trajectory, study: PointStudy, *, rng: np.random.Generato
     found = discover(run, study.searched, study.recipe, seed=rng)
     fronts = found.fronts.values()
     problems = list(dict.fromkeys(front.problem for front in fronts if front.problem is not None))
-    no_rows = dict.fromkeys(found.model.states, float("nan"))  # of a search of trajectories
+    no_rows = dict.fromkeys(found.model.states, float("nan"))  # a search of trajectories has none
     return Fitted(model=found.model, status=SEARCHED, r2=no_rows | _r2(problems, found.model))
 
 
 def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, float]:
-    """Of the derivative, by state, on training rows as they are."""
+    """R2 of the derivative, by state, on the unweighted training rows."""
     found = {}
     for problem in problems:
         rows = ~problem.test
@@ -250,7 +250,7 @@ def _r2(problems: Sequence[RegressionRows], model: SparseModel) -> dict[str, flo
 
 @dataclass(frozen=True)
 class TimeBootstrap:
-    """Intervals of least squares: draws of blocks that last `periods` of the oscillation."""
+    """Settings of the bootstrap in time: number of draws, and length of a block in periods."""
 
     n_draws: int
     periods: float
@@ -274,14 +274,14 @@ def resample_coefficients(
 ) -> Float[np.ndarray, "draws coefs"]:
     """Coefficients of `constrained_fit` on training rows redrawn in blocks of time, in SI.
 
-    A draw counts groups of rows, for all equations alike; each equation keeps the weight that it
-    has on all rows, and rows whose noise is followed stay whitened as under `model`.
-    model: of `constrained_fit` on these problems. block: groups that are drawn side by side.
-    Returns one column per coefficient of the constraint. Draws are moved so that their mean is
-    the fit: blocks seldom reach the ends of the record, which would shift them.
+    A draw counts groups of rows, the same for all equations. Each equation keeps the weight that it
+    has on all rows, and rows of known noise stay whitened as under `model`. model: result of
+    `constrained_fit` on these problems. block: number of consecutive groups in a block.
+    Returns one column per coefficient of the constraint. The draws are shifted so that their mean
+    is the fit: blocks seldom reach the ends of the record, which would bias them.
     Raises ValueError for blocks that leave fewer than five to draw from, or several trajectories.
-    Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for
-    Dependent Data, 2.5, for the centre.
+    Source: Kuensch 1989, doi:10.1214/aos/1176347265; Lahiri 2003, Resampling Methods for Dependent
+    Data, 2.5, for the centre.
     """
     if len(problems[0].trajectories) > 1:
         raise ValueError(
@@ -322,7 +322,7 @@ def _check_blocks(n_groups: int, block: int) -> None:
 
 
 def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
-    """In the order of the constraint's."""
+    """Coefficients of a model in the order of the constraint's."""
     index, states = model.library.index, model.states.index
     return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
 
@@ -330,7 +330,7 @@ def coefficients_of(model: SparseModel, constraint: Constraint) -> Float[np.ndar
 def _free_rows(
     equation: WeightedEquation, constraint: Constraint, coef: Float[np.ndarray, " coefs"]
 ) -> Float[np.ndarray, "rows columns"]:
-    """One equation's rows by free coefficient, the target last; residuals of variance 1."""
+    """One equation's rows by free coefficient, the target last; residual variance 1."""
     at = equation.at
     theta, target = equation.rows(coef[at])
     return np.column_stack([theta @ constraint.C[at], target - theta @ constraint.d[at]])
@@ -338,11 +338,11 @@ def _free_rows(
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """What one search over all points that oscillate found.
+    """Result of one search over all points that oscillate.
 
-    fitted: the support with coefficients of its own at every point, None at the others. tied: its
-    coefficients as polynomials of the parameters; None where the points do not suffice, for the
-    reason in `why_not_tied`.
+    fitted: for each point that oscillates, the support with the point's own coefficients; None at
+    the others. tied: the coefficients as polynomials of the parameters; None if the points do not
+    suffice, for the reason in `why_not_tied`.
     """
 
     found: SharedDiscovery
@@ -362,8 +362,8 @@ def search_shared(
 ) -> JointResult | None:
     """Search all points that oscillate at once; None for fewer than two of them.
 
-    law: terms that coefficients are tied by, over the parameters of the points.
-    None, too, for a search that cannot weigh several points: only BestSubset does.
+    law: functions of the points' parameters that tie the coefficients. Also None for a search that
+    cannot weigh several points: only BestSubset can.
     """
     used = {
         point.label: point

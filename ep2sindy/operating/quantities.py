@@ -1,4 +1,4 @@
-"""Physical quantities read from coefficients, with their intervals; what one point gave."""
+"""Physical quantities read from coefficients, with intervals, and the results of one point."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ep2sindy.library.relations import Constraint, place_of
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
 
-LEVEL = 0.95  # of all intervals here
+LEVEL = 0.95  # level of all intervals in this file
 FITTED, SEARCHED, CONVERGED = "fitted", "searched", "converged"
-REFINED = "_refined"  # ends the name of a case's refinement
+REFINED = "_refined"  # suffix of the name of a case's refinement
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a coefficient stands for: factor * coef^power, in SI.
+    """A physical quantity read from a coefficient: factor * coef^power, in SI.
 
     coefficient: "state: term". power: 1, or -1 for a length or a time such as L = -1/coef.
     """
@@ -49,20 +49,20 @@ class Quantity:
         return self.coefficient.split(":")[1].strip()
 
     def of(self, coef: Float[np.ndarray, " coefs"]) -> Float[np.ndarray, " coefs"]:
-        """Its value for any number of values of the coefficient."""
+        """Values of the quantity for an array of values of the coefficient."""
         return self.factor * coef**self.power
 
     def slope(self, coef: float) -> float:
-        """Derivative by the coefficient."""
+        """Derivative of the quantity by the coefficient."""
         return self.factor * self.power * coef ** (self.power - 1)
 
     def place(self, constraint: Constraint, library: Library) -> int:
-        """Which of the constraint's coefficients it is. Raises ValueError where it is none."""
+        """Index of its coefficient in the constraint. Raises ValueError if it is not there."""
         who = f"the quantity of {self.coefficient!r}"
         return place_of(library, constraint.coefficients, self.state, self.term, who)
 
     def unit(self, library: Library, units: Mapping[str, str]) -> str:
-        """From the units of the states and variables."""
+        """Unit of the quantity, from the units of the states and variables."""
         of_term = library.units(units)[library.index(self.term)]
         p = self.power
         return unit_product([(units[self.state], p), ("s", -p), (of_term, -p)])
@@ -81,10 +81,10 @@ class QuantityEstimate:
 class Fitted:
     """A model of one operating point.
 
-    status: fitted, by least squares; searched; or what became of a refinement.
-    r2: by state, of the derivative, on training rows. loss: of a refinement, else NaN.
-    draws: by quantity, (draws,), what the intervals of least squares were taken from.
     The model's covariance is that of the draws, or of the refinement.
+    status: fitted (by least squares), searched, or the status of a refinement. r2: for each state,
+    of the derivative, on training rows. loss: of a refinement, else NaN. draws: for each quantity,
+    (draws,), the bootstrap draws behind the intervals of least squares.
     """
 
     model: SparseModel
@@ -97,10 +97,11 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class PointResult:
-    """What one operating point gave; without fits unless its status is "oscillating".
+    """Results at one operating point; without fits unless its status is "oscillating".
 
-    f_Hz: dominant frequency of the first state. spread: by state, standard deviation over mean.
-    fits: by case, and by case + "_refined". searched: what the search chose.
+    f_Hz: dominant frequency of the first state. spread: for each state, standard deviation over
+    mean. fits: by the name of the case, and of the case + "_refined". searched: the model that the
+    search chose.
     """
 
     parameters: Mapping[str, float]
@@ -113,7 +114,7 @@ class PointResult:
     searched: Fitted | None = None
 
     def usable(self, fit: str) -> bool:
-        """Whether a fit was made here and came to its end."""
+        """True if this fit exists and finished."""
         return fit in self.fits and self.fits[fit].status in (FITTED, CONVERGED)
 
 
@@ -124,9 +125,10 @@ def estimates_of_draws(
     constraint: Constraint,
     library: Library,
 ) -> tuple[dict[str, QuantityEstimate], dict[str, Float[np.ndarray, " draws"]]]:
-    """Estimates whose intervals are percentiles of draws, and the draws of every quantity.
+    """Estimates with intervals from percentiles of draws, and the draws of every quantity.
 
-    The reciprocal of a coefficient whose own interval holds zero may be anything.
+    The reciprocal of a coefficient has an infinite interval if the coefficient's interval holds
+    zero.
     coef, draws: in the order of the constraint's coefficients.
     """
     estimates, drawn = {}, {}
@@ -149,7 +151,7 @@ def estimates_of_covariance(
     constraint: Constraint,
     library: Library,
 ) -> dict[str, QuantityEstimate]:
-    """Estimates whose intervals are those of the model's covariance, carried by the slope."""
+    """Estimates with intervals from the model's covariance, linearised in the coefficient."""
     estimates = {}
     for name, quantity in quantities.items():
         state, term = constraint.coefficients[quantity.place(constraint, library)]

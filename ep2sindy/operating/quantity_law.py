@@ -17,21 +17,21 @@ from ep2sindy.operating.quantities import PointResult
 from ep2sindy.operating.records import check_varying
 from ep2sindy.runtime.arrays import read_only
 
-# A share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
+# Share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
 
-# A point with this leverage is the only one that knows some coefficient: without it no law.
+# A point with this leverage alone determines some coefficient: without it there is no law.
 FULL_LEVERAGE = 1.0 - 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class ControlLaw:
-    """quantity = library(parameters) coef, and how far it errs.
+    """quantity = library(parameters) coef, with its errors.
 
-    terms: of the library, in its order. coef: (terms,), in the units of quantity over term.
-    r2: of the points it was fitted to; NaN for a quantity that does not vary.
-    loo_error: RMS error at points left out one by one, the terms as they are, over the mean's
-    size. search_error: the same with the terms searched again without the point.
+    terms: of the library, in its order. coef: (terms,), in the units of quantity over term. r2: on
+    the points of the fit; NaN for a quantity that does not vary. loo_error: leave-one-out RMS error
+    with these terms, relative to the absolute mean of the quantity. search_error: the same with the
+    terms searched again without the point.
     """
 
     library: Library
@@ -51,7 +51,7 @@ class ControlLaw:
     def predict(
         self, parameters: Float[np.ndarray, "points parameters"]
     ) -> Float[np.ndarray, " points"]:
-        """The quantity at any points; columns in the order of the library's variables."""
+        """The quantity at given points; columns in the order of the library's variables."""
         columns = [self.library.index(name) for name in self.terms]
         return self.library.evaluate(parameters)[:, columns] @ self.coef
 
@@ -66,9 +66,10 @@ def control_law(
     """Find the terms that predict best at points left out of their fit.
 
     All supports of up to `max_terms` terms are fitted by least squares, every point with the same
-    weight, and judged by exact leave-one-out residuals r / (1 - h), h the diagonal of the hat
-    matrix. None: as many terms as leave two points over; never more than that, nor more than the
-    library has. A support to which one point is indispensable has no such residual, and is out.
+    weight, and judged by exact leave-one-out residuals r / (1 - h), with h the diagonal of the hat
+    matrix. max_terms: None allows as many terms as leave two points over; never more than that, nor
+    more than the library has. A support to which one point is indispensable has no such residual,
+    and is left out.
     Raises ValueError for under three points, another number of parameters than variables, values
     that are not finite, or a parameter that never varies.
     Source: Allen 1974, doi:10.1080/00401706.1974.10489157.
@@ -112,7 +113,7 @@ def _check(
 
 
 def _best_support(values: np.ndarray, theta: np.ndarray, max_terms: int | None) -> list[int]:
-    """Columns of least leave-one-out error; of equals but for rounding, the fewest."""
+    """Columns of least leave-one-out error; the fewest of those equal up to rounding."""
     n_points, n_terms = theta.shape
     largest = max(1, min(n_terms, n_points - 2, max_terms or n_terms))
     floor = ROUNDING * np.sqrt(np.square(values).mean())
@@ -126,7 +127,7 @@ def _best_support(values: np.ndarray, theta: np.ndarray, max_terms: int | None) 
 
 
 def _predictions(values: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every point by the fit to all, and by the fit to the others; infinite where there is none."""
+    """Every point predicted by the fit to all, and by the fit to the others (infinite if none)."""
     left, singular, _ = np.linalg.svd(_unit_columns(columns), full_matrices=False)
     leverage = np.square(left).sum(axis=1)
     fitted = left @ (left.T @ values)
@@ -138,7 +139,7 @@ def _predictions(values: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, n
 def _predict_left_out(
     row: np.ndarray, values: np.ndarray, theta: np.ndarray, max_terms: int | None
 ) -> float:
-    """One more point, by the law found in these."""
+    """Prediction at one more point by the law found in these."""
     support = _best_support(values, theta, max_terms)
     return float(row[support] @ _least_squares(values, theta[:, support]))
 
@@ -169,9 +170,10 @@ def fit_names(results: Sequence[PointResult]) -> list[str]:
 def laws(
     results: Sequence[PointResult], library: Library, *, max_terms: int | None = None
 ) -> dict[str, dict[str, ControlLaw]]:
-    """A control law per fit and quantity, from the points whose fit came to its end.
+    """A control law per fit and quantity, from the points at which the fit finished.
 
-    Fits with under three such points, or a parameter that does not vary over them, have none.
+    Fits with under three such points, or with a parameter that does not vary over them, are left
+    out.
     """
     found = {}
     for fit in fit_names(results):
@@ -189,11 +191,12 @@ def laws(
 def trends(results: Sequence[PointResult], *, along: str, at: Mapping[str, float]) -> pd.DataFrame:
     """Exponents p of |quantity| ~ parameter^p along one parameter, the others held.
 
-    One row per fit and quantity: the slope of logarithms, by least squares over the points.
-    r2: of that line, whether the points are a power law at all; near zero, too, without a trend.
-    low and high: its 95 % interval by the bootstraps of least-squares fits, points independent;
-    it says how well the slope is known, not whether points lie on a line.
-    Two points are always on a line: r2, low and high are NaN, as low and high of refined fits.
+    One row per fit and quantity: the slope of logarithms, by least squares over the points. r2: of
+    that line; it tells whether the points follow a power law at all, and is also near zero without
+    a trend. low and high: 95 % interval of the slope by the bootstraps of least-squares fits,
+    points independent. It says how well the slope is known, not whether the points lie on a line.
+    With two points, which are always on a line, r2, low and high are NaN; low and high are also NaN
+    for refined fits.
     """
     held = [each for each in results if all(each.parameters[k] == v for k, v in at.items())]
     rows = []
@@ -214,7 +217,10 @@ def trends(results: Sequence[PointResult], *, along: str, at: Mapping[str, float
 
 
 def exponent(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]) -> float:
-    """Slope of log |values| by log x, by least squares; NaN unless x is two numbers above zero."""
+    """Slope of log |values| against log x, by least squares.
+
+    NaN unless x is positive and has two different values.
+    """
     if len(x) < 2 or np.ptp(x) == 0.0 or x.min() <= 0.0:
         return float("nan")
     centred = np.log(x) - np.log(x).mean()
@@ -222,7 +228,7 @@ def exponent(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points
 
 
 def power_law_r2(x: Float[np.ndarray, " points"], values: Float[np.ndarray, " points"]) -> float:
-    """R2 of the line through logarithms; NaN for under three points, or values all alike."""
+    """R2 of the line through logarithms; NaN for under three points or for equal values."""
     slope, logs = exponent(x, values), np.log(np.abs(values))
     if len(x) < 3 or np.isnan(slope) or np.ptp(logs) == 0.0:
         return float("nan")

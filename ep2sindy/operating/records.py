@@ -1,4 +1,4 @@
-"""Operating points: where a record was taken, what it holds, and which cycle it is on."""
+"""Operating points: their parameters, the record taken at each, and the cycle it is on."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
 from ep2sindy.signals.spectrum import steps_in
 
-MIN_PERIODS = 6.0  # of a record: windows of two, and something to compare a free run with
+MIN_PERIODS = 6.0  # least in a record: windows of two, and a rest to compare a free run with
 
-# Two cycles coexist where the relative amplitudes of the records, as far as a plane through the
-# parameters does not explain them, part in two groups this many times as far apart as those in a
-# group are spread, and by this share of themselves; a single amplitude or a trend is no branch.
+# Two cycles coexist if the relative amplitudes of the records, less a plane over the parameters,
+# form two groups. The gap between these must exceed the spread in a group by the factor APART, and
+# the logarithm of the amplitude must differ by MIN_STEP; a trend alone makes no branches.
 APART, MIN_STEP = 3.0, 0.3
 
-N_ROBUST = 50  # of the plane's fits, each weighted by the last one's residuals
+N_ROBUST = 50  # fits of the plane, each weighted by the residuals of the one before
 
 # A group of this many or fewer records has no spread of its own to compare with.
 FEW = 4
@@ -33,9 +33,10 @@ FEW = 4
 class OperatingRecord:
     """One operating point, and the record that was taken there.
 
-    trajectory: None where the source says that nothing oscillates. status: what the source says
-    of it; "oscillating" is looked into, all else believed. notes: what is amiss with its data.
-    used: which data they are, in words. Raises ValueError for parameters that are not finite.
+    trajectory: None if the source says that nothing oscillates. status: as the source says; only
+    "oscillating" is checked, other values are taken as given. notes: remarks on problems of the
+    data. used: description of the data.
+    Raises ValueError for parameters that are not finite.
     """
 
     parameters: Mapping[str, float]
@@ -54,7 +55,7 @@ class OperatingRecord:
 
     @staticmethod
     def of(parameters: Mapping[str, float], run: Trajectory) -> OperatingRecord:
-        """A record that laws can be made of; raises ValueError for one without a `cycle`."""
+        """A record that laws can be made of. Raises ValueError for one without a `cycle`."""
         record = OperatingRecord(parameters, run)
         _ = record.cycle
         return record
@@ -71,9 +72,9 @@ class OperatingRecord:
 
     @cached_property
     def cycle(self) -> Cycle:
-        """What the record repeats.
+        """The cycle that the record repeats.
 
-        Raises ValueError, with the point, for a record without a period or of under six of them.
+        Raises ValueError, naming the point, for a record without a period or with fewer than six.
         """
         cycle = find_cycle(self.run.t, self.run.states)
         where = f"operating point {self.label}"
@@ -91,14 +92,14 @@ class OperatingRecord:
 
     @property
     def relative_amplitude(self) -> float:
-        """Root mean square over the states of standard deviation over mean, of the waveform."""
+        """Standard deviation over mean of the waveform, root mean square over the states."""
         return relative_amplitude(self.cycle.mean, self.cycle.std)
 
     @property
     def slowest(self) -> int:
-        """The sample of the first two periods at which the states move least, in deviations.
+        """Index of the slowest sample of the first two periods, states in standard deviations.
 
-        A free run starts here: in the pulse a small error of the model is a large one in phase.
+        A free run starts here: during the pulse a small error of the model is a large one in phase.
         """
         n = round(steps_in(2.0, frequency_Hz=self.cycle.frequency_Hz, dt_s=self.run.dt_s))
         x = self.run.states[: max(n, 3)] / zero_to_one(self.cycle.std)
@@ -110,13 +111,13 @@ class OperatingRecord:
 
 
 def point_label(parameters: Mapping[str, float]) -> str:
-    """`V_D_V=300, mdot_mg_s=5`."""
+    """Label of an operating point, such as `V_D_V=300, mdot_mg_s=5`."""
     return ", ".join(f"{name}={value:g}" for name, value in parameters.items())
 
 
 @contextmanager
 def naming(parameters: Mapping[str, float]) -> Iterator[None]:
-    """What cannot work at an operating point is said with its name before it."""
+    """Put the name of the operating point before errors raised inside."""
     try:
         yield
     except (ValueError, OSError) as error:
@@ -137,9 +138,9 @@ def check_varying(
     *,
     remedy: str = "leave it out, or add points",
 ) -> None:
-    """Raise ValueError for a parameter that is the same at all points: no law can hold it.
+    """Raise ValueError for a parameter that is the same at all points: no law can depend on it.
 
-    remedy: what to do about it, with `{name}` for the parameter's.
+    remedy: advice for the error message, with `{name}` for the parameter's name.
     """
     for name, column in zip(parameters, points.T, strict=True):
         if np.ptp(column) == 0.0:
@@ -150,7 +151,7 @@ def check_varying(
 
 
 def check_records(records: Sequence[OperatingRecord]) -> None:
-    """Raise ValueError unless all have the same parameters, which vary, states and units."""
+    """Raise ValueError unless all have the same states, units and parameters, and these vary."""
     if not records:
         raise ValueError("a law needs operating points that oscillate: none came")
     names = list(records[0].parameters)
@@ -169,7 +170,7 @@ def check_records(records: Sequence[OperatingRecord]) -> None:
 
 
 def values_of(records: Sequence[OperatingRecord]) -> Float[np.ndarray, "records parameters"]:
-    """Parameters, in the order of the first record's."""
+    """Parameters of the records, columns in the order of the first record's."""
     names = list(records[0].parameters)
     return np.array([[record.parameters[name] for name in names] for record in records])
 
@@ -184,10 +185,12 @@ def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
 def interpolation_errors(
     records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
-    """How smooth the records are: what functions of the parameters miss at points left out.
+    """Leave-one-out errors of interpolating frequency and amplitude by functions of the parameters.
 
-    Relative errors of the frequency, and the largest over the states of the standard deviation's,
-    each interpolated itself, logarithmically. No law of these functions can be asked for much less.
+    Both are interpolated directly, in logarithms.
+    Returns the relative error of the frequency, and the largest relative error of the standard
+    deviation over the states. They show how smoothly the records vary: no law of these functions
+    can be much better.
     """
     scaled = basis / zero_to_one(np.linalg.norm(basis, axis=0))
     hat = scaled @ np.linalg.pinv(scaled)
@@ -199,11 +202,11 @@ def interpolation_errors(
 
 
 def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records"]:
-    """0 for records on one cycle, the stronger if there are two, and 1 for those on the other.
+    """Cycle of each record: 0 on the stronger (or only) cycle, 1 on the weaker.
 
-    The logarithm of the relative amplitude is fitted by a plane over the parameters, robustly, and
-    its residuals are sorted. Two cycles coexist where they part in a gap that is wide against what
-    lies to both of its sides, and where the frequencies part as well: a strong cycle is slower.
+    The logarithm of the relative amplitude is fitted robustly by a plane over the parameters, and
+    its residuals are sorted. Two cycles coexist if the residuals show a gap that is wide compared
+    with the spread on either side of it.
     """
     amplitude = np.log([record.relative_amplitude for record in records])
     left = _off_plane(values_of(records), amplitude)
@@ -226,7 +229,7 @@ def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records
 def _off_plane(
     values: Float[np.ndarray, "points parameters"], target: Float[np.ndarray, " points"]
 ) -> Float[np.ndarray, " points"]:
-    """What a plane of least absolute deviations leaves; a constant where points are few."""
+    """Residuals of a plane of least absolute deviations; of a constant if the points are few."""
     centred = (values - values.mean(axis=0)) / zero_to_one(np.ptp(values, axis=0))
     columns = np.column_stack([np.ones(len(values)), centred])
     if len(values) < 2 * columns.shape[1]:

@@ -1,4 +1,4 @@
-"""Joint search: one support for all operating points, coefficients free at each."""
+"""Joint search: one support for all operating points, with free coefficients at each."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 class JointFront:
     """The best supports of every size for one equation at all points, the empty one first.
 
-    errors: (supports,), geometric mean over the points of 1 - R2 (held-out rows, if any); the
-    best falls with size. points: point -> the fit of every support there, in the same order; a
-    term that depends on earlier ones at a point, or is zero there, is left out of that fit.
+    errors: (supports,), geometric mean over the points of 1 - R2 (on held-out rows, if any); the
+    best falls with size. points: point -> the fit of every support there, in the same order. A term
+    that is zero at a point, or depends on earlier ones there, is left out of that point's fit.
     """
 
     equation: str
@@ -41,10 +41,10 @@ class JointFront:
 
 @dataclass(frozen=True, eq=False)
 class SharedDiscovery:
-    """What a joint search leaves: per state a front, scores and the support; per point a model.
+    """Result of a joint search: fronts, scores and supports by state, and models by point.
 
-    scores: by state, one per support, summed over the points; the lowest is chosen.
-    ambiguities: by point, terms that its data cannot tell apart.
+    scores: for each state, one per support, summed over the points; the lowest is chosen.
+    ambiguities: for each point, terms that its data cannot tell apart.
     """
 
     fronts: Mapping[str, JointFront] = field(repr=False)
@@ -64,17 +64,18 @@ def discover_shared(
     progress: Progress | bool = False,
     recipe: Regression | None = None,
 ) -> SharedDiscovery:
-    """Find equations whose terms are the same at every operating point, coefficients free.
+    """Find equations whose terms are the same at every operating point, with free coefficients.
 
-    Each point is assembled on its own, with its own sampling, noise and scale. The search finds
-    the supports whose product of residuals over the points is least: a term is in or out
-    everywhere. The method's rule scores the fits at each point and the scores are added: for AICc,
-    BIC and EBIC that is the criterion of the joint likelihood, the count of supports paid once. A
-    term may vanish at some points, if it shows at others. One point gives what `discover` does.
-    points: name -> trajectories. Points are assembled in the order of their names.
-    method: None means Regression(). recipe: its old name, for one version more.
-    Raises ValueError for a search that cannot serve several points, bootstraps, which a search of
-    several points has none of, no point, or points whose states, variables or units differ.
+    The rows of each point are assembled separately, with its own sampling, noise and scale. The
+    search finds the supports whose product of residuals over the points is least: a term is in or
+    out everywhere. The method's rule scores the fits at each point, and the scores are added: for
+    AICc, BIC and EBIC the sum is the criterion of the joint likelihood, with the number of supports
+    counted once. A term may vanish at some points, if it shows at others. For a single point the
+    result is that of `discover`.
+    points: name -> trajectories. Points are assembled in the order of their names. method: None
+    means Regression(). recipe: the old name of method, for one more version.
+    Raises ValueError for a search that cannot serve several points, bootstraps (not available for
+    several points), no point, or points whose states, variables or units differ.
     Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
     """
     method = method or old_name(recipe) or Regression()
@@ -110,7 +111,7 @@ def _joint_fronts(
     depth: int,
     progress: Progress,
 ) -> dict[str, JointFront]:
-    """By equation, the search over all points. problems: by point, of one structure."""
+    """Joint search for every equation. problems: for each point, of the same structure."""
     equations = [
         (k, equation)
         for k, problem in enumerate(next(iter(problems.values())))
@@ -125,7 +126,7 @@ def _joint_fronts(
 
 
 def _search_of(method: Regression) -> BestSubset:
-    """The search of a method that can weigh all points at once."""
+    """The method's search, if it can weigh all points at once."""
     if not isinstance(method.search, BestSubset):
         raise ValueError(
             f"a joint search must weigh all points at once: {method.search} cannot; use BestSubset"
@@ -144,7 +145,7 @@ def _models(
     best: Mapping[str, int],
     provenance: Mapping[str, str],
 ) -> dict[str, SparseModel]:
-    """The best support of every equation, with each point's own coefficients."""
+    """For each point, the best supports with the point's own coefficients."""
     return {
         point: assemble_model(
             library,
@@ -179,7 +180,7 @@ def _check_points(points: Mapping[str, Sequence[Trajectory]], library: Library) 
 def _joint_front(
     problems: Mapping[str, RegressionRows], equation: str, search: BestSubset, depth: int
 ) -> JointFront:
-    """Search the Gram matrices of all points at once, and fit what is found at each of them."""
+    """Search the Gram matrices of all points at once, and fit the supports at each point."""
     any_problem = next(iter(problems.values()))
     k = any_problem.equations.index(equation)
     grams = [problem.train_gram for problem in problems.values()]
@@ -212,7 +213,7 @@ def _joint_front(
 def _keep_determined(
     problem: RegressionRows, masks: Bool[np.ndarray, "supports terms"]
 ) -> Bool[np.ndarray, "supports terms"]:
-    """The terms of each support that the rows of one point determine, earlier terms first."""
+    """Terms of each support that the rows of one point determine, earlier terms first."""
     found = masks.copy()
     for mask in found:
         columns = np.flatnonzero(mask)

@@ -1,1 +1,1 @@
-"""The report: a run folder, a screen, a page, TensorBoard, and where it all came from."""
+"""The report: run folder, terminal, HTML page, TensorBoard, and the provenance of a run."""

@@ -1,4 +1,4 @@
-"""What a reader must know of a run beside its results: what was asked, and how to do it again."""
+"""Description of a run for its page: settings, provenance, and the command that repeats it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-ASKED = {  # keys of a config in the order and the words of a page
+ASKED = {  # keys of a config in the order of the page, with their names there
     "data": "data",
     "prepare": "preparation",
     "trajectory": "time series",
@@ -24,11 +24,11 @@ ASIDE = ("experiment", "study", "output", "figures", "thesis", "parallel")
 
 @dataclass(frozen=True)
 class About:
-    """A run, for its page.
+    """Description of a run, for its page.
 
-    purpose: of the experiment, in a sentence. asked: settings in words, by name. said: lines on
-    the data and on what was done on the way.
-    provenance: as in provenance.json. config: the resolved one, as text.
+    purpose: of the experiment, in a sentence. asked: settings in words, by name. said: messages
+    about the data and the steps of the run. provenance: as in provenance.json. config: the resolved
+    config, as text.
     """
 
     purpose: str
@@ -40,14 +40,14 @@ class About:
 
     @property
     def command(self) -> str:
-        """As it is typed: arguments that a shell would change stand in quotes."""
+        """The command as typed in a shell, arguments quoted if necessary."""
         from shlex import join
 
         return join(self.provenance["command"])
 
 
 def settings_used(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, str]:
-    """The settings that a study uses, in words; those that are not set are left out."""
+    """The settings that a study uses, in words; unset ones are left out."""
     shown = [key for key in settings if key in keys and key not in ASIDE]
     rank = {key: k for k, key in enumerate(ASKED)}
     ordered = sorted(shown, key=lambda key: rank.get(key, len(rank)))
@@ -56,16 +56,16 @@ def settings_used(settings: Mapping[str, Any], keys: Collection[str]) -> dict[st
 
 
 def _bare(value: Any) -> str:
-    """Without the brackets around all of it, which a mapping has inside another."""
+    """Text of a setting, without the parentheses of a nested mapping."""
     text = setting_text(value)
     nameless = isinstance(value, Mapping) and "_target_" not in value
     return text[1:-1] if nameless else text
 
 
 def setting_text(value: Any) -> str:
-    """`BestSubset (max_terms 4, n_best 2)`; empty for what is not set.
+    """Text of a setting, such as `BestSubset (max_terms 4, n_best 2)`; empty if it is not set.
 
-    A variable of a file that bears no name there is not set.
+    A variable without a name in the file counts as not set.
     """
     if value is None or (isinstance(value, Mapping) and "name" in value and value["name"] is None):
         return ""
@@ -74,7 +74,7 @@ def setting_text(value: Any) -> str:
         inner = ", ".join(f"{k} {text}" for k, text in parts.items() if text)
         if target := value.get("_target_"):
             name = str(target).rpartition(".")[2]
-            if not inner and parts:  # nothing of it is set
+            if not inner and parts:  # none of its parts is set
                 return ""
             return f"{name} ({inner})" if inner else name
         return f"({inner})" if inner else ""
@@ -84,9 +84,9 @@ def setting_text(value: Any) -> str:
 
 
 def by_place(place: str, value: Any) -> dict[str, Any]:
-    """`search: BestSubset, search.max_terms: 4`; what is not set is left out."""
+    """Settings by dotted key, `search: BestSubset, search.max_terms: 4`; without unset ones."""
     if isinstance(value, Mapping):
-        if "name" in value and value["name"] is None:  # a variable that a file has not
+        if "name" in value and value["name"] is None:  # a variable missing in the file
             return {}
         name = str(value.get("_target_", "")).rpartition(".")[2]
         found = {place: name} if name else {}

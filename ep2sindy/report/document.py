@@ -1,4 +1,4 @@
-"""What a study says, written once: sections that the terminal and the page both show."""
+"""Sections of a report, written once and shown both in the terminal and on the page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph. warning: it says that something is amiss. page_only: too long for a screen."""
+    """A paragraph. warning: it tells of a problem. page_only: too long for a terminal."""
 
     text: str
     warning: bool = False
@@ -25,10 +25,11 @@ class Text:
 
 @dataclass(frozen=True)
 class Equation:
-    """One equation: state -> terms. lead: words before it, mark: behind. aside: beside the point.
+    """One equation: state -> terms.
 
-    unit: of the derivative, as the terms are written; where they stand in SI it may be left out.
-    On the page alone, unless on_screen. As a cell of a table it is always shown.
+    lead: text before it; mark: text after it. unit: of the derivative, consistent with the terms;
+    may be left out if they are in SI. aside: set less prominently, as of lesser importance.
+    Shown only on the page, unless on_screen. As a cell of a table it is always shown.
     """
 
     state: str
@@ -41,7 +42,7 @@ class Equation:
 
     @property
     def text(self) -> str:
-        """`thesis: n_i' = -2 n_i [m^-3 s^-1]`."""
+        """The equation as text, such as `thesis: n_i' = -2 n_i [m^-3 s^-1]`."""
         lead = f"{self.lead}: " if self.lead else ""
         unit = f" [{self.unit}]" if self.unit else ""
         return f"{lead}{equation_text(self.state, self.terms)}{unit}{self.mark}"
@@ -49,10 +50,10 @@ class Equation:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Rows to read: text as it is, numbers to three digits, NaN as a dash, an `Equation` written.
+    """A table for reading: numbers to three digits, NaN as a dash, an `Equation` written out.
 
-    page_only: too long for a screen. bold, italic: numbers of the rows so set. breaks: of those
-    that a rule follows.
+    page_only: too long for a terminal.
+    bold, italic: indices of rows in that style. breaks: indices of rows followed by a line.
     """
 
     rows: pd.DataFrame
@@ -66,14 +67,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the outcome, by its name; on the page alone."""
+    """A figure of the outcome, by its name; shown only on the page."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Link:
-    """A cell that leads to another page. to: a relative address."""
+    """A table cell that links to another page. to: a relative address."""
 
     text: str
     to: str
@@ -84,7 +85,7 @@ Block: TypeAlias = Text | Equation | Table | Picture
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """Blocks under a heading; level 3 is a part of the section before it."""
+    """Blocks under a heading; a level 3 section is a part of the one before it."""
 
     title: str
     blocks: Sequence[Block]
@@ -93,7 +94,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Captioned:
-    """A figure that is drawn when it is written, and what it shows."""
+    """A figure with its caption, drawn only when it is written."""
 
     draw: Callable[[], Figure]
     caption: str
@@ -111,7 +112,7 @@ def cell_text(value: object) -> str:
 
 
 def places(value: float, n: int) -> str:
-    """A number to so many places, NaN as a dash."""
+    """A number to `n` decimal places, NaN as a dash."""
     return "-" if value != value else f"{value:.{n}f}"
 
 

@@ -1,4 +1,4 @@
-"""A run's folder: everything a figure needs to be redrawn, and one page to read.
+"""The folder of a run: everything needed to redraw its figures, and one page to read.
 
 config.yaml  provenance.json  run.log  summary.json  report.html
 models/*.json  tables/*.csv  figures/*.png  tensorboard/
@@ -29,13 +29,13 @@ VERSIONED = (
     "ep2sindy", "numpy", "scipy", "numba", "scikit-learn", "xarray", "torch", "hydra-core",
     "pysindy",
 )  # fmt: skip
-# What a figure can be written as, and what its file says: without a date it is the same each time.
+# Formats of a figure, with metadata: without a date the file is the same each time.
 FORMATS: Mapping[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}}
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Writes a run's results, each file whole or not at all."""
+    """Writes the results of a run; each file is complete or absent."""
 
     path: Path
 
@@ -43,7 +43,7 @@ class RunFolder:
     def create(root: Path, experiment: str, *, now: datetime) -> RunFolder:
         """Make `root/experiment/<date>_<time>`, with a suffix if another run took that name.
 
-        Raises OSError, with the way out, where no folder can be written.
+        Raises OSError, naming the way out, if no folder can be written.
         """
         parent = root / experiment
         try:
@@ -64,7 +64,7 @@ class RunFolder:
         raise OSError(f"1000 runs started in one second in {parent}; wait and start again")
 
     def file(self, name: str, folder: str = "") -> Path:
-        """Where a result lies. Raises ValueError for a name that is a path."""
+        """Path of a result. Raises ValueError for a name that is a path."""
         if name != Path(name).name or "\\" in name or not name.isprintable():
             raise ValueError(f"a result's name must be that of a file, and no path: {name!r} came")
         return self.path / folder / name
@@ -82,21 +82,21 @@ class RunFolder:
         write_text(self.file(f"{name}.csv", "tables"), table.to_csv(index=False))
 
     def write_figure(self, name: str, figure: Figure, formats: Sequence[str] = ("png",)) -> bytes:
-        """As files of one layout, which the figure keeps; returns what is in the PNG.
+        """Write a figure in several formats with the same layout; returns the content of the PNG.
 
-        formats: some of FORMATS, png among them.
+        The figure keeps this layout. formats: some of FORMATS, png among them.
         """
         freeze_layout(figure)
         contents = {}
         for suffix in formats:
-            drawn = BytesIO()  # a PDF that finds no room fails again when it is closed, over zlib
+            drawn = BytesIO()  # in memory: on a full disk a PDF fails again, in zlib, on closing
             figure.savefig(drawn, format=suffix, dpi=DPI, metadata=FORMATS[suffix])
             contents[suffix] = drawn.getvalue()
             write_bytes(self.file(f"{name}.{suffix}", "figures"), contents[suffix])
         return contents["png"]
 
     def write_provenance(self, *, seed: int, command: Sequence[str]) -> dict[str, Any]:
-        """Which code a run is made by, in provenance.json; returned as well."""
+        """Write commit, seed, command and versions to provenance.json, and return them."""
         found = {
             "commit": commit(Path(__file__).resolve().parents[2]),
             "seed": seed,
@@ -108,19 +108,19 @@ class RunFolder:
 
 
 def freeze_layout(figure: Figure) -> None:
-    """Solve the layout once: every saving would solve it again, and draw twice."""
+    """Solve the layout once: otherwise every saving would solve it again, and draw twice."""
     engine: Any = figure.get_layout_engine()
     if engine is not None:
-        engine.set(w_pad=0.12, h_pad=0.08)  # inches: one pass leaves labels that far off
+        engine.set(w_pad=0.12, h_pad=0.08)  # inches: after one pass labels may be that far off
         figure.set_dpi(DPI)
         engine.execute(figure)
         figure.set_layout_engine(None)  # not "none": that placeholder still draws twice
 
 
 def commit(folder: Path) -> str:
-    """Git commit of a checkout's folder, with "+changes" if some are not committed."""
+    """Git commit of a checkout's folder, with "+changes" if there are uncommitted ones."""
     if not (folder / ".git").exists():
-        return "unknown: not a git checkout"  # git would take that of a folder around it
+        return "unknown: not a git checkout"  # git would report the commit of an enclosing checkout
     try:
         head = _git(folder, "rev-parse", "HEAD")
         return head + ("+changes" if _git(folder, "status", "--porcelain") else "")

@@ -1,6 +1,7 @@
-"""A page of results in one file of HTML that needs no other, and no network: it can be mailed.
+"""Results as one self-contained HTML file that needs no other file and no network.
 
-Equations stand in it as browsers typeset them: MathML, from the LaTeX that the package writes.
+The file can be sent by mail. Equations are MathML, converted from the package's LaTeX, and typeset
+by the browser.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ def page_html(
     *,
     template: Path = TEMPLATES / "page.html",
 ) -> str:
-    """Every section with its equations, tables and figures; text is escaped by the template.
+    """HTML of all sections with their equations, tables and figures; the template escapes text.
 
-    template: a Jinja2 file that is given all of these, see the package's own.
-    Raises ValueError for one that is missing, or that is no template.
+    template: a Jinja2 file that is given the title, the sections by part, the figures and `about`;
+    see the package's own.
+    Raises ValueError for a template that is missing or invalid.
     """
     from jinja2 import TemplateError
 
@@ -56,9 +58,9 @@ def page_html(
 
 
 def _environment(template: Path) -> Environment:
-    """Templates beside this one, then the package's; functions for what HTML does not know.
+    """Jinja2 environment with the template's folder, the package's, and functions for equations.
 
-    Sandboxed: a template from someone else reads what it is given, and runs nothing.
+    It is sandboxed: a template from someone else can read the data it is given, but run no code.
     """
     from jinja2 import FileSystemLoader, StrictUndefined
     from jinja2.sandbox import ImmutableSandboxedEnvironment
@@ -78,7 +80,7 @@ def _environment(template: Path) -> Environment:
 
 
 def equation_html(block: Equation) -> Markup:
-    """An equation with its words and unit; what is in it is escaped here."""
+    """An equation with its lead, unit and mark; its text is escaped here."""
     from markupsafe import Markup, escape
 
     lead = escape(f"{block.lead}: ") if block.lead else ""
@@ -88,7 +90,7 @@ def equation_html(block: Equation) -> Markup:
 
 
 def cell_html(value: object) -> Markup:
-    """A cell of a table, escaped here."""
+    """A cell of a table; its text is escaped here."""
     from markupsafe import Markup
 
     if isinstance(value, Equation):
@@ -102,7 +104,7 @@ def cell_html(value: object) -> Markup:
 
 
 def powers_html(text: str) -> Markup:
-    """Text with its powers raised, `m^-3 s^-1`, and all else escaped."""
+    """Text with powers such as `m^-3 s^-1` as superscripts, and all else escaped."""
     from markupsafe import Markup, escape
 
     escaped = str(escape(text))
@@ -111,14 +113,14 @@ def powers_html(text: str) -> Markup:
 
 
 def numeric_columns(table: Table) -> list[bool]:
-    """Whether the cells of each column are set to the right: all of them numbers, or empty."""
+    """For each column, True if it is aligned right: its cells are all numbers or empty."""
     columns = (table.rows.iloc[:, k] for k in range(table.rows.shape[1]))
     texts = ([each for each in column if cell_text(each)] for column in columns)
     return [bool(column) and all(map(_is_number, column)) for column in texts]
 
 
 def _is_number(value: Any) -> bool:
-    """A number, perhaps with a unit, or the dash for none."""
+    """True for a number, perhaps with a unit, or for the dash of a missing one."""
     return bool(re.fullmatch(r"-|[+-]?\d[\d.e+-]*( ?[%µ\w/^-]{1,5})?", cell_text(value)))
 
 
@@ -132,17 +134,17 @@ def _classes(table: Table, row: int) -> str:
 
 
 def equation_mathml(equation: Equation) -> str:
-    """The equation alone, without what stands before and behind it."""
+    """The equation as MathML, without lead, unit and mark."""
     slope = rf"\mathrm{{d}} {latex_name(equation.state)} / \mathrm{{d}} t"
     return mathml(f"{slope} = {sum_latex(equation.terms)}")
 
 
 def mathml(latex: str) -> str:
-    """LaTeX as a `math` element; whatever names it holds end as text, never as markup."""
+    """LaTeX as a `math` element; names in it end as text, never as markup."""
     from latex2mathml.converter import convert_to_element  # only when a page is written
 
     element = convert_to_element(latex)
     for each in element.iter():
         if each.text:
-            each.text = html.unescape(each.text)  # it writes signs as entities, as in `&#x02212;`
+            each.text = html.unescape(each.text)  # signs come as entities, as in `&#x02212;`
     return ElementTree.tostring(element, encoding="unicode")

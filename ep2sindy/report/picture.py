@@ -1,4 +1,4 @@
-"""Figures inside a page: as images in the text itself, or as drawings that say more on hover."""
+"""Figures inside a page: embedded PNG images, or SVG drawings with texts on hover."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SVG = "http://www.w3.org/2000/svg"
-PX_PER_INCH = 96  # of a page: one size of letters in all figures, whatever their own
+PX_PER_INCH = 96  # of a page: letters have the same size in all figures
 DPI = 150  # of figures in a run folder
-HOVER = "hover: "  # begins the id of an artist that says more, see `figures.style.hover`
+HOVER = "hover: "  # prefix of the id of an artist with a hover text, see `figures.style.hover`
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure that has been drawn.
+    """A figure as HTML.
 
-    html: an element that needs no other file. width_px: how wide it is meant to be.
+    html: an element that needs no other file. width_px: intended width.
     """
 
     html: str
@@ -33,7 +33,7 @@ class Drawn:
 
 
 def draw(figure: Figure, png: bytes, caption: str) -> Drawn:
-    """A figure for a page: its PNG, or where something in it says more on hover, its SVG."""
+    """A figure for a page: its PNG, or its SVG if artists in it have a text on hover."""
     width = round(figure.get_size_inches()[0] * PX_PER_INCH)
     speaks = figure.findobj(lambda artist: (artist.get_gid() or "").startswith(HOVER))
     if speaks:
@@ -42,9 +42,9 @@ def draw(figure: Figure, png: bytes, caption: str) -> Drawn:
 
 
 def read_png(path: Path, caption: str) -> Drawn:
-    """A figure that an earlier run wrote."""
+    """A figure written by an earlier run."""
     png = path.read_bytes()
-    width = struct.unpack(">I", png[16:20])[0]  # of the header, which comes first
+    width = struct.unpack(">I", png[16:20])[0]  # width in the PNG header
     return Drawn(png_html(png), caption, round(width / DPI * PX_PER_INCH))
 
 
@@ -53,11 +53,11 @@ def png_html(png: bytes) -> str:
 
 
 def svg_html(figure: Figure) -> str:
-    """An SVG in which artists that say more have a title, which browsers show on hover."""
+    """An SVG in which the hover texts of artists are titles, which browsers show on hover."""
     from matplotlib import rc_context
 
     buffer = BytesIO()
-    with rc_context({"svg.hashsalt": "ep2sindy"}):  # the same figure, the same ids
+    with rc_context({"svg.hashsalt": "ep2sindy"}):  # the same figure gets the same ids
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     ElementTree.register_namespace("", SVG)
     ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
@@ -71,5 +71,5 @@ def svg_html(figure: Figure) -> str:
     for metadata in root.findall(f"{{{SVG}}}metadata"):
         root.remove(metadata)
     for size in ("width", "height"):
-        root.attrib.pop(size, None)  # the page sets them
+        root.attrib.pop(size, None)  # the page sets the size
     return ElementTree.tostring(root, encoding="unicode")

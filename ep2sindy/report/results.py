@@ -1,7 +1,7 @@
-"""Results as facts: a figure is described once, and becomes column, cell, JSON and headline.
+"""Results as facts: each is described once, and becomes column, cell, JSON and headline.
 
-`Metric` is one figure of a record, `ResultTable` a table of records by their metrics. `LABELS` has
-the words of headline figures, for pages that compare runs and know their names alone.
+`Metric` is one value of a record, `ResultTable` a table of records by their metrics. `LABELS` has
+the words for headline values, for pages that compare runs and know only the names.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ LABELS = {
 
 
 class View(Flag):
-    """Where a metric appears: tables/*.csv, screen and page, summary.json, headline.
+    """Places where a metric appears: tables/*.csv, screen and page, summary.json, headline.
 
-    FILES: tables and summary. SHOWN: in them and on the screen. ALL: and in the headline.
+    FILES: tables and summary. SHOWN: also on screen and page. ALL: also in the headline.
     """
 
     CSV = auto()
@@ -65,13 +65,13 @@ Metrics = Sequence["Metric[Record]"]
 
 @dataclass(frozen=True)
 class Metric(Generic[Record]):
-    """One figure of a record, in SI unless its key says otherwise.
+    """One value of a record, in SI unless its key says otherwise.
 
-    key: its name in files and headlines. value: takes it from a record; a mapping gives a value to
-    each state (or other part). heading: of its column on the screen, `{}` being the state; the key
-    without one. format: of its cell, such as `{:.3f}` (a dash where there is no number), or a
-    function of the value; without one a number has three digits. column: name of the CSV columns
-    of a mapping, `{}` being the state; `<key>_{}` without one.
+    key: its name in files and headlines. value: function that takes it from a record; a mapping
+    gives one value for each state (or other part). heading: of its column on the screen, with `{}`
+    for the state; the key by default. format: of its cell, such as `{:.3f}` (a dash for a missing
+    number), or a function of the value; three digits by default. column: name of the CSV columns of
+    a mapping, with `{}` for the state; `<key>_{}` by default.
     """
 
     key: str
@@ -82,7 +82,7 @@ class Metric(Generic[Record]):
     column: str = ""
 
     def cell(self, value: Any) -> object:
-        """A value as it is read."""
+        """A value formatted for reading."""
         if callable(self.format):
             return self.format(value)
         if not self.format:
@@ -90,14 +90,14 @@ class Metric(Generic[Record]):
         return "-" if value is None or value != value else self.format.format(value)
 
     def columns(self, value: Any) -> dict[str, Any]:
-        """The value by CSV column: one, or one for each state."""
+        """The value by CSV column: one column, or one for each state."""
         if not isinstance(value, Mapping):
             return {self.key: value}
         name = self.column or f"{self.key}_{{}}"
         return {name.format(part): each for part, each in value.items()}
 
     def cells(self, value: Any) -> dict[str, object]:
-        """The same by heading, as it is read."""
+        """The formatted value by heading: one cell, or one for each state."""
         heading = self.heading or self.key.replace("_", " ")
         if not isinstance(value, Mapping):
             return {heading: self.cell(value)}
@@ -106,11 +106,12 @@ class Metric(Generic[Record]):
     def of(
         self, part: Callable[[Outer], Record], key: str = "{}", view: View = View.ALL
     ) -> Metric[Outer]:
-        """The same figure of a part of a larger record.
+        """The same metric for a record that contains this record as a part.
 
-        key: its name there, `{}` being the own one. view: where it appears, of those it did.
+        part: takes this record from the outer one. key: the new name, with `{}` for the old one.
+        view: places to appear in, limited to the present ones.
         """
-        made: Any = replace(self, key=key.format(self.key))  # the one field of a record's type
+        made: Any = replace(self, key=key.format(self.key))  # Any: the record's type changes
         column = key.format(self.column) if self.column else ""
         return replace(
             made,
@@ -122,15 +123,15 @@ class Metric(Generic[Record]):
 
 @dataclass(frozen=True, eq=False)
 class ResultTable(Generic[Record]):
-    """Records by name, or nameless in a sequence, and the metrics that are known of each."""
+    """Records, by name or in a sequence without names, and their metrics."""
 
     records: Mapping[str, Record] | Sequence[Record]
     metrics: Metrics[Record]
 
     def csv(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
-        """A row per record; heading: of the column of names, if there is to be one.
+        """A row per record. heading: of the column of names, left out if empty.
 
-        by_state: a row per record and state instead, in which a metric without states repeats.
+        by_state: a row per record and state instead, in which a metric without states is repeated.
         """
         rows: list[dict[str, Any]] = []
         for name, record in self._named():
@@ -146,10 +147,10 @@ class ResultTable(Generic[Record]):
         return pd.DataFrame(rows)
 
     def screen(self, heading: str = "", *, by_state: bool = False) -> pd.DataFrame:
-        """A row of cells per record.
+        """A row of formatted cells per record.
 
-        by_state: a row per record and state instead, in which a name, or a metric without states,
-        stands in the first row alone.
+        by_state: a row per record and state instead. The name, and metrics without states, are then
+        shown only in a record's first row.
         """
         rows: list[dict[str, object]] = []
         for name, record in self._named():
@@ -162,18 +163,18 @@ class ResultTable(Generic[Record]):
         return pd.DataFrame(rows)
 
     def upright(self, heading: str = "quantity") -> pd.DataFrame:
-        """A row per metric, a column of cells per record."""
+        """A row per metric, and a column of formatted cells per record."""
         cells = {name: self._cells(record) for name, record in self._named()}
         headings = list(next(iter(cells.values())))
         columns = {name: [of[h] for h in headings] for name, of in cells.items()}
         return pd.DataFrame({heading: headings, **columns})
 
     def json(self) -> dict[str, dict[str, Any]]:
-        """Metrics by name and key, values by state as they are."""
+        """Metrics by record name and key; values by state stay mappings."""
         return {name: facts(record, self.metrics) for name, record in self._named()}
 
     def headline(self) -> dict[str, float]:
-        """`name/key`, and `name/state/key` of values by state."""
+        """Headline values by `name/key`, or `name/state/key` if they are by state."""
         found = {}
         for name, record in self._named():
             for metric in self._in(View.HEADLINE):
@@ -198,13 +199,13 @@ class ResultTable(Generic[Record]):
 
 
 def facts(record: Record, metrics: Metrics[Record]) -> dict[str, Any]:
-    """What `summary.json` says of one record, by key."""
+    """Metrics of one record for `summary.json`, by key."""
     found = {m.key: m.value(record) for m in metrics if View.JSON in m.view}
     return {key: dict(v) if isinstance(v, Mapping) else v for key, v in found.items()}
 
 
 def percent(digits: int, *, sign: bool = False) -> Callable[[float], str]:
-    """A format of shares: `12.3 %`, a dash where there is no number."""
+    """A format of shares such as `12.3 %`, with a dash for a missing number."""
 
     def text(value: float) -> str:
         return f"{100.0 * value:{'+' if sign else ''}.{digits}f} %" if isfinite(value) else "-"
@@ -213,9 +214,9 @@ def percent(digits: int, *, sign: bool = False) -> Callable[[float], str]:
 
 
 def in_words(name: str) -> str:
-    """Words for a headline figure: `simple/n_i/r2_test` -> `simple, n_i: R2 on held-out rows`.
+    """Words for a headline name: `simple/n_i/r2_test` -> `simple, n_i: R2 on held-out rows`.
 
-    Parts of the name without a label stand as they are, blanks for underscores.
+    Parts without a label stay as they are; in the last part, underscores become blanks.
     """
     *where, what = name.split("/")
     text = LABELS.get(what, what.replace("_", " "))
@@ -223,14 +224,14 @@ def in_words(name: str) -> str:
 
 
 def value_text(name: str, value: float, clock: Clock = SECONDS) -> str:
-    """A headline figure as a cell; a frequency with its unit, in people's time."""
+    """A headline value as a cell; a frequency gets its unit, on the given clock."""
     if name.split("/")[-1] == "f_kHz":
         return clock.frequency_text(1e3 * value)
     return cell_text(value)
 
 
 def _states(values: Sequence[tuple[Metric[Any], Any]]) -> list[str]:
-    """States that the first value by state has."""
+    """States of the first metric that has values by state."""
     return list(next(value for _, value in values if isinstance(value, Mapping)))
 
 
@@ -241,7 +242,7 @@ def _of_state(value: Any, state: str) -> Any:
 def _rows_of_states(
     first: dict[str, object], values: Sequence[tuple[Metric[Any], Any]]
 ) -> Iterator[dict[str, object]]:
-    """Cells by state; after the first state those that do not depend on it are blank."""
+    """Rows of cells by state; metrics without states are blank after the first row."""
     for k, state in enumerate(_states(values)):
         row = {name: "" if k else text for name, text in first.items()} | {"state": state}
         for metric, value in values:

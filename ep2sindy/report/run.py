@@ -1,4 +1,4 @@
-"""A run: what a study may use while it computes, and what is made of its outcome."""
+"""A run of a study: its folder, terminal, messages and progress."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ep2sindy.runtime.progress import Advance, Bars, Progress
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run of a study: its name and seed, where it writes and what it says on the way.
+    """One run of a study: name and seed, destinations of its results, and its messages.
 
-    settings: the whole config as plain values. said: what the page repeats; warnings: that is
-    amiss, the summary too. provenance: which code this is, and the command. watch: who is told how
-    far the run has come.
+    settings: the whole config as plain values. said: messages to be repeated on the page.
+    warnings: messages about problems, for the page and the summary. provenance: version of the
+    code, and the command. watch: receives the progress of the run.
     """
 
     title: str
@@ -37,18 +37,18 @@ class Run:
     watch: Progress = field(default_factory=Bars)
 
     def say(self, text: str, *, warning: bool = False) -> None:
-        """A line for those who watch, at once: on the screen and in run.log, later on the page."""
+        """Print a message at once, on the screen and in run.log, and repeat it on the page."""
         if not warning:
             self.said.append(text)
         self.screen.print(*renderables(Text(text, warning=warning)))
 
     def warn(self, text: str) -> None:
-        """Say that something is amiss, at once, on the page and in the summary."""
+        """Print a warning at once, and repeat it on the page and in the summary."""
         self.warnings.append(text)
         self.say(text, warning=True)
 
     def write(self, name: str, writer: Callable[[Path], None]) -> None:
-        """A file of the study's own into the run folder, whole or not at all."""
+        """Write a file of the study's own into the run folder, complete or not at all."""
         with replacing(self.folder.file(name)) as temporary:
             writer(temporary)
 

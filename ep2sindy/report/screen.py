@@ -1,4 +1,4 @@
-"""The terminal and run.log."""
+"""Output to the terminal and to run.log."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ WIDTH = 120  # columns of run.log, and of output that goes to a file
 
 class Terminal(Console):
     def on_broken_pipe(self) -> None:
-        """Rich would end the program."""
+        """Raise an error instead of ending the program, as Rich would."""
         raise BrokenPipeError("the terminal has gone away")
 
 
 class Screen:
-    """Prints to the terminal and, without colours, to run.log where there is one."""
+    """Prints to the terminal and, without colours, to run.log if there is one."""
 
     def __init__(self, log: Path | None = None) -> None:
         self._path = log or Path()
@@ -42,7 +42,7 @@ class Screen:
             self._consoles.append(log_file)
 
     def print(self, *renderables: RenderableType) -> None:
-        """Text as it is: neither markup nor the name of an emoji means anything."""
+        """Print text literally, without markup and emoji codes."""
         with on_screen(sys.stdout):
             _print(self._consoles[0], *renderables)
         with writing(self._path):
@@ -51,14 +51,14 @@ class Screen:
             self._flush()
 
     def log(self, text: str) -> None:
-        """Into run.log alone."""
+        """Write to run.log only."""
         with writing(self._path):
             for console in self._consoles[1:]:
                 _print(console, plain(text))
             self._flush()
 
     def show(self, sections: Sequence[Section]) -> None:
-        """Every section that has something for the screen."""
+        """Print every section that has content for the screen."""
         for section in sections:
             shown = [each for block in section.blocks for each in renderables(block)]
             if shown:
@@ -72,13 +72,13 @@ class Screen:
                 self._log.close()
 
     def _flush(self) -> None:
-        """What is printed waits in the file's memory until here."""
+        """Write buffered output to run.log."""
         if self._log is not None:
             self._log.flush()
 
 
 def renderables(block: Block) -> Iterator[RenderableType]:
-    """What a terminal shows of a block."""
+    """The parts of a block that a terminal shows."""
     match block:
         case Text(page_only=False):
             yield _text(block.text, "bold red" if block.warning else "")
@@ -95,7 +95,7 @@ def _print(console: Console, *renderables: RenderableType) -> None:
 
 
 def _text(text: str, style: str = "") -> RichText:
-    """Text that is neither markup nor steers a terminal."""
+    """Text without markup and without terminal control codes."""
     return RichText(plain(text), style)
 
 
@@ -124,9 +124,9 @@ def rich_table(table: Table) -> RichTable:
 
 @dataclass(frozen=True)
 class Cell:
-    """Text that breaks where a line does not hold it: before a sign, or a mark `<- selected`.
+    """Text that, if too long for a line, breaks before a sign or a mark `<- selected`.
 
-    Words break as ever where what lies between is too long for a line.
+    A part that is still too long breaks between words as usual.
     """
 
     text: str

@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a run, written as its own event files: no PyTorch is needed."""
+"""Output of a run for TensorBoard, written directly as event files, without PyTorch."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ep2sindy.runtime.files import writing
 
 
 class Board:
-    """One run in TensorBoard; opened when something is written, for its import takes a while.
+    """One run in TensorBoard; opened at the first output, because the import takes a while.
 
-    TensorBoard's own writer works in a thread, whose errors are printed in its words, not ours.
+    TensorBoard's own writer is not used: it works in a thread, which prints errors itself.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -25,20 +25,20 @@ class Board:
         self._writer: Any = None
 
     def scalars(self, scalars: Mapping[str, float], *, step: int) -> None:
-        """Curves that grow while the run goes on."""
+        """Add points to curves that grow during the run."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()]
         self._add(Summary(value=values), step=step)
 
     def equations(self, texts: Mapping[str, str]) -> None:
-        """The equations of all models, by name: one block of lines as they are, in a fixed font."""
+        """The equations of all models, by name, as one block of lines in a fixed-width font."""
         parts = (f"{name}\n{indent(text, '  ')}" for name, text in texts.items())
         if texts:
             self.text("equations", "\n\n".join(parts))
 
     def text(self, name: str, text: str) -> None:
-        """Lines as they are, in a fixed font."""
+        """Lines of text unchanged, in a fixed-width font."""
         from tensorboard.compat.proto.summary_pb2 import Summary
         from tensorboard.compat.proto.tensor_pb2 import TensorProto
         from tensorboard.plugins.text.metadata import create_summary_metadata
@@ -49,17 +49,17 @@ class Board:
         self._add(Summary(value=[Summary.Value(tag=name, metadata=kind, tensor=tensor)]))
 
     def image(self, name: str, png: bytes) -> None:
-        """A figure as it was drawn for the folder."""
+        """A figure, as the PNG drawn for the folder."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
-        width, height = struct.unpack(">II", png[16:24])  # of the header, which comes first
+        width, height = struct.unpack(">II", png[16:24])  # in the PNG header
         image = Summary.Image(height=height, width=width, colorspace=4, encoded_image_string=png)
         self._add(Summary(value=[Summary.Value(tag=name, image=image)]))
 
     def settings(self, hparams: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
-        """The metrics beside the settings that led to them; runs are compared by their keys.
+        """The metrics with the settings that led to them; TensorBoard compares runs by their keys.
 
-        No list of keys is written: of all runs TensorBoard would believe the first one's.
+        No list of keys is written, because TensorBoard would use the first run's for all runs.
         """
         from tensorboard.plugins.hparams import summary_v2 as hp
 
@@ -82,7 +82,7 @@ class Board:
 
 
 def _open(folder: Path) -> Any:
-    """An event file, named as TensorBoard looks for it."""
+    """An event file, named so that TensorBoard finds it."""
     from tensorboard.summary.writer.record_writer import RecordWriter
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Selection: rules that choose one candidate of every front."""
+"""Selection: rules that choose one candidate from every Pareto front."""
 
 from ep2sindy._stubs import attach
 

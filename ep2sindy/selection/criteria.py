@@ -1,4 +1,4 @@
-"""Rules that score candidates one by one: by information, by evidence, by the knee of the front."""
+"""Rules that score candidates one by one: information criteria, evidence, knee, stability."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.selection.rule import FLOOR
 
-# Rounds of weighting the rows by the covariance under the candidate that leads.
+# Rounds of weighting the rows by the covariance under the leading candidate.
 MAX_ROUNDS = 5
 
 
 @dataclass(frozen=True)
 class AICc:
-    """Akaike's criterion for small samples: which model will predict best.
+    """Akaike's criterion for small samples, which selects the model expected to predict best.
 
-    Assumes Gaussian residuals, white after weighting by the rows' covariance where it is known
-    (`Weak`), and independent from row to row where it is not (`Differential`: neighbours of a
-    smoothed series are not, so it keeps too many terms). Not consistent: even with endless data
-    it keeps a needless term now and then.
+    Assumes Gaussian residuals. Where the rows' covariance is known (`Weak`), the residuals must be
+    white after weighting by it. Where it is not (`Differential`), they must be independent from row
+    to row; neighbouring rows of a smoothed series are not, so AICc then keeps too many terms. Not
+    consistent: even with endless data it keeps a needless term now and then.
     Source: Hurvich & Tsai 1989, doi:10.1093/biomet/76.2.297.
     """
 
@@ -42,17 +42,18 @@ class AICc:
 
 @dataclass(frozen=True)
 class EBIC:
-    """The extended criterion: sizes are equally likely before, not models.
+    """The extended Bayesian criterion: a priori all sizes of support are equally likely.
 
     score = n log(RSS / n) + k log n + 2 gamma log(number of supports of k terms). Libraries are
-    nested by degree, and the supports are counted in the smallest that holds this one: simple
-    terms need not pay for the many of high degree.
-    Assumes what `AICc` does of the residuals. coarsening: no model is exact, and with n rows any
-    discrepancy becomes significant; the likelihood is raised to the power 1 / (1 + n/coarsening),
-    so that evidence stops growing at about that many rows. None: trust the residuals to the end.
-    With gamma=0 and coarsening=None it is Schwarz's criterion, BIC: which model is most likely,
-    all being equally likely before. There are many more models of middle size than small ones, so
-    with a library of any size BIC keeps too many terms.
+    nested by degree, and the supports are counted in the smallest one that holds the candidate's
+    terms, so that simple terms do not pay for the many terms of high degree. The assumptions on the
+    residuals are those of `AICc`.
+    coarsening: no model is exact, and with enough rows any discrepancy becomes significant. The
+    likelihood is therefore raised to the power 1 / (1 + n/coarsening), so that evidence stops
+    growing at about that many rows. None uses the full likelihood.
+    With gamma=0 and coarsening=None it is Schwarz's criterion, BIC, for which all models are
+    equally likely a priori. There are many more models of middle size than small ones, so with a
+    library of any size BIC keeps too many terms.
     Source: Chen & Chen 2008, doi:10.1093/biomet/asn034; Miller & Dunson 2019,
     doi:10.1080/01621459.2018.1469995; Schwarz 1978, doi:10.1214/aos/1176344136.
     """
@@ -74,7 +75,7 @@ class EBIC:
         return "BIC" if self.gamma == 0.0 and self.coarsening is None else "EBIC"
 
     def shared_by(self, n_points: int) -> EBIC:
-        """The rule at one of n points that share a support: together they pay its count once."""
+        """The rule at one of n points with a common support: together they pay for it once."""
         return replace(self, gamma=self.gamma / n_points)
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
@@ -91,7 +92,7 @@ class EBIC:
 
 
 def log_supports(library: Library, terms: Sequence[str]) -> float:
-    """Log of the number of supports of this size among terms of no higher degree than these."""
+    """Log of the number of supports of this size among terms up to the highest degree of these."""
     degrees = library.degrees
     highest = max((degrees[library.index(name)] for name in terms), default=0)
     return log(comb(int((degrees <= highest).sum()), len(terms)))
@@ -103,10 +104,10 @@ def _criterion(
     *,
     coarsening: float | None = None,
 ) -> Float[np.ndarray, " candidates"]:
-    """n log(RSS / n) + penalty of every candidate, its rows weighted where noise is known.
+    """n log(RSS / n) + penalty of every candidate, its rows weighted where their noise is known.
 
-    The weights depend on the model: those of the leading candidate serve all, in rounds, until
-    the leader stays.
+    The weights depend on the model. Those of the leading candidate serve all, and are updated until
+    the leader stays the same.
     """
     problem = front.rows
     n_rows = len(problem.train_rows)
@@ -132,8 +133,8 @@ def _fits(
     target: Float[np.ndarray, " rows"],
     masks: Bool[np.ndarray, "candidates terms"],
 ) -> tuple[Float[np.ndarray, " candidates"], Float[np.ndarray, "candidates terms"]]:
-    """Least squares of every support: residual squares, no lower than the floor, and coef."""
-    # The triangle keeps all that least squares needs of the rows, at the rows' own condition.
+    """Least squares on every support: residual squares, at least the floor, and coefficients."""
+    # R of the QR factors holds all that least squares needs, without squaring the condition number.
     triangle = np.asarray(np.linalg.qr(np.column_stack([theta, target]), mode="r"))
     columns, right = triangle[:, :-1], triangle[:, -1]
     coef = np.zeros(masks.shape)
@@ -145,9 +146,10 @@ def _fits(
 
 @dataclass(frozen=True)
 class Evidence:
-    """The candidate under which the trajectories are most likely, its terms' prices paid.
+    """Select by -2 log likelihood of the trajectories plus the prices of the terms.
 
-    What a `TrajectorySearch` weighs its own candidates by; fronts of regressions have none.
+    A `TrajectorySearch` ranks its own candidates by this value. Fronts of regressions do not have
+    it.
     """
 
     label: ClassVar[str] = "deviance"
@@ -167,16 +169,16 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Knee:
-    """Select the candidate closest to no error and no terms: the thesis's rule.
+    """Selects the candidate closest to zero error and zero terms: the thesis's rule.
 
-    score = sqrt((1 - R2)^2 + (n_terms / n_norm)^2), where n_norm is the number of terms in
-    the library (the thesis's Eq. 9), or for "max_terms" the largest candidate's plus one (what
-    the thesis's Tables II and III were made with). Assumes that a term worth having raises R2 by
+    score = sqrt((1 - R2)^2 + (n_terms / n_norm)^2). For n_norm="library" it is the number of terms
+    in the library (the thesis's Eq. 9); for "max_terms" it is the largest candidate's number plus
+    one (used for the thesis's Tables II and III). Assumes that a term worth having raises R2 by
     about one step of n_terms / n_norm: any other is dropped, by construction.
     scale: "log" takes the logarithm of the error, so that a small term of an exact law counts:
-    score = sqrt(((log e - log e_min) / (log e_max - log e_min))^2 + (n_terms / n_norm)^2).
-    That assumes that errors span orders of magnitude: the largest fall sets the scale, and a true
-    term that lowers the error by less than one step of it is dropped.
+    score = sqrt(((log e - log e_min) / (log e_max - log e_min))^2 + (n_terms / n_norm)^2). That
+    assumes that errors span orders of magnitude: the largest fall sets the scale, and a true term
+    that lowers the error by less than one step of it is dropped.
     """
 
     n_norm: str = "library"
@@ -199,7 +201,7 @@ class Knee:
         ]
 
     def _height(self, front: ParetoFront) -> Float[np.ndarray, " candidates"]:
-        """Errors, or their logarithms from 0 to 1."""
+        """Errors, or their logarithms scaled to the range from 0 to 1."""
         if self.scale == "linear":
             return front.errors
         height = np.log(np.maximum(front.errors, FLOOR))
@@ -214,15 +216,17 @@ def _norm_of_sizes(front: ParetoFront, n_norm: str) -> float:
 
 @dataclass(frozen=True)
 class Stability:
-    """The largest candidate all of whose terms stood in `threshold` of the bootstraps or more.
+    """Selects the largest candidate whose terms were each chosen in enough of the bootstraps.
 
-    A term counts for a bootstrap where it was at hand and stood in a support of the candidate's
-    size. score = -n_terms for a stable candidate, otherwise the share of bootstraps that lacked
-    its least stable term. Assumes that a term which is not in the law is chosen by chance, now
-    this one and now that: one that mends the same error of the rows in every bootstrap is as
-    stable as a true one, and then too many terms are kept. Bootstraps that cull a true term upset
-    its companions too, which lowers their shares in a small library. The source bounds the
-    number of false terms for thresholds above a half.
+    A term counts as chosen in a bootstrap if it was available there and stood in a support of the
+    candidate's size. A candidate is stable if each of its terms was chosen in at least the share
+    `threshold` of the bootstraps. score = -n_terms for a stable candidate, otherwise the share of
+    bootstraps that lacked its least stable term.
+    Assumes that false terms are chosen by chance, a different one each time. A false term that
+    corrects the same error of the rows in every bootstrap is as stable as a true one, and then too
+    many terms are kept. Bootstraps that leave a true term out of the library also disturb the
+    choice of the others, which lowers their shares in a small library. The source bounds the number
+    of false terms for thresholds above a half.
     Source: Meinshausen & Buehlmann 2010, doi:10.1111/j.1467-9868.2010.00740.x.
     """
 
@@ -234,7 +238,7 @@ class Stability:
             raise ValueError(f"threshold must lie in (0.5, 1]: {self.threshold} came")
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]:
-        """Raises ValueError for fronts without bootstraps."""
+        """Scores as described above. Raises ValueError for fronts without bootstraps."""
         _check_bootstraps([c for front in fronts for c in front.candidates])
         return [np.array([self._score(c) for c in front.candidates]) for front in fronts]
 

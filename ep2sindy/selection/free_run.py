@@ -1,4 +1,4 @@
-"""Selection by free run: systems of equations refined, and judged by the cycle they live on."""
+"""Selection by free run: systems are refined, and compared with the cycle of the data."""
 
 from __future__ import annotations
 
@@ -42,34 +42,36 @@ from ep2sindy.selection.systems import (
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import samples_in, steps_in
 
-MIN_WINDOWS = 30  # that the winner is refined on
+MIN_WINDOWS = 30  # fewest windows to refine the winner on
 
-# Share of the window loss of a smaller system on a neutral cycle that one on a cycle that attracts
-# must come below: where noise is all that is left, more terms pull by chance.
+# A system on an attracting cycle replaces a smaller one on a neutral cycle only if its window loss
+# is below this share of the other's: if only noise is left, extra terms attract by chance.
 GAIN = 0.95
 
-# Modulus of the second Floquet multiplier up to which a cycle counts as one that attracts: a
-# departure halves within 14 periods. Data of a few periods cannot tell less from none.
+# Largest modulus of the Floquet multipliers, after the first, of an attracting cycle: a departure
+# halves within 14 periods. Data of a few periods cannot tell weaker attraction from none.
 PULL = 0.95
 
-# Of a record, so that its folds leave windows of two: six, less what noise makes of them.
+# Fewest periods of a record, so that its folds leave windows of two periods: six, less a margin
+# for noise.
 MIN_PERIODS = 5.5
 
-# Change of every state's amplitude from each third of a record to the next, in one direction, above
-# which it spirals: no one cycle has the amplitude of all folds within 10 %.
+# A record spirals if the amplitude of every state changes by more than this factor, in the same
+# direction, from each third to the next: no single cycle then fits all folds within 10 %.
 MAX_DRIFT = 1.1
 
-# Periods of a trial run: enough for a transient to die out. A model without inputs runs on where
-# a stretch ends before.
+# Periods of a trial run: enough for a transient to die out. A model without inputs continues
+# beyond the end of a short stretch.
 MIN_RUN, MAX_RUN = 16.0, 30.0
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A system after all folds, where it was not fitted: the worst of them.
+    """Results of a system on the folds that it was not fitted to, the worst over all folds.
 
-    error: largest deviation from the data's cycle in units of its bound; one and less lives.
-    waveform: largest error of the waveform. loss: of the windows it was refined on.
+    error: largest deviation from the data's cycle, in units of its bound; a system with one or less
+    lives. waveform: largest error of the waveform. loss: on the windows that the system was refined
+    on.
     """
 
     system: TrialSystem
@@ -80,29 +82,33 @@ class Trial:
 
 @dataclass(frozen=True)
 class FreeRunScore:
-    """Judge systems of equations by running them freely: the smallest that lives wins.
+    """Judge systems of equations by running them freely; the smallest system that lives wins.
 
-    The records are parted in `n_folds`. Every combination of candidates, one per equation, is
-    refined on windows of `window_periods` in all folds but one, and run from where the data's
-    cycle is when what was held out begins (noise in a sample is not the model's), in turn for
-    every fold. It lives if frequency, amplitudes and waveform keep within `bounds` of the data's
-    cycle each time. Of those that live with room to spare the smallest, by waveform among equals,
-    is refined on windows of all data and run over the longest record; it wins if it lives there
-    too, on a cycle that attracts. One on a neutral cycle wins where no larger one attracts that
-    follows its windows better; where none lives, the one that deviates least does; the note says
-    so. Neither R2 nor the loss of the windows decides what lives: they are blind to where a
-    trajectory ends. Only where the samples are followed to rounding, the truth being in the
-    library, the systems that do so compete alone.
+    The records are split into `n_folds`. Every combination of candidates, one per equation, is
+    refined on windows of `window_periods` in all folds but one, then run freely over the fold held
+    out, in turn for every fold. A run starts on the data's cycle at the phase where the held-out
+    part begins, not at its first sample, whose noise is not the model's fault. A model with inputs
+    starts at the smoothed sample instead. A system lives if frequency, amplitudes and waveform stay
+    within `bounds` of the data's cycle in every run.
+    Living systems within `margin` come first; among these the smallest, and among equals the one
+    with the best waveform, is refined on windows of all data and run over the longest record. It
+    wins if it lives there too, on a cycle that attracts. A system on a neutral cycle wins only if
+    no larger system on an attracting cycle follows its windows better. If no system lives, the one
+    that deviates least wins, and the note says so. Neither R2 nor the loss of the windows decides
+    which systems live: they are blind to where a trajectory ends. Only if some systems follow the
+    samples to rounding, because the truth is in the library, these compete alone.
 
-    Where a record has no period, or fewer than six, or spirals outward or inward through all of
-    them, there is no cycle to keep to: RefinedScore decides.
+    RefinedScore decides instead if a record has no period, holds fewer than six, or spirals outward
+    or inward throughout: then there is no cycle to compare with.
     score = the largest deviation from the cycle, in units of its bound; at most 10.
-    margin: systems that deviate by no more than this share of the bounds come first, however
-    small others are: what barely keeps within them here will not in another record.
-    judged: states whose cycle counts, such as one that was measured where others are made of it;
-    None takes all. n_starts: of models without inputs in every stretch that was held out, at
-    phases spread over the period; all must end on the cycle.
-    max_combinations: more are refused. n_confirmed: refined on all data, at most. seed: of windows.
+    margin: systems that deviate by no more than this share of the bounds come first, even if others
+    are smaller: a system that barely stays within the bounds here will leave them in another
+    record.
+    judged: states whose cycle counts, for example the one that was measured if the others are
+    derived from it; None takes all. n_starts: number of runs over every held-out part for models
+    without inputs, at phases spread over the period; all must end on the cycle.
+    max_combinations: more are refused. n_confirmed: most systems to refine on all data. seed: of
+    the random windows.
     """
 
     bounds: FreeRunBounds = field(default_factory=FreeRunBounds)
@@ -130,7 +136,7 @@ class FreeRunScore:
     def scores(
         self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
     ) -> list[Float[np.ndarray, " _candidates"]]:
-        """Those of `decide`."""
+        """The scores that `decide` returns."""
         return list(self.decide(fronts, library, runs).scores)
 
     def decide(
@@ -142,8 +148,10 @@ class FreeRunScore:
         *,
         progress: Progress = SILENT,
     ) -> Decision:
-        """Raises ValueError for no runs, a state without a front, more than
-        max_combinations, or relations that no combination has the terms for.
+        """Score the candidates, and refine the winning system on all data.
+
+        Raises ValueError for no runs, a state without a front, more than max_combinations, or
+        relations that no combination has the terms for.
         """
         records = records_of(fronts, runs)
         cycles = cycles_of(records, [front.equation for front in fronts])
@@ -161,7 +169,7 @@ class FreeRunScore:
         return Decision(scores, model, note)
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
-        """Samples of a window."""
+        """Number of samples in a window."""
         frequency_Hz = [cycle.frequency_Hz for cycle in cycles]
         dt_s = [run.dt_s for run in records.runs]
         return samples_in(self.window_periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
@@ -173,9 +181,9 @@ class FreeRunScore:
         systems: Sequence[TrialSystem],
         progress: Progress,
     ) -> list[Trial]:
-        """Every system refined and run, fold by fold; one that lacks an equation cannot live."""
+        """Refine and run every system, fold by fold; one that lacks an equation cannot live."""
         whole = [k for k, system in enumerate(systems) if system.model.coef.any(axis=0).all()]
-        whole.sort(key=lambda k: systems[k].n_terms)  # neighbours in a batch cost alike
+        whole.sort(key=lambda k: systems[k].n_terms)  # systems in a batch then cost about the same
         trials = [Trial(system, MAX_ERROR, np.inf, np.inf) for system in systems]
         if not whole:
             return trials
@@ -211,7 +219,7 @@ class FreeRunScore:
                 batch,
                 method=method,
                 constraints=[system.constraint for system in systems],
-                n_reweights=0,  # states count by their standard deviation, as they are judged
+                n_reweights=0,  # scale states by their standard deviation, as in the judging
                 points_per_batch=together,
                 advance=advance,
             )
@@ -231,7 +239,7 @@ class FreeRunScore:
         cycle: Cycle,
         states: Sequence[str],
     ) -> Float[np.ndarray, "systems 2"]:
-        """Error and waveform of every system over one stretch, transients left out."""
+        """Error and waveform of every system over one stretch, its first half left out."""
         half, columns = len(t) // 2, columns_of(states, self.judged)
         ours = replace(cycle, mean=cycle.mean[columns], harmonics=cycle.harmonics[:, columns])
         found = np.full((len(paths), 2), [MAX_ERROR, np.inf])
@@ -250,7 +258,7 @@ class FreeRunScore:
         trials: Sequence[Trial],
         progress: Progress,
     ) -> tuple[int, SparseModel, str]:
-        """Which system, refined on all data, and how it came to win."""
+        """Index of the winning system, the system refined on all data, and how it won."""
         exact = min(trial.loss for trial in trials) < FLOOR
         living = [
             k for k, t in enumerate(trials) if t.error <= 1.0 and (t.loss < FLOOR or not exact)
@@ -288,7 +296,7 @@ class FreeRunScore:
         return trial.error > self.margin, trial.system.n_terms, trial.waveform
 
     def _confirmed(self, model: SparseModel, records: Records, cycles: Sequence[Cycle]) -> FreeRun:
-        """Over the longest record, from where its cycle begins."""
+        """Free run over the longest record, from the start of its cycle."""
         pairs = zip(records.runs, cycles, strict=True)
         run, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
@@ -296,7 +304,7 @@ class FreeRunScore:
 
 
 def _attracts(run: FreeRun, cycles: Sequence[Cycle]) -> bool:
-    """Whether a departure from the model's cycle dies out; a driven model has no cycle alone."""
+    """True if departures from the model's cycle die out; always for models with inputs."""
     if run.model.inputs:
         return True
     period_s = 1.0 / cycles[0].frequency_Hz
@@ -305,10 +313,10 @@ def _attracts(run: FreeRun, cycles: Sequence[Cycle]) -> bool:
 
 
 def cycles_of(records: Records, states: Sequence[str]) -> list[Cycle] | str:
-    """The cycle of every record, or what stands against there being one."""
+    """The cycle of every record, or the reason why a record has none."""
     found = []
     for run in records.runs:
-        # Samples as they are: a waveform of all periods averages noise, smoothing clips peaks.
+        # Unsmoothed samples: the waveform averages noise over all periods; smoothing clips peaks.
         cycle = find_cycle(run.t, run.columns(states))
         name = f"record {run.label!r}" if run.label else "the record"
         if cycle is None:
@@ -322,7 +330,7 @@ def cycles_of(records: Records, states: Sequence[str]) -> list[Cycle] | str:
 
 
 def _spirals(cycle: Cycle, states: Float[np.ndarray, "samples n_states"]) -> bool:
-    """Whether the fundamental of every state grows, or of every state decays, all along."""
+    """True if the fundamental of every state grows, or of every state decays, throughout."""
     amplitude = []
     for phase, part in zip(np.array_split(cycle.phase, 3), np.array_split(states, 3), strict=True):
         basis = np.column_stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
@@ -339,7 +347,7 @@ def paths_over(
     cycles: Sequence[Cycle],
     n_starts: int,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, Cycle]]:
-    """Times and paths of every system over every stretch that was held out, start by start."""
+    """Times and paths of every system over every held-out stretch, one start after the other."""
     joined = np.concatenate(records.smoothed)
     centre, spread = joined.mean(axis=0), joined.std(axis=0)
     for part in held:
@@ -348,7 +356,7 @@ def paths_over(
         first, n_samples = part.start, part.stop - part.start
         if not ensemble.inputs:
             n_samples = round(np.clip(n_samples, MIN_RUN * per_period, MAX_RUN * per_period))
-            # Over as many periods, no two at one phase.
+            # Starts spread over as many periods, no two at the same phase.
             later = np.arange(n_starts) * (1.0 + 1.0 / n_starts) * per_period
             starts = np.minimum(first + later.round().astype(np.int64), part.stop - 1)
             begin = cycle.waveform(cycle.phase[starts]).T

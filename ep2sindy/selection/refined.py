@@ -1,4 +1,4 @@
-"""Selection by refinement: systems of equations at their best, judged on windows not fitted."""
+"""Selection by refinement: systems of equations, refined, are judged on windows not fitted."""
 
 from __future__ import annotations
 
@@ -29,41 +29,42 @@ from ep2sindy.selection.rule import (
 )
 from ep2sindy.selection.systems import Records, TrialSystem, budget, records_of, systems_of
 
-# Pairs of windows that the records are cut into at least, where nobody sets the length.
+# Fewest pairs of windows to cut the records into if window_s is not set.
 MIN_PAIRS = 3
 
-# Parts that the windows are dealt to: half of the windows of a relaxation oscillation may hold
-# none of its jumps, and then they leave the coefficients of the fast equation open.
+# Groups that the windows are dealt into. With two, half of the windows of a relaxation oscillation
+# may hold none of its jumps, which leaves the coefficients of the fast equation undetermined.
 N_FOLDS = 3
 
-# Standard errors that the winner may lie above the best.
+# Standard errors by which the winner's error may exceed the least.
 N_ERRORS = 2.0
 
 
 @dataclass(frozen=True)
 class RefinedScore:
-    """Judge equations together, at their best: which system follows windows it never saw?
+    """Judge systems of equations, after refinement, on windows that were not used in the fit.
 
-    The records are cut into windows that share no samples. Every combination of candidates, one
-    per equation, is refined on two of three windows and judged on the third, in turn for each of
-    the three. So coefficients that noise in the library has biased are mended before they count.
-    Judging holds them and fits each window's start: from a smoothed start the truth, if it is
-    chaotic, runs away from its own samples.
-    The error is the mean square distance to the samples in variances of each state, averaged
-    over the states with weights 1 / residual of the leader, the combination of greatest
-    likelihood; at most 10, which also stands for a window that a combination cannot run through.
-    A refinement that blows up, or does not converge and follows its own windows no better, leaves
-    the coefficients of the regression: they are a fit too, and are judged like any other.
-    Of the combinations within two standard errors of the leader the one of fewest terms wins.
-    The standard error is that of the difference between the two, in which noise that both meet
-    cancels: with n independent residuals an excess share of q in the error has the standard
-    error sqrt(4 q / n), so q = 16 / n is two of them. n is less than the residuals' number by
-    (1 - rho) / (1 + rho), rho being the autocorrelation of the leader's from sample to sample:
-    little is certain about models that miss more than white noise.
+    The records are cut into windows that share no samples. Every combination of candidates, one per
+    equation, is refined on two of three windows and judged on the third, in turn for each of the
+    three. This corrects coefficients that noise in the library has biased, before they count. For
+    judging, the coefficients are held and each window's start is fitted: from a smoothed start even
+    the true system, if it is chaotic, runs away from its own samples.
+    The error is the mean square distance to the samples in variances of each state, averaged over
+    the states with weights 1 / residual of the leader, the combination of greatest likelihood. It
+    is at most 10, which also stands for a window that a combination cannot run through. A
+    refinement that blows up, or that does not converge and follows its own windows no better, keeps
+    the coefficients of the regression, which are judged like any other.
+    Of the combinations within two standard errors of the leader the one of fewest terms wins. The
+    standard error is that of the difference between the two errors, in which noise that both meet
+    cancels: with n independent residuals an excess share of q in the error has the standard error
+    sqrt(4 q / n), so q = 16 / n is two of them. n is the number of residuals times (1 - rho) / (1 +
+    rho), rho being the autocorrelation of the leader's residuals from sample to sample. So
+    differences between models that miss more than white noise are uncertain.
     score = the least error of all combinations with the candidate, no less than that limit; the
-    winner's candidates a hair below.
-    window_s: None for one and a half dominant periods, or what leaves three pairs if that is less.
-    n_windows: judged, at most, over all records. max_combinations: more are refused.
+    winner's candidates score marginally below it.
+    window_s: None for one and a half dominant periods, or less if needed to leave three pairs of
+    windows. n_windows: most windows to judge on, over all records. max_combinations: more are
+    refused.
     """
 
     window_s: float | None = None
@@ -83,8 +84,10 @@ class RefinedScore:
     def scores(
         self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
     ) -> list[Float[np.ndarray, " _candidates"]]:
-        """Raises ValueError for no runs, a state without a front, more than
-        max_combinations, or records too short for two windows.
+        """Scores of every candidate by the errors of its combinations.
+
+        Raises ValueError for no runs, a state without a front, more than max_combinations, or
+        records too short for two windows.
         """
         places = combinations(fronts, self.max_combinations)
         systems = systems_of(fronts, places, library, runs)
@@ -100,9 +103,9 @@ class RefinedScore:
         *,
         progress: Progress = SILENT,
     ) -> Decision:
-        """As `scores`, and the winner refined on windows of all the data.
+        """Score the candidates as `scores` does, and refine the winner on windows of all the data.
 
-        Raises ValueError for relations that no combination has the terms for, too.
+        Also raises ValueError for relations that no combination has the terms for.
         """
         places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
         records = records_of(fronts, runs)
@@ -117,7 +120,7 @@ class RefinedScore:
     def _judge(
         self, systems: Sequence[TrialSystem], records: Records, progress: Progress
     ) -> tuple[Float[np.ndarray, " combinations"], float]:
-        """Error of every combination on windows it was not refined on, and the limit."""
+        """Error of every combination on windows it was not refined on, and the winner's limit."""
         coef = np.stack([system.model.coef for system in systems], axis=2)
         model = systems[0].model
         ensemble = Ensemble(model.library, model.states, coef)
@@ -136,10 +139,10 @@ class RefinedScore:
     def _folds(
         self, runs: Sequence[Trajectory], ensemble: Ensemble
     ) -> list[tuple[WindowBatch, WindowBatch]]:
-        """Windows to refine on and windows to judge on, by turns; each judges once."""
+        """Pairs of windows to refine on and windows to judge on; every window judges once."""
         pieces = self._pieces(runs, self._window(runs, ensemble.states))
         n_folds = min(N_FOLDS, len(pieces))
-        nothing_left_to_chance = np.random.default_rng(0)  # a trajectory for every window
+        nothing_left_to_chance = np.random.default_rng(0)  # one window per trajectory
 
         def batch(chosen: list[Trajectory]) -> WindowBatch:
             return cut_windows(
@@ -160,7 +163,7 @@ class RefinedScore:
         ]
 
     def _pieces(self, runs: Sequence[Trajectory], window: int) -> list[Trajectory]:
-        """Pairs of neighbouring windows, spread over every record that holds one."""
+        """Pairs of neighbouring windows, spread over every record that is long enough."""
         n_samples = sum(run.n_samples for run in runs)
         pieces = []
         for run in runs:
@@ -172,7 +175,7 @@ class RefinedScore:
         return pieces
 
     def _window(self, runs: Sequence[Trajectory], states: Sequence[str]) -> int:
-        """Samples in each window."""
+        """Number of samples in each window."""
         longest = max(run.n_samples for run in runs)
         if self.window_s is None:
             room = sum(run.n_samples for run in runs) // (2 * MIN_PAIRS)
@@ -196,7 +199,7 @@ def _models(ensemble: Ensemble, places: Int[np.ndarray, " models"]) -> list[Spar
 
 
 def _by_size(ensemble: Ensemble) -> Int[np.ndarray, " models"]:
-    """Models with terms, the smallest first: neighbours then cost each other little."""
+    """Indices of the models with terms, the smallest first, so that a batch costs alike."""
     n_terms = (ensemble.coef != 0.0).sum(axis=(0, 1))
     order = np.argsort(n_terms, kind="stable")
     return order[n_terms[order] > 0]
@@ -208,7 +211,7 @@ def _refined(
     constraints: Sequence[Constraint],
     advance: Advance,
 ) -> Ensemble:
-    """Every model refined on the same windows; one without terms has nothing to refine."""
+    """Every model refined on the same windows; models without terms stay as they are."""
     order = _by_size(ensemble)
     if not order.size:
         return ensemble
@@ -238,7 +241,7 @@ def _residuals(
     ensemble: Ensemble, batch: WindowBatch, advance: Advance = nothing
 ) -> Float[np.ndarray, "models windows samples n_states"]:
     """Distances of the best trajectories to the samples, in the batch's scale; NaN if none."""
-    # Without terms a state stays where it is, and best at the mean.
+    # Without terms a state is constant, and its best constant is the mean.
     still = batch.data.mean(axis=1, keepdims=True) - batch.data
     found = np.repeat(still[None], ensemble.coef.shape[2], axis=0)
     order = _by_size(ensemble)
@@ -258,7 +261,7 @@ def _residuals(
 def _errors_and_limit(
     residuals: Float[np.ndarray, "models windows samples n_states"],
 ) -> tuple[Float[np.ndarray, " models"], float]:
-    """Error of every model, and up to where it cannot be told from the leader's."""
+    """Error of every model, and the largest error not distinguishable from the leader's."""
     squares = _bounded_squares(residuals)
     by_state = np.maximum(squares.mean(axis=1), FLOOR)
     leader = int(np.argmin(np.log(by_state).sum(axis=1)))
@@ -271,14 +274,14 @@ def _errors_and_limit(
 def _bounded_squares(
     residuals: Float[np.ndarray, "models windows samples n_states"],
 ) -> Float[np.ndarray, "models windows n_states"]:
-    """Mean squares, MAX_ERROR at most and where there is no trajectory."""
+    """Mean squares over a window, at most MAX_ERROR, which also stands for a missing trajectory."""
     with np.errstate(over="ignore"):
         squares = np.square(residuals).mean(axis=2)
     return np.where(squares < MAX_ERROR, squares, MAX_ERROR)
 
 
 def _independent(residuals: Float[np.ndarray, "windows samples n_states"]) -> float:
-    """How many independent residuals say as much about a mean, by their correlation in time."""
+    """Number of independent residuals with the same information on a mean, by autocorrelation."""
     power = np.maximum(np.square(residuals).sum(axis=(0, 1)), 1e-300)
     rho = (residuals[:, 1:] * residuals[:, :-1]).sum(axis=(0, 1)) / power
     rho = np.clip(rho, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What a selection rule is: scores of candidates, alone or combined, the lowest selected."""
+"""Protocols of selection rules: scores of candidates, alone or combined, the lowest selected."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
 
-# What no noise-free fit can fall below, as a share of the target's squares: beneath it a
-# criterion would select terms that explain the discretisation.
+# Least residual squares, as a share of the target's squares: below this value a criterion would
+# select terms that fit the discretisation error of noise-free data.
 FLOOR = 1e-6
 
-# The largest error of a system, and that of one that dies, diverges or cannot be refined. It counts
-# variances of the data, where a model that always gives the mean has 1, or bounds of a free run.
+# Upper bound on the error of a system, also used if it dies, diverges or cannot be refined. The
+# unit is the variance of the data (a constant at the mean has error 1), or the bound of a free run.
 MAX_ERROR = 10.0
 
 
 @runtime_checkable
 class Selection(Protocol):
-    """Gives every candidate of every front a score; the lowest of a front is selected.
+    """A rule that scores every candidate of every front; the lowest score of a front is selected.
 
-    label: what the score is called in tables.
+    label: name of the score in tables.
     """
 
     @property
@@ -40,16 +40,16 @@ class Selection(Protocol):
 
 
 def selected(front: ParetoFront, scores: Float[np.ndarray, " candidates"]) -> Candidate:
-    """The candidate of least score; of several, the smallest."""
+    """The candidate of least score; of several, the one with fewest terms."""
     return front.candidates[int(np.argmin(scores))]
 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """What a rule decides that weighs whole systems of equations, with coefficients of its own.
+    """Result of a rule that judges whole systems of equations and refines the coefficients.
 
-    scores: per front, one per candidate, the winner's the least. model: the winner refined, with
-    the covariance of its coefficients. note: how it was decided, in words.
+    scores: for each front, one per candidate, the winner's the least. model: the winner refined,
+    with the covariance of its coefficients. note: how it was decided, in words.
     """
 
     scores: Sequence[Float[np.ndarray, " _candidates"]]
@@ -61,9 +61,9 @@ class Decision:
 class SystemSelection(Protocol):
     """A rule that judges combinations of candidates, one per equation, and refines the winner.
 
-    library: of the candidates' terms. runs: that systems are judged by. relations: between
-    coefficients; they hold in every system that is judged. progress: told of the systems that are
-    tried. label: what the score is called in tables.
+    library: of the candidates' terms. runs: the data that systems are judged on. relations: between
+    coefficients; they hold in every system that is judged. progress: notified of the systems that
+    are tried. label: name of the score in tables.
     """
 
     @property
@@ -90,7 +90,7 @@ def score_candidates(
     library: Library,
     runs: Sequence[Trajectory],
 ) -> list[Float[np.ndarray, " _candidates"]]:
-    """Scores by a rule of either kind: of candidates one by one, or of whole systems of them."""
+    """Scores by a rule of either kind, of single candidates or of whole systems."""
     if isinstance(rule, SystemSelection):
         return rule.scores(fronts, library, runs)
     return rule.scores(fronts)
@@ -119,10 +119,10 @@ def joint_scores(
 ) -> list[Float[np.ndarray, " _candidates"]]:
     """Scores of candidates from the errors of their combinations.
 
-    limit: errors up to there cannot be told from the least; of these the combination of fewest
+    limit: errors up to this value cannot be told from the least; of these the combination of fewest
     terms wins, unless `winner` names another. A candidate's score is the least error of all
-    combinations with it, no less than the limit, and MAX_ERROR without any; the winner's are a
-    hair below.
+    combinations with it, no less than the limit, or MAX_ERROR if there are none. The winner's
+    candidates score marginally below the limit.
     """
     winner = smallest(fronts, places, errors, limit=limit) if winner is None else winner
     scores = np.maximum(errors, limit)
@@ -140,7 +140,7 @@ def smallest(
     *,
     limit: float,
 ) -> int:
-    """Of the combinations with errors up to the limit, that of fewest terms, and least error."""
+    """Index of the combination of fewest terms, then least error, among errors up to the limit."""
     n_terms = sum(f.sizes[k] for f, k in zip(fronts, places.T, strict=True))
     return int(np.lexsort((errors, n_terms, errors > limit))[0])
 
@@ -158,9 +158,9 @@ def admissible(
     places: Int[np.ndarray, "combinations fronts"],
     relations: Sequence[Relation],
 ) -> Int[np.ndarray, "_ fronts"]:
-    """The combinations that have the terms that the relations name.
+    """Combinations that have the terms named by the relations.
 
-    Raises ValueError where none has.
+    Raises ValueError if there are none.
     """
     kept = [binding(relations, support_of(fronts, choice)) is not None for choice in places]
     if not any(kept):

@@ -1,4 +1,4 @@
-"""Candidates as systems of equations, the records that they are judged by, and folds of these."""
+"""Systems of equations made of candidates, the records to judge them on, and folds of these."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ep2sindy.regression.front import ParetoFront
 from ep2sindy.selection.rule import support_of
 from ep2sindy.signals.kalman import KalmanSmoother
 
-# Steps of all windows of all systems that are refined together: more leave the cache.
+# Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
 BATCH_STEPS = 6000
 
 
 @dataclass(frozen=True, eq=False)
 class TrialSystem:
-    """One candidate per equation as a model whose coefficients obey the constraint."""
+    """A model of one candidate per equation, with the constraint that its coefficients obey."""
 
     model: SparseModel
     constraint: Constraint
@@ -43,11 +43,11 @@ class TrialSystem:
         n_reweights: int = 1,
         seed: int = 0,
     ) -> SparseModel:
-        """Refined on windows spread over all the data, with the covariance of its coefficients.
+        """Refine on windows spread over all the data, with the covariance of the coefficients.
 
-        window: None takes one and a half periods. n_windows, n_reweights, and seed for its rng,
-        as for `refine`. A system without terms, or one whose refinement does not stay finite,
-        comes back as it is, without covariance.
+        window: in samples; None takes one and a half periods. n_windows, n_reweights and seed: as
+        for `refine`. A system without terms, or one whose refinement does not stay finite, is
+        returned unchanged, without covariance.
         """
         if not len(self.constraint.free):
             return self.model
@@ -70,7 +70,7 @@ def systems_of(
     runs: Sequence[Trajectory],
     relations: Sequence[Relation] = (),
 ) -> list[TrialSystem]:
-    """Every combination as a system, in the units of the runs."""
+    """Every combination as a system, with the units of the runs."""
     units = runs[0].units if runs else {}
     return [_system(fronts, choice, library, units, relations) for choice in places]
 
@@ -82,7 +82,7 @@ def _system(
     units: Mapping[str, str],
     relations: Sequence[Relation],
 ) -> TrialSystem:
-    """A combination: free coefficients from the candidates, the others as the relations say."""
+    """System of one combination: free coefficients as found, the others by the relations."""
     states = [front.equation for front in fronts]
     chosen = [front.candidates[k] for front, k in zip(fronts, choice, strict=True)]
     coef = coef_matrix(library, [candidate.coef_by_term for candidate in chosen])
@@ -95,10 +95,10 @@ def _system(
 
 
 def budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:
-    """How long to refine systems that are to be judged, and how many together.
+    """Refinement method for systems to be judged, and how many to refine together.
 
-    The regression's coefficients are close: whole windows at once, and few iterations. Those
-    that need more are the wrong ones.
+    The regression's coefficients are close, so whole windows are fitted at once in few iterations.
+    Systems that need more are the wrong ones.
     """
     method = MultipleShooting(first_block=batch.data.shape[1], tolerance=1e-3, max_iter=10)
     return method, max(1, BATCH_STEPS // batch.steps.size)
@@ -106,14 +106,14 @@ def budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:
 
 @dataclass(frozen=True, eq=False)
 class Records:
-    """The trajectories that equations are judged by, and their states smoothed."""
+    """The trajectories to judge equations on, with smoothed states."""
 
     runs: Sequence[Trajectory]
     smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
 
 
 def records_of(fronts: Sequence[ParetoFront], runs: Sequence[Trajectory]) -> Records:
-    """The runs that systems are judged by, states in the order of the fronts.
+    """The runs with smoothed states, the states in the order of the fronts.
 
     Raises ValueError for no runs, or a state without a front.
     """
@@ -130,7 +130,7 @@ def records_of(fronts: Sequence[ParetoFront], runs: Sequence[Trajectory]) -> Rec
 
 @dataclass(frozen=True)
 class Stretch:
-    """Samples start to stop (exclusive) of one of the runs."""
+    """The samples from start to stop (exclusive) of one run."""
 
     run: int
     start: int
@@ -139,7 +139,7 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """What is held out of the runs, and the pieces of them that are left."""
+    """The held-out parts of the runs, and the remaining pieces, which are fitted."""
 
     held: Sequence[Stretch]
     fitted: Sequence[Stretch]
@@ -154,7 +154,7 @@ class Fold:
         n_windows: int,
         rng: np.random.Generator,
     ) -> WindowBatch:
-        """Windows of the pieces that are left, no longer than the longest piece."""
+        """Windows of the pieces that are fitted, no longer than the longest piece."""
         pieces = [runs[part.run].window(part.start, part.stop) for part in self.fitted]
         longest = max(piece.n_samples for piece in pieces)
         return cut_windows(
@@ -168,7 +168,7 @@ class Fold:
 
 
 def folds_of(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
-    """Every run in turn where there are enough, else every run cut in blocks.
+    """Fold by whole runs if there are enough; otherwise cut every run into blocks.
 
     Raises ValueError for runs too short to be cut.
     """
