@@ -119,7 +119,7 @@ class Study:
     def _searched(
         self, field: xr.Dataset, search: PointSearch, kept: Kept, run: Run
     ) -> tuple[xr.Dataset, int]:
-        """The result, continued from a broken run if any, and the number of points from that run."""
+        """The result, continued from a broken run if any, and number of points from that run."""
         blocks = blocks_of(field, self.block_points)
         n_before = sum(block.n_points for block in blocks if kept.holds(block))
         n_points = sum(block.n_points for block in blocks)
