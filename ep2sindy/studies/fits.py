@@ -329,9 +329,9 @@ def _or_verdict(run: FreeRun, text: str) -> str:
 
 
 def evaluation_summary(judged: Evaluation) -> dict[str, Any]:
-    """Results of the run from the first sample; those by state are for the first state.
+    """Summary of the run from the first sample: f_kHz, f_error, nrmse, amplitude_ratio.
 
-    f_kHz, f_error, nrmse, amplitude_ratio and more.
+    Quantities by state are those of the first state.
     """
     return model_summary(judged.model) | facts(judged, METHOD)
 
