@@ -1,1 +1,1 @@
-"""The program: from a command line to a run folder. The one room that knows Hydra."""
+"""The program, from a command line to a run folder. Only this package imports Hydra."""

@@ -1,6 +1,6 @@
-"""`ep2sindy compare RUN RUN ...`: run folders side by side, on the terminal and as a page.
+"""`ep2sindy compare RUN RUN ...`: compare run folders on the terminal and on a page.
 
-A run folder is read again first: its summary, provenance, settings and models.
+The module first reads each run folder: its summary, provenance, settings and models.
 """
 
 from __future__ import annotations
@@ -39,14 +39,17 @@ NOTE = (
     "the term is not in the model, or its interval is not known."
 )
 
-# What a page is made of.
+# Entries of the files that a page needs, with their types.
 SUMMARY = {"experiment": str, "seed": int, "headline": dict, "warnings": list, "data": dict}
 PROVENANCE = {"commit": str, "versions": dict}
 REQUIRED = {"experiment", "seed"}
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Raises ValueError for a folder that holds no run, or a template that is missing."""
+    """Compare the run folders named on the command line.
+
+    Raises ValueError for a folder that holds no run, or a template that is missing.
+    """
     parser = argparse.ArgumentParser("ep2sindy compare", description=ABOUT)
     parser.add_argument("run", nargs="+", help="run folder; two or more")
     parser.add_argument("--page", default="compare.html", help="where the page goes")
@@ -66,7 +69,7 @@ def main(arguments: Sequence[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ReadRun:
-    """A run folder, read. settings: by dotted place. label: what tables call it."""
+    """The contents of a run folder. settings: by dotted place. label: the run's name in tables."""
 
     folder: Path
     label: str
@@ -77,20 +80,20 @@ class ReadRun:
 
     @property
     def clock(self) -> Clock:
-        """The unit that its times are read in."""
+        """The time unit in which the run is shown."""
         return Clock.of(self.summary.get("data", {}).get("time_unit", "s"))
 
     @property
     def headline(self) -> dict[str, float]:
-        """A figure that was not a number stands as null in the file."""
+        """The headline figures; null in the file becomes NaN."""
         found = self.summary.get("headline", {})
         return {name: float("nan") if v is None else float(v) for name, v in found.items()}
 
 
 def read_run(folder: Path, number: int) -> ReadRun:
-    """A run that came to its end. number: from zero; its label is A, B, ...
+    """Read a completed run. number: from zero; it gives the label A, B, ...
 
-    Raises ValueError for a folder that is none, or a run that ended early.
+    Raises ValueError for a folder that is not a run, or a run that ended early.
     """
     if not folder.is_dir():
         raise ValueError(f"a run is a folder: {folder} is not there; {_nearby(folder)}")
@@ -114,7 +117,7 @@ def read_run(folder: Path, number: int) -> ReadRun:
 
 
 def _checked(path: Path, kinds: Mapping[str, Any]) -> dict[str, Any]:
-    """An object of JSON whose keys hold what a page makes of them."""
+    """A JSON object, checked for the keys and types that a page needs."""
     with _damage_named(path):
         found = read_json(path.read_text("utf-8"))
         if not isinstance(found, dict) or not REQUIRED & {*kinds} <= {*found}:
@@ -130,7 +133,7 @@ def _checked(path: Path, kinds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
-    """By dotted place."""
+    """The run's settings by dotted place."""
     with _damage_named(path):
         check_yaml(path)
         config: Any = OmegaConf.to_container(OmegaConf.load(path))
@@ -148,7 +151,7 @@ def _damage_named(path: Path) -> Iterator[None]:
 
 
 def _nearby(folder: Path) -> str:
-    """Runs that there are: below the folder itself, beside it, or where outputs go."""
+    """Runs found below the folder, beside it, or in the output folder, for an error message."""
     for place in (folder, folder.parent, Path("outputs")):
         found = sorted(path.parent for path in place.glob("**/summary.json"))[-3:]
         if found:
@@ -157,12 +160,15 @@ def _nearby(folder: Path) -> str:
 
 
 def link_to(run: ReadRun, beside: Path) -> str:
-    """The run's page, as a page in this folder reaches it."""
+    """Link to the run's page, relative to this folder."""
     return os.path.relpath(run.folder / "report.html", beside)
 
 
 def compare_runs(runs: Sequence[ReadRun], *, beside: Path) -> list[Section]:
-    """Runs, settings that differ, headline figures, equations, figures. beside: of the page."""
+    """Sections on runs, differing settings, headline figures, equations and figures.
+
+    beside: folder of the page.
+    """
     return [
         Section("Runs", [_runs(runs, beside), *_versions(runs)]),
         Section("Settings that differ", [_differing(_settings(runs), "setting", "the same")]),
@@ -188,7 +194,7 @@ def _runs(runs: Sequence[ReadRun], beside: Path) -> Table:
 
 
 def _versions(runs: Sequence[ReadRun]) -> list[Block]:
-    """Of packages, where they differ."""
+    """Versions of packages, if they differ."""
     versions = {run.label: run.provenance.get("versions", {}) for run in runs}
     table = _differing(versions, "package", "")
     return [table] if isinstance(table, Table) else []
@@ -199,7 +205,7 @@ def _settings(runs: Sequence[ReadRun]) -> dict[str, Mapping[str, Any]]:
 
 
 def _differing(values: Mapping[str, Mapping[str, Any]], heading: str, none: str) -> Block:
-    """A row per name whose value is not everywhere the same; a word where there is none."""
+    """One row per name whose value differs between runs; a sentence if none differs."""
     names = dict.fromkeys(name for each in values.values() for name in each)
     rows = []
     for name in names:
@@ -210,7 +216,7 @@ def _differing(values: Mapping[str, Mapping[str, Any]], heading: str, none: str)
 
 
 def _headlines(runs: Sequence[ReadRun]) -> Table:
-    """In words; of two runs also by how much the second is off the first."""
+    """Headline figures by name; for two runs also the second's difference from the first."""
     names = dict.fromkeys(name for run in runs for name in run.headline)
     rows = []
     for name in names:
@@ -224,7 +230,7 @@ def _headlines(runs: Sequence[ReadRun]) -> Table:
 
 
 def _change(before: float, after: float) -> str:
-    """`+2.1 %`, or the difference of what is small or changes sign; a dash for what is unknown."""
+    """`+2.1 %`, or the difference for large changes and changes of sign; a dash if unknown."""
     change = after - before
     if change != change or change == 0.0:
         return "0" if change == 0.0 else "-"
@@ -234,7 +240,7 @@ def _change(before: float, after: float) -> str:
 
 
 def _models(runs: Sequence[ReadRun]) -> list[Section]:
-    """Of every name, the equations of all runs, and their coefficients beside each other."""
+    """For every model name, the equations of all runs and their coefficients side by side."""
     found, clocks = [], {run.clock for run in runs}
     clock = clocks.pop() if len(clocks) == 1 else SECONDS
     for name in dict.fromkeys(name for run in runs for name in run.models):
@@ -255,7 +261,7 @@ def _models(runs: Sequence[ReadRun]) -> list[Section]:
 
 
 def _coefficients(models: Mapping[str, SparseModel], clock: Clock) -> pd.DataFrame:
-    """A row per state and term that any of the models has, per unit of the clock."""
+    """One row per state and term of any of the models, per time unit of the clock."""
     rows = []
     for state in dict.fromkeys(s for model in models.values() for s in model.states):
         own = {n: m.terms(state) if state in m.states else {} for n, m in models.items()}
@@ -296,7 +302,7 @@ def _pictures(runs: Sequence[ReadRun]) -> list[Section]:
 
 
 def figures_of(runs: Sequence[ReadRun]) -> dict[str, Drawn]:
-    """As their folders have them."""
+    """Figures by name, from the runs' folders."""
     return {
         f"{run.label}-{name}": read_png(run.folder / "figures" / f"{name}.png", f"Run {run.label}.")
         for name in _shared_figures(runs)

@@ -1,4 +1,4 @@
-"""`ep2sindy inspect PATH ...`: what files hold, and a config of the data group for them."""
+"""`ep2sindy inspect PATH ...`: contents of files, and a config of the data group for them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ABOUT = """Says what files hold: variables, shapes, units, ranges, what looks li
 and what is missing for which experiment. Several files, or a pattern in quotes, are several
 records of one kind."""
 
-# Variables that experiments on files need beside time; those that take any need none of ours.
+# Variables that experiments on files need besides time; generic experiments need none.
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "breathing": ("n_i", "n_n", "R_ion", "u_iz"),
     "weak": ("n_i", "n_n"),
@@ -37,9 +37,9 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
 
 
 def main(arguments: Sequence[str], conf: Path) -> None:
-    """conf: the package's configs.
+    """Inspect files and write a config for them. conf: the folder of the package's configs.
 
-    Raises ValueError as `ep2sindy.inspect_file` does, and for a config that is there already.
+    Raises ValueError as `ep2sindy.inspect_file` does, and for a config that exists already.
     """
     parser = argparse.ArgumentParser("ep2sindy inspect", description=ABOUT)
     parser.add_argument("path", nargs="+", help="file, folder.zarr or pattern")
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
 
 
 def experiments(found: Inspection) -> list[str]:
-    """A line for those that can be run, and one for those that lack the same variables."""
+    """One line on the experiments that can be run, and one for each set of missing variables."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for name, needed in NEEDS.items():
         groups.setdefault(found.lacking(needed), []).append(f"+exp={name}")
@@ -78,7 +78,7 @@ def experiments(found: Inspection) -> list[str]:
 
 
 def own_config(name: str, conf: Path) -> Path:
-    """Where a config of the data group goes that is found from here; no file is overwritten."""
+    """Path for a new config of the data group that is found from here; no file is overwritten."""
     path = Path("conf") / "data" / f"{name}.yaml"
     if (conf / "data" / path.name).is_file() and conf.resolve() != Path("conf").resolve():
         raise ValueError(f"the package has data={name} itself: choose another, --write NAME")
@@ -88,7 +88,7 @@ def own_config(name: str, conf: Path) -> Path:
 
 
 def config_text(found: Sequence[Inspection], paths: Sequence[str]) -> str:
-    """The config of the data group, with a word wherever something was only likely."""
+    """The config of the data group, with a comment on every entry that is only likely."""
     first = found[0]
     variables = {n: Variable(None, u) for n, u in {**KNOWN_UNITS, "T_e_eV": "eV"}.items()}
     variables |= first.variables
@@ -122,14 +122,14 @@ def _node(variable: Variable) -> dict[str, Any]:
 
 
 def _flow(value: Any) -> str:
-    """YAML on one line that Hydra reads back as it is: text that could mean more is quoted."""
+    """A value as YAML on one line that Hydra reads back unchanged; ambiguous text is quoted."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_flow, value)) + "]"
     if not isinstance(value, str):
         return "null" if value is None else repr(value)
-    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)  # what Hydra would replace
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)  # Hydra would interpolate it
     if in_line(text) != text:
         return yaml.safe_dump(text, default_style='"', width=float("inf")).strip()
     is_plain = re.fullmatch(r"[\w./^-]+", text) and yaml.safe_load(text) == text
@@ -141,7 +141,7 @@ def _word(found: Inspection, name: str) -> str:
 
 
 def commands(found: Inspection, name: str) -> list[str]:
-    """What can be run with it, with a word in capitals for what only the user knows."""
+    """Commands that can be run with the config; placeholders in capitals are for the user."""
     data = [f"data={name}"]
     if found.time is None and found.dt_s is None:
         data.append("data.dt_s=STEP")

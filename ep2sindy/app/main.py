@@ -1,6 +1,7 @@
-"""Where the command line begins: `ep2sindy`, `python -m experiments.run`.
+"""Entry point of the command line: `ep2sindy`, `python -m experiments.run`.
 
-Nothing else is imported before the current folder, which may be anybody's, is off the path.
+The current folder, which may be untrusted, is removed from the path before anything else is
+imported.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
-`ep2sindy compare RUN RUN` sets run folders side by side instead.
-`ep2sindy inspect PATH` looks into files instead, and `ep2sindy warm` compiles what is compiled
-once after installation.
+`ep2sindy compare RUN RUN` compares run folders instead. `ep2sindy inspect PATH` inspects files,
+and `ep2sindy warm` compiles, once after installation, all that needs compiling.
 
 Only Hydra is imported here: `--help` must not wait for the numerics.
 """
@@ -40,15 +39,15 @@ USUAL_WARNING = warnings.formatwarning
 
 
 def run() -> None:
-    """Errors of the user's making end in one message; all others keep their traceback."""
-    gc.set_threshold(100_000, 50, 100)  # imports make many objects, and all of them stay
-    atexit.register(gc.freeze)  # to look through them all once more at the end takes a second
+    """Run the command line; user errors end in one message, all others keep their traceback."""
+    gc.set_threshold(100_000, 50, 100)  # imports make many objects that are never freed
+    atexit.register(gc.freeze)  # a last collection over all of them takes a second
     sys.excepthook, warnings.formatwarning = _print_error, _warning_text
     end_as_interrupted()
     start_on_one_thread()
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come here: Hydra would print its own words
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are reported here, not in Hydra's words
     sweeps: list[Path] = []
-    failed: list[str] = []  # told at the end: an error that left a job would be told by Hydra too
+    failed: list[str] = []  # reported at the end: Hydra too would report an error that left a job
     try:
         conf = conf_folder()
         if command(sys.argv[1:], conf):
@@ -85,7 +84,7 @@ def run() -> None:
 
 @contextmanager
 def said_as_text() -> Iterator[None]:
-    """What Hydra prints instead of a run, such as names of configs for --help, is said as text."""
+    """Print text that Hydra writes instead of a run, such as config names for --help, safely."""
     given, _ = get_args_parser().parse_known_args()
     if not (given.help or given.hydra_help or given.cfg or given.info):
         yield
@@ -99,7 +98,7 @@ def said_as_text() -> Iterator[None]:
 
 
 def _print_error(*error: Any) -> None:
-    """As Python does, but for what would steer a terminal."""
+    """Print an error as Python does, without characters that would control the terminal."""
     print(plain("".join(traceback.format_exception(*error))), end="", file=sys.stderr)
 
 
@@ -111,7 +110,7 @@ def _warning_text(
 
 
 def command(arguments: Sequence[str], conf: Path) -> bool:
-    """Whether the first argument names a command, which has been carried out then."""
+    """Carry out the command that the first argument names; returns whether it names one."""
     name, rest = "".join(arguments[:1]), arguments[1:]
     if name == "compare":
         from ep2sindy.app.compare import main as compare_runs
@@ -129,7 +128,7 @@ def command(arguments: Sequence[str], conf: Path) -> bool:
 
 
 def conf_folder() -> Path:
-    """The package's configs: beside it in a checkout, inside it where it is installed."""
+    """Folder of the package's configs: beside it in a checkout, inside it when installed."""
     places = (PACKAGE.parent / "conf", PACKAGE / "conf")
     for place in places:
         if (place / "config.yaml").is_file():
@@ -141,7 +140,7 @@ def conf_folder() -> Path:
 
 
 def prepare_arguments(conf: Path) -> None:
-    """Flags may stand anywhere, and configs in ./conf are found as with `--config-dir ./conf`."""
+    """Allow flags anywhere, and add ./conf to the configs as `--config-dir ./conf` would."""
     flags = [text for text in sys.argv[1:] if text in ("-m", "--multirun")]
     sys.argv[1:] = [*flags, *(text for text in sys.argv[1:] if text not in flags)]
     primary = ("--config-path", "-cp", "--config-name", "-cn")
@@ -157,7 +156,7 @@ def prepare_arguments(conf: Path) -> None:
 
 
 def run_job(config: DictConfig, conf: Path) -> list[str]:
-    """One run, and why it ended early, if it did; a sweep notes that and goes on."""
+    """Run one job; returns why it ended early, if it did. A sweep notes that and goes on."""
     with note_job() as (done, ended_early):
         try:
             if config.experiment is None:
@@ -168,7 +167,7 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
                 )
             typed = HydraConfig.get().overrides.task
             check_places(resolved(config), typed)
-            say(first_word(config))  # what follows takes seconds to load
+            say(first_word(config))  # the imports below take seconds
             from ep2sindy.app.runner import run_config
 
             finished = run_config(config, overrides=typed)
@@ -184,10 +183,10 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
 def note_job() -> Iterator[
     tuple[Callable[[Path, Mapping[str, float]], None], Callable[[BaseException], None]]
 ]:
-    """In a sweep: say which job begins, and note how it ended; otherwise do nothing.
+    """In a sweep, report each job's begin and note its end; otherwise do nothing.
 
-    The first of what comes is told the run folder and the headline figures of a job that came to
-    its end, the second the error of one that did not.
+    Yields two callbacks: the first takes the run folder and headline figures of a completed job,
+    the second takes the error of a job that failed.
     """
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         yield (lambda folder, headline: None), (lambda error: None)
@@ -210,18 +209,18 @@ def note_job() -> Iterator[
         ended_early(error)
         raise
     finally:
-        from ep2sindy.app.sweep import note_end  # pandas and more, when a job has ended
+        from ep2sindy.app.sweep import note_end  # loads pandas, only when a job has ended
 
         note_end(sweep, record)
 
 
 def first_word(config: DictConfig) -> str:
-    """What a run is, and where it will write."""
+    """First line of a run's output: what it runs, and its output folder."""
     folder = Path(str(config.get("output")), str(config.experiment))
     return f"{config.experiment}: loading study={config.get('study')}; writes below {folder}/"
 
 
 def list_experiments(conf: Path) -> str:
-    """Experiments that there are to choose from."""
+    """Text that lists the available experiments."""
     folders = {conf, Path.cwd() / "conf"}
     return ", ".join(sorted({path.stem for each in folders for path in each.glob("exp/*.yaml")}))

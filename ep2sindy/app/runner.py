@@ -1,4 +1,4 @@
-"""One runner for all studies: folder, log, TensorBoard, tables, figures, page and summary."""
+"""The runner of all studies: folder, log, TensorBoard, tables, figures, page and summary."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from ep2sindy.trust.user_code import load_user_module
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that came to its end: where it lies, and the numbers it is compared by."""
+    """A completed run: its folder, and its headline figures."""
 
     folder: Path
     headline: Mapping[str, float]
 
 
 def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished:
-    """Build the study that a config names, compute it, and write all that it leaves.
+    """Build the study that a config names, compute it, and write its outcome.
 
-    overrides: what was set on the command line; one that the study does not use is an error.
+    overrides: settings from the command line; one that the study does not use is an error.
     """
     check_common(config)
     formats = formats_of(config)
@@ -54,7 +54,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
         kind = study_class(config.get("study"))
         advance(1)
         check_overrides(overrides, used=keys_of(kind), experiment=config.experiment)
-        study: Experiment = study_of(kind, config)  # a setting that cannot be leaves no run folder
+        study: Experiment = study_of(kind, config)  # an invalid setting leaves no run folder
         advance(1)
     warm()
     with start_run(config) as run:
@@ -64,9 +64,10 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
 
 
 def study_class(name: object) -> type:
-    """The class `Study` of a module of `ep2sindy.studies`, or of one's own by its dotted name.
+    """The class `Study` of a module of `ep2sindy.studies`, or of a user's module by dotted name.
 
-    A folder holds it in its module `study`. One's own lies below the current folder.
+    If the name is a folder, its module `study` holds the class. A user's module must lie below the
+    current folder.
     """
     text = str(name)
     inside = "." not in text or text.startswith("ep2sindy.")
@@ -80,7 +81,7 @@ def study_class(name: object) -> type:
         return found.Study
     except (ModuleNotFoundError, AttributeError) as error:
         if isinstance(error, ModuleNotFoundError) and not module.startswith(str(error.name)):
-            raise  # the module is there, but one that it needs is not
+            raise  # the module exists, but one of its imports is missing
         raise ValueError(
             f"study must name a module of ep2sindy.studies that has a class Study, one of "
             f"{list_studies()}, or one of your own as package.module, below the folder that you "
@@ -89,7 +90,7 @@ def study_class(name: object) -> type:
 
 
 def list_studies() -> list[str]:
-    """Modules of the room that define a study; read as text, for importing them takes seconds."""
+    """Modules of `studies` that define a study; they are read as text, as imports take seconds."""
     folder = Path(ep2sindy.studies.__file__ or "").parent
     found = []
     for module in iter_modules([str(folder)]):
@@ -100,7 +101,7 @@ def list_studies() -> list[str]:
 
 
 def check_common(config: DictConfig) -> None:
-    """Raise ValueError for a seed, a name or a folder that cannot be."""
+    """Raise ValueError for an invalid seed, name or folder."""
     if not isinstance(config.seed, int) or isinstance(config.seed, bool) or config.seed < 0:
         raise ValueError(f"seed must be a whole number, zero or more: {config.seed!r} came")
     if not str(config.experiment).isidentifier():
@@ -111,9 +112,9 @@ def check_common(config: DictConfig) -> None:
 
 
 def formats_of(config: DictConfig) -> list[str]:
-    """The files that are made of each figure, png among them, which pages are made of.
+    """File formats of the figures; they must include png, which pages use.
 
-    Raises ValueError for another list.
+    Raises ValueError for an invalid list.
     """
     given: Any = OmegaConf.select(config, "figures.formats", default=["png"])
     formats = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
@@ -126,7 +127,7 @@ def formats_of(config: DictConfig) -> list[str]:
 
 
 def check_overrides(overrides: Iterable[str], *, used: Collection[str], experiment: str) -> None:
-    """Raise ValueError for a key of conf/config.yaml that was set but that a study does not use."""
+    """Raise ValueError for a key of conf/config.yaml that was set but is not used by the study."""
     for text in overrides:
         key = re.split(r"[.=@]", text.lstrip("+~/"))[0]
         if key in set(GROUPS) - set(used):
@@ -157,7 +158,7 @@ def start_run(config: DictConfig) -> Iterator[Run]:
 def write(
     run: Run, outcome: Outcome, study: Experiment, formats: Sequence[str] = ("png",)
 ) -> dict[str, float]:
-    """Everything of an outcome into the run folder; what no view may lose comes first."""
+    """Write an outcome into the run folder; models and tables first, as views may fail."""
     folder, models = run.folder, outcome.models()
     for name, model in models.items():
         folder.write_model(name, model)
@@ -181,7 +182,7 @@ def write(
 
 
 def about(run: Run, study: Experiment) -> About:
-    """What its page says of a run beside its results."""
+    """Information on a run for its page, besides the results."""
     purpose = (type(study).__doc__ or "").split("\n\n")[0].replace("\n", " ")
     return About(
         purpose=" ".join(purpose.split()),
@@ -194,7 +195,7 @@ def about(run: Run, study: Experiment) -> About:
 
 
 def hparams_of(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """The settings by which runs are told apart: each by its dotted place, groups by their name."""
+    """Settings that distinguish runs: each by its dotted place, groups by their name."""
     found: dict[str, Any] = {"seed": settings["seed"]}
     for key in sorted({*keys} & {*settings} - {*ASIDE}):
         found |= by_place(key, settings[key])

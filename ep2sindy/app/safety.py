@@ -1,9 +1,10 @@
-"""What files may not say: a config may come from anybody.
+"""Checks on what config files may set, since a config may come from an untrusted source.
 
-Below `hydra:` one can name callbacks, log handlers, the shell lines of a cluster job, variables
-of the environment and folders to write to: that is obeyed from the command line alone. Folders for
-runs and caches that lie elsewhere, and schedulers, whose answers are trusted, are typed as well.
-What a file asks for is counted before it is written out.
+Keys below `hydra:` can name callbacks, log handlers, the shell lines of a cluster job, variables
+of the environment and folders to write to; they are accepted from the command line alone. Folders
+for runs and caches outside the current folder must be typed as well, and so must schedulers, whose
+answers are trusted. The size of a file's content is computed before anchors and references are
+expanded.
 """
 
 from __future__ import annotations
@@ -27,32 +28,33 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-FOLDERS = ("output", "keep", "cache")  # keys, at any depth, of what a run writes to
+FOLDERS = ("output", "keep", "cache")  # keys, at any depth, of folders that a run writes to
 SERVERS = ("address",)
-# What Hydra itself notes of a run, and nobody obeys.
+# Hydra's own notes on a run, which have no effect.
 NOTED = ("runtime.choices", "runtime.config_sources", "job.override_dirname")
-# What nobody may set, for it names what is called or made.
+# Settings that nobody may change, as they name what is called or created.
 SILENT = {"version": 1, "root": {"level": "ERROR"}, "disable_existing_loggers": True}
 FIXED: Mapping[str, Any] = {"callbacks": {}, "job_logging": SILENT, "hydra_logging": SILENT}
 
-MAX_VALUES = 100_000  # of one file, with all that its anchors stand for
-MAX_CHARACTERS = 1_000_000  # of one setting, with all that its references stand for
+MAX_VALUES = 100_000  # values in one file, with its anchors expanded
+MAX_CHARACTERS = 1_000_000  # characters of one setting, with its references expanded
 
 BRACES = re.compile(r"\$\{(.*)\}", re.DOTALL)
 WORD = re.compile(r"[^\s.,:$'\"(){}\[\]]+")
 
 
 class CheckedLoader(ConfigLoaderImpl):
-    """Hydra's loader of configs, which looks at each before anything of it is obeyed.
+    """Hydra's loader of configs, which checks each config before any of it takes effect.
 
-    What is typed is told from what files say by composing once more without the folders: a file
-    reaches `hydra:` by keys, packages, defaults and names of groups, and the result knows them all.
+    To separate typed settings from those of files, it composes once more without the users'
+    folders. A file can reach `hydra:` by keys, packages, defaults and group names; the composed
+    result shows all of these.
     """
 
     def __init__(self, config_search_path: ConfigSearchPath) -> None:
         super().__init__(config_search_path)
         self.repository = CheckedFiles(config_search_path)
-        self._without_files: dict[tuple[Any, ...], DictConfig] = {}  # jobs of a sweep share it
+        self._without_files: dict[tuple[Any, ...], DictConfig] = {}  # shared by the jobs of a sweep
 
     def load_configuration(
         self,
@@ -64,21 +66,21 @@ class CheckedLoader(ConfigLoaderImpl):
     ) -> DictConfig:
         hydras = [text for text in overrides if re.match(r"[+~]*hydra[./=]", text)]
         typed = partial(self._typed, config_name, hydras, run_mode, from_shell)
-        if not validate_sweep_overrides:  # Hydra asks for its mode alone, before it composes
+        if not validate_sweep_overrides:  # Hydra asks for the mode only, before composing
             return typed() if hydras else OmegaConf.create({"hydra": {"mode": None}})
         found = super().load_configuration(config_name, overrides, run_mode, from_shell)
         tasks = [text for text in overrides if text not in hydras]
         check_hydra(_settings(found), _settings(typed()) | {"overrides.task": tasks})
         check_references(_written(found))
-        if "output" in found:  # Hydra makes a sweep's folder in it; all others a job looks at, for
-            check_output(found)  # not before it begins can all that a config says be resolved
+        if "output" in found:  # Hydra makes a sweep's folder in it. A job checks the others:
+            check_output(found)  # only once it begins can the whole config be resolved
             check_places([("output", found.output)], overrides)
         return found
 
     def _typed(
         self, config_name: str | None, hydras: list[str], run_mode: RunMode, from_shell: bool
     ) -> DictConfig:
-        """What the command line and the package say without files from elsewhere."""
+        """Settings of the command line and the package, without files from elsewhere."""
         key = (run_mode, *hydras)
         if key not in self._without_files:
             loader = _without_folders(self, hydras)
@@ -89,9 +91,9 @@ class CheckedLoader(ConfigLoaderImpl):
 
 
 def _without_folders(loader: ConfigLoaderImpl, hydras: Sequence[str]) -> ConfigLoaderImpl:
-    """A loader of the package's and Hydra's own configs, for a folder may hold some of their names.
+    """A loader of the package's and Hydra's configs only, as a folder may reuse their names.
 
-    With a group of Hydra's on the command line, such as a launcher, folders are trusted with it.
+    If the command line names a group of Hydra's, such as a launcher, the folders are trusted too.
     """
     path = deepcopy(loader.config_search_path)
     if not any("/" in text.partition("=")[0] for text in hydras):
@@ -101,7 +103,7 @@ def _without_folders(loader: ConfigLoaderImpl, hydras: Sequence[str]) -> ConfigL
 
 @contextmanager
 def checked_loader() -> Iterator[None]:
-    """Within, Hydra's program composes no config that has not been checked."""
+    """A context in which Hydra composes only configs that have been checked."""
     before = program.ConfigLoaderImpl
     program.ConfigLoaderImpl = CheckedLoader  # type: ignore[misc]
     try:
@@ -113,8 +115,8 @@ def checked_loader() -> Iterator[None]:
 def check_hydra(found: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
     """Raise ValueError for a setting below `hydra` that does not come from the command line.
 
-    found: all that a config says, by dotted place. typed: what the command line and the package
-    say without it.
+    found: all settings of a config, by dotted place. typed: settings of the command line and the
+    package without that config.
     """
     for name, value in FIXED.items():
         fixed = dict(_leaves(value, name))
@@ -133,14 +135,14 @@ def check_hydra(found: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
 
 
 def check_output(config: DictConfig) -> None:
-    """Raise ValueError for an output that is no text: of a group, its text would be a folder."""
+    """Raise ValueError for an output that is not text; a group's text would become a folder."""
     output = config.get("output")
     if not isinstance(output, str) or not output:
         raise ValueError(f"output must be a folder's name: {output!r} came")
 
 
 def check_places(settings: Iterable[tuple[str, Any]], overrides: Sequence[str]) -> None:
-    """Raise ValueError for a folder elsewhere, or a server, that nobody has typed.
+    """Raise ValueError for a folder elsewhere, or a server, that was not typed.
 
     settings: plain values by their dotted place.
     """
@@ -151,7 +153,7 @@ def check_places(settings: Iterable[tuple[str, Any]], overrides: Sequence[str]) 
             continue
         for each in value if isinstance(value, list) else [value]:
             if not isinstance(each, str) or each == "???":
-                continue  # whoever takes it refuses it
+                continue  # refused where it is used
             if key in SERVERS:
                 raise ValueError(
                     f"a config must not set {place}, for what answers there is trusted: {each!r} "
@@ -165,32 +167,32 @@ def check_places(settings: Iterable[tuple[str, Any]], overrides: Sequence[str]) 
 
 
 def resolved(config: DictConfig) -> Iterator[tuple[str, Any]]:
-    """All that a config says, by dotted place, as a run will read it: text may make a group."""
+    """All settings by dotted place, resolved as a run reads them; text may become a group."""
     for key in config:
         try:
             node = config[key]
             is_group = OmegaConf.is_config(node)
             plain = OmegaConf.to_container(node, resolve=True) if is_group else node
             yield from _leaves(plain, str(key))
-        except OmegaConfBaseException:  # told better by whoever reads it; but it might be mended
-            yield from _resolved_one_by_one(config, key)  # by then, and must hide no folder
+        except OmegaConfBaseException:  # reported where it is read; but it may be valid by then,
+            yield from _resolved_one_by_one(config, key)  # so it must not hide a folder
 
 
 def _resolved_one_by_one(config: DictConfig, key: Any) -> Iterator[tuple[str, Any]]:
-    """All below a key as it is written, but folders and servers as a run will read them."""
+    """Settings below a key as written; only folders and servers are resolved as in a run."""
     for place, value in _leaves(_written(config).get(key), str(key)):
         known = place.rpartition(".")[2] in FOLDERS + SERVERS and "${" in str(value)
         yield place, OmegaConf.select(config, place) if known else value
 
 
 def _written(config: DictConfig) -> dict[str, Any]:
-    """All that a config says but Hydra's own, as it is written."""
+    """All settings of a config as written, without Hydra's own."""
     written: Any = OmegaConf.to_container(config, resolve=False)
     return {key: value for key, value in written.items() if key != "hydra"}
 
 
 def _is_typed(place: str, overrides: Sequence[str]) -> bool:
-    """Whether the command line gave a value; `data=mine` chooses a file, which is none."""
+    """Whether the command line gave a value; `data=mine` chooses a file and does not count."""
     for text in overrides:
         key, _, value = text.lstrip("+~").partition("=")
         if place == key or (place.startswith(f"{key}.") and value.strip().startswith(("{", "["))):
@@ -199,12 +201,12 @@ def _is_typed(place: str, overrides: Sequence[str]) -> bool:
 
 
 def _settings(config: DictConfig) -> dict[str, Any]:
-    """All below `hydra`, by dotted place, interpolations as they are written."""
+    """All settings below `hydra`, by dotted place, with interpolations as written."""
     return dict(_leaves(OmegaConf.to_container(config.hydra, resolve=False), ""))
 
 
 def _leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
-    """Values by their dotted place; an empty group is one."""
+    """Values by their dotted place; an empty group counts as a value."""
     dot = f"{place}." if place else ""
     if isinstance(value, Mapping) and value:
         for name, each in value.items():
@@ -217,7 +219,7 @@ def _leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
 
 
 class CheckedFiles(ConfigRepository):
-    """Hydra's folders of configs; what is wrong with a file is said with its name."""
+    """Hydra's folders of configs; errors name the file."""
 
     def load_config(self, config_path: str) -> ConfigResult | None:
         source = self._find_object_source(config_path, ObjectType.CONFIG)
@@ -237,7 +239,7 @@ class CheckedFiles(ConfigRepository):
 
 
 def check_yaml(path: Path) -> None:
-    """Raise ValueError for anchors within anchors that stand for more than anybody writes."""
+    """Raise ValueError for nested anchors that expand to an unreasonable number of values."""
     text = path.read_text("utf-8")
     if "&" not in text or "*" not in text:
         return
@@ -249,9 +251,9 @@ def check_yaml(path: Path) -> None:
 
 
 def _size(node: Any, known: dict[int, int]) -> int:
-    """Values below a node, each as often as it is written out; an anchor in itself has no end."""
+    """Number of values below a node with anchors expanded; an anchor in itself is unlimited."""
     if id(node) not in known:
-        known[id(node)] = MAX_VALUES + 1  # until it is known
+        known[id(node)] = MAX_VALUES + 1  # until it is computed
         inner = node.value if isinstance(node, yaml.CollectionNode) else []
         each = [part for pair in inner for part in (pair if isinstance(pair, tuple) else [pair])]
         known[id(node)] = 1 + sum(_size(part, known) for part in each)
@@ -259,10 +261,10 @@ def _size(node: Any, known: dict[int, int]) -> int:
 
 
 def check_references(settings: Any) -> None:
-    """Raise ValueError for references to references that stand for more than anybody writes.
+    """Raise ValueError for nested references that expand to an unreasonable length.
 
-    settings: a config's groups and values as they are written. A name in `${...}` counts as the
-    longest of the settings whose key it is, for what it stands for need not be known here.
+    settings: a config's groups and values as written. A name in `${...}` counts as the longest
+    setting with that key, since its actual target need not be known here.
     """
     most = MAX_CHARACTERS + 10 * len(str(settings))
     named: dict[str, list[Any]] = {}
@@ -280,7 +282,7 @@ def check_references(settings: Any) -> None:
 
 
 def _name(node: Any, named: dict[str, list[Any]]) -> None:
-    """Gather what stands under every key, in whatever group, and in every place of a list."""
+    """Collect the values under every key of any group, and at every position of a list."""
     inner = enumerate(node) if isinstance(node, list) else node.items()
     for key, value in inner:
         named.setdefault(str(key), []).append(value)
@@ -289,10 +291,10 @@ def _name(node: Any, named: dict[str, list[Any]]) -> None:
 
 
 def _length(node: Any, named: Mapping[str, Sequence[Any]], known: dict[int, int]) -> int:
-    """Characters of a value with its references written out; those in a circle count once."""
+    """Characters of a value with references expanded; circular references count once."""
     if id(node) in known:
         return known[id(node)]
-    known[id(node)] = 0  # until it is known
+    known[id(node)] = 0  # until it is computed
     if isinstance(node, dict | list):
         parts = list(node.values()) if isinstance(node, dict) else node
         n = len(parts) + sum(_length(part, named, known) for part in parts)

@@ -1,6 +1,7 @@
-"""From a config to a study: the study's signature is the schema of its config.
+"""Build a study from a config; the study's signature is the schema of its config.
 
-Holds the one type checker of configs, for fields of studies and arguments of `_target_`s.
+The module holds the only type checker of configs, for fields of studies and arguments of
+`_target_`s.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from ep2sindy.studies.study import Check, Deferred
 
 # Keys of conf/config.yaml that every run has.
 COMMON = ("experiment", "study", "seed", "output", "figures")
-# Fields of these types are made of groups at the top level, by what stands beside them: a method is
-# five groups. Recipe is the old way to write AnyMethod, for one version more.
+# Fields of these types are made of the top-level groups listed with them: a method is five groups.
+# Recipe is the old name of AnyMethod, for one version more.
 GATHERED: Mapping[Any, Callable[..., Any]] = {
     AnyMethod: method_of, Recipe: method_of, Source: Source,
 }  # fmt: skip
@@ -38,7 +39,7 @@ GROUPS = (
 
 
 def keys_of(study: type) -> set[str]:
-    """The top-level keys of the config that a study takes."""
+    """The top-level keys of a study's config."""
     found: set[str] = set()
     for name, kind in hints_of(study).items():
         found |= set(_groups(kind)) if kind in GATHERED else {name}
@@ -48,21 +49,21 @@ def keys_of(study: type) -> set[str]:
 def study_of(study: type, config: DictConfig) -> Any:
     """Build a study from the config.
 
-    Raises ValueError for a key that the study does not take, one that is missing, or a value of
-    another kind than the study says.
+    Raises ValueError for a key that the study does not take, a missing key, or a value whose type
+    differs from the study's.
     """
     known = {*COMMON, *GROUPS, *keys_of(study)}
     unknown = set(map(str, config)) - known
     if unknown:
         hint = ""
-        if "thruster" in unknown:  # a file of ./conf/thruster without its first line
+        if "thruster" in unknown:  # a file of ./conf/thruster that lacks its first line
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
         raise ValueError(f"unknown keys {sorted(unknown)}; there are {sorted(known)}{hint}")
     return _fill(study, _without_formats(config, has_own="figures" in keys_of(study)))
 
 
 def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:
-    """What is left to a study: `figures.formats`, the files that are made, is the runner's."""
+    """The config without `figures.formats`, the list of file formats, which the runner uses."""
     own = {name: v for name, v in (config.get("figures") or {}).items() if name != "formats"}
     if own and not has_own:
         first = f"figures.{next(iter(own))}"
@@ -74,7 +75,7 @@ def _without_formats(config: DictConfig, *, has_own: bool) -> DictConfig:
 
 
 def _fill(study: type, config: DictConfig) -> Any:
-    """A dataclass from the top level of the config."""
+    """Fill a dataclass from the top level of the config."""
     arguments = {}
     for name, kind in hints_of(study).items():
         if kind in GATHERED:
@@ -87,7 +88,7 @@ def _fill(study: type, config: DictConfig) -> Any:
 
 
 def _gather_groups(kind: Any, config: DictConfig) -> Any:
-    """A method or source from its groups: one left out (`~search`) must not turn into a default."""
+    """Build a method or source from its groups; one left out (`~search`) gets no default."""
     groups = _groups(kind)
     if lacking := [name for name in groups if name not in config]:
         raise ValueError(
@@ -100,23 +101,23 @@ def _gather_groups(kind: Any, config: DictConfig) -> Any:
 
 
 def _groups(kind: Any) -> dict[str, Any]:
-    """The groups that make a value of this kind, each with the kind that it must be."""
+    """The groups that make up a value of this type, each with its required type."""
     hints = get_type_hints(GATHERED[kind], include_extras=True)
     return {name: hint for name, hint in hints.items() if name != "return"}
 
 
-# From nodes of a config to values: the one place where a setting is held to its kind.
+# From nodes of a config to values: the only place where the type of a setting is checked.
 #
-# A setting's kind stands in the signature that it goes to: a field of a study, or an argument of
-# what a `_target_` names. Of an argument only what must be plain is checked here, for a class or
-# function says best itself what is wrong with the rest.
+# The type comes from the signature that takes the setting: a field of a study, or an argument of a
+# `_target_`. Only plain arguments are checked here, since the class or function itself reports
+# errors in the others best.
 
 
 PLAIN = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 
 
 def value_of(kind: Any, node: Any, place: str) -> Any:
-    """A value of this kind from a node of the config; place: its dotted path, for errors."""
+    """A value of this type from a node of the config. place: its dotted path, for errors."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         value = contents(node)
@@ -155,7 +156,7 @@ def _container(origin: type, parts: Sequence[Any], node: Any, place: str) -> Any
 
 
 def check_names(names: Iterable[str], place: str) -> None:
-    """Raise ValueError for a name, of what files and headings are called by, that is more."""
+    """Raise ValueError for a name that cannot serve in file names and headings."""
     for name in names:
         if not re.fullmatch(r"\w[\w .,+-]{,99}", name):
             raise ValueError(
@@ -165,7 +166,7 @@ def check_names(names: Iterable[str], place: str) -> None:
 
 
 def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
-    """A value of the first kind that it fits; the last says what is wrong."""
+    """A value of the first type that fits; if none fits, the error is that of the last."""
     if node is None and type(None) in kinds:
         return None
     kinds = [kind for kind in kinds if kind is not type(None)]
@@ -178,13 +179,13 @@ def _one_of(kinds: Sequence[Any], node: Any, place: str) -> Any:
 
 
 def _scalar(kind: Any, node: Any, place: str) -> Any:
-    """A plain value. One that names no `_target_` is never of a type that is not plain."""
+    """A plain value. A value without a `_target_` never has a type that is not plain."""
     value = check_plain((kind,), node, place)
     return float(value) if kind is float else value
 
 
 def check_plain(kinds: Collection[type], node: Any, place: str) -> Any:
-    """The value of a node; raises ValueError for one that is of none of these kinds."""
+    """The value of a node; raises ValueError if it has none of these types."""
     value = contents(node)
     if not any(_is_plain(value, kind) for kind in kinds):
         wanted = [PLAIN.get(kind, f"a {kind.__name__}, named by its _target_") for kind in kinds]
@@ -193,12 +194,12 @@ def check_plain(kinds: Collection[type], node: Any, place: str) -> Any:
 
 
 def _is_plain(value: object, kind: type) -> bool:
-    """Whether a value is of a plain kind; a whole number is a number too, true is none."""
+    """Whether a value has a plain type; an int also counts as a float, a bool does not."""
     return type(value) is kind or (kind, type(value)) == (float, int)
 
 
 def _dataclass(kind: type, node: Any, place: str) -> Any:
-    """A mapping as a dataclass: no key may be missing, and none be there that does nothing."""
+    """A mapping as a dataclass; missing keys and unused keys are errors."""
     names = [f.name for f in fields(kind) if f.init]
     needed = [name for name in names if is_required(kind, name)]
     given = set(map(str, node)) if isinstance(node, DictConfig) else None
@@ -225,7 +226,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def hints_of(kind: type) -> dict[str, Any]:
-    """Field of a dataclass that it is made with -> its annotation."""
+    """Type annotations of a dataclass's init fields, by name."""
     hints = get_type_hints(kind, include_extras=True)
     return {f.name: hints[f.name] for f in fields(kind) if f.init}
 
@@ -236,19 +237,19 @@ def is_required(kind: type, name: str) -> bool:
 
 
 def child(parent: Any, key: Any, place: str) -> Any:
-    """A child, interpolations resolved."""
+    """A child of a node, with interpolations resolved."""
     if OmegaConf.is_missing(parent, key):
         raise ValueError(f"{place} must be set: it is still '???'")
     return parent[key]
 
 
 def contents(node: Any) -> Any:
-    """The plain value of a node, interpolations resolved."""
+    """The plain value of a node, with interpolations resolved."""
     return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
 
 
 def instantiate(node: DictConfig, kind: type, place: str) -> Any:
-    """The object that a node names, if it is of this kind."""
+    """The object that a node names, checked to be of this type."""
     value = bind(node, place)()
     if not isinstance(value, kind):
         raise ValueError(f"{place} must name a _target_ that is a {kind.__name__}: {value!r} came")
@@ -256,7 +257,7 @@ def instantiate(node: DictConfig, kind: type, place: str) -> Any:
 
 
 def bind_step(node: Any, place: str) -> Step:
-    """A step of `prepare`; an argument that it does not know is refused here."""
+    """A step of `prepare`; unknown arguments are refused here."""
     if not isinstance(node, DictConfig) or "_target_" not in node:
         raise ValueError(
             f"{place} must be like {{_target_: ep2sindy.prepare.crop, start_s: 0}}: {node!r} came"
@@ -265,10 +266,10 @@ def bind_step(node: Any, place: str) -> Step:
 
 
 def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
-    """What a node's `_target_` names, with the rest of the node, built, as its arguments.
+    """The node's `_target_`, with the remaining entries, built, as its arguments.
 
-    place: the node's dotted path, for errors. first: arguments that it is given when called.
-    Raises ValueError where it cannot be called so, or what a nested target raised itself.
+    place: the node's dotted path, for errors. first: leading arguments, given when it is called.
+    Raises ValueError if the target cannot be called so, and errors that a nested target raises.
     """
     settings = {name: child(node, name, f"{place}.{name}") for name in map(str, node)}
     target = target_of(node, place)
@@ -283,7 +284,7 @@ def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
     )
     try:
         takes = inspect.signature(target)
-    except ValueError:  # compiled, it does not say what it takes
+    except ValueError:  # a compiled function may have no signature
         return call
     try:
         takes.bind(*first, **call.keywords)
@@ -295,23 +296,23 @@ def bind(node: DictConfig, place: str, *first: Any) -> partial[Any]:
 
 
 def _plain_arguments(target: Any) -> dict[str, tuple[type, ...]]:
-    """Arguments of a target that can only be plain values, or None: by name, their kinds."""
+    """Arguments of a target that can only be plain values or None, with their types."""
     try:
         hints = get_type_hints(getattr(target, "__init__") if isinstance(target, type) else target)  # noqa: B009
-    except Exception:  # an annotation that is not there while the program runs; no annotations
+    except Exception:  # an annotation that does not exist at run time; no annotations
         return {}
     alternatives = {name: _alternatives(hint) for name, hint in hints.items()}
     return {name: kinds for name, kinds in alternatives.items() if set(kinds) <= set(PLAIN)}
 
 
 def _alternatives(hint: Any) -> tuple[Any, ...]:
-    """The kinds of a union but None; of another hint itself."""
+    """The types of a union without None; a single type by itself."""
     parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     return tuple(part for part in parts if part is not type(None))
 
 
 def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
-    """An argument of a target, with what it names at any depth made. kinds: empty for any."""
+    """An argument of a target, with nested targets built. kinds: its types, empty for any."""
     if kinds and node is not None:
         return check_plain(kinds, node, place)
     if isinstance(node, ListConfig):
@@ -319,7 +320,7 @@ def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
         return [_argument((), child(node, k, at), at) for k, at in enumerate(places)]
     if not isinstance(node, DictConfig):
         return node
-    if "_target_" not in set(node):  # a DictConfig itself denies one that is still to be set
+    if "_target_" not in set(node):  # `in` on a DictConfig denies a key whose value is missing
         named = {key: f"{place}.{key!s}" for key in node}
         return {key: _argument((), child(node, key, at), at) for key, at in named.items()}
     call = bind(node, place)
@@ -330,14 +331,14 @@ def _argument(kinds: Collection[type], node: Any, place: str) -> Any:
 
 
 def check_set(node: DictConfig) -> None:
-    """Raise ValueError for a value, at any depth, that a config leaves to its user."""
+    """Raise ValueError for a value, at any depth, that a config leaves for the user to set."""
     if missing := sorted(OmegaConf.missing_keys(node)):
         raise ValueError(f"{missing[0]} must be set: it is still '???'")
 
 
 @dataclass(frozen=True, eq=False)
 class Configured:
-    """A node that names a `_target_`, built when asked for: see `Deferred`."""
+    """A node that names a `_target_`, built on request; see `Deferred`."""
 
     node: Any
     place: str
@@ -365,7 +366,7 @@ class Configured:
             if OmegaConf.select(node, place, default=missing) is missing:
                 raise ValueError(f"{self.place}.{place} must be there to be changed: it is not")
             OmegaConf.update(node, place, value)
-        OmegaConf.set_struct(node, False)  # a key that it does not take is refused when it is built
+        OmegaConf.set_struct(node, False)  # unknown keys are refused when it is built
         merged: Any = OmegaConf.merge(node, dict(more or {}))
         return Configured(merged, self.place)
 
@@ -374,10 +375,10 @@ class Configured:
 
 
 def write_defaults(node: DictConfig, place: str, *, root: str) -> None:
-    """Add what stands at a dotted place by default, if the targets on the way have it.
+    """Add the default value at a dotted place, if the targets on the way have one.
 
-    root: where the node itself stands, for errors. `thruster.transport.c_plume` in a thruster that
-    says nothing of its transport becomes all of the transport that it has by default.
+    root: the place of the node itself, for errors. For example, `thruster.transport.c_plume` in a
+    thruster without a transport adds the whole default transport.
     """
     *outer, last = place.split(".")
     for name in (*outer, last):
@@ -393,7 +394,7 @@ def write_defaults(node: DictConfig, place: str, *, root: str) -> None:
 
 
 def defaults_of(call: Any) -> dict[str, Any]:
-    """Arguments of a class or function that have a default, with it."""
+    """Arguments of a class or function that have a default, with that default."""
     if is_dataclass(call):
         found = {}
         for each in fields(call):
@@ -404,13 +405,13 @@ def defaults_of(call: Any) -> dict[str, Any]:
         return found
     try:
         takes = inspect.signature(call).parameters.values()
-    except (TypeError, ValueError):  # compiled, it does not say what it takes
+    except (TypeError, ValueError):  # a compiled function may have no signature
         return {}
     return {each.name: each.default for each in takes if each.default is not each.empty}
 
 
 def as_node(value: Any) -> Any:
-    """A value as a config has it: a dataclass as a node that names its class."""
+    """A value as a config writes it; a dataclass becomes a node that names its class."""
     if is_dataclass(value) and not isinstance(value, type):
         members = {each.name: as_node(getattr(value, each.name)) for each in fields(value)}
         taken = {each.name for each in fields(value) if each.init}
@@ -421,5 +422,5 @@ def as_node(value: Any) -> Any:
 
 
 def _name(kind: type) -> str:
-    """By the package's stubs where they have it: modules may move."""
-    return place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"  # a user's
+    """Name of a class in the package's stubs if it is there, since modules may move."""
+    return place_of(kind) or f"{kind.__module__}.{kind.__qualname__}"  # a user's class

@@ -1,7 +1,7 @@
-"""A sweep's index: every job with its overrides, how it ended, its headline figures and folder.
+"""Index of a sweep: every job with its overrides, outcome, headline figures and folder.
 
-Each job writes a record of its own, so that jobs may run side by side or on a cluster, and the
-index and its page are made anew from all records there are.
+Each job writes its own record, so that jobs may run in parallel or on a cluster. The index and its
+page are rebuilt from all records.
 """
 
 from __future__ import annotations
@@ -34,21 +34,22 @@ Records = Sequence[Mapping[str, Any]]
 
 
 def note_end(sweep: Path, record: Mapping[str, Any]) -> None:
-    """Write how a job ended, and the index with it."""
+    """Write how a job ended, and update the index."""
     write_json(sweep / RECORDS / f"{record['job']}.json", record)
     write_index(sweep)
 
 
 def records_of(sweep: Path) -> list[dict[str, Any]]:
-    """What every job noted, in their order."""
-    paths = (sweep / RECORDS).glob("[!.]*.json")  # not what is being written
+    """Records of all jobs, in order."""
+    paths = (sweep / RECORDS).glob("[!.]*.json")  # without files that are being written
     return sorted((read_json(path.read_text("utf-8")) for path in paths), key=lambda r: r["job"])
 
 
 def write_index(sweep: Path) -> None:
-    """`index.csv` of a sweep's folder: a row per job, a column per headline figure; `index.html`.
+    """Write `index.csv` and `index.html`: one row per job, one column per headline figure.
 
-    Written again if another job has noted its end meanwhile: the last to write knows them all.
+    They are written again if another job ended meanwhile, so that the last writer includes all
+    jobs.
     """
     records: list[dict[str, Any]] = []
     while len(now := records_of(sweep)) > len(records):
@@ -76,7 +77,7 @@ def _index(records: Records) -> str:
 
 
 def write_sweep_page(sweep: Path, records: Records) -> None:
-    """`index.html` beside `index.csv`; links go to the pages of the jobs, and are relative."""
+    """Write `index.html` beside `index.csv`, with relative links to the jobs' pages."""
     varied, shared = split_varied(records)
     jobs = [Table(_jobs(sweep, records, varied), note=f"In all jobs: {' '.join(shared) or '-'}.")]
     figures = _figures(records, varied)
@@ -92,7 +93,7 @@ def write_sweep_page(sweep: Path, records: Records) -> None:
 
 
 def split_varied(records: Records) -> tuple[dict[str, list[str]], list[str]]:
-    """What differs between jobs, as values by key, one per job; and what all have in common."""
+    """Settings that differ between jobs, as values by key, one per job; and the common settings."""
     everywhere = set.intersection(*(set(record["overrides"]) for record in records))
     keys = dict.fromkeys(
         text.partition("=")[0] for r in records for text in r["overrides"] if text not in everywhere
@@ -103,7 +104,7 @@ def split_varied(records: Records) -> tuple[dict[str, list[str]], list[str]]:
 
 
 def _jobs(sweep: Path, records: Records, varied: Mapping[str, Sequence[str]]) -> pd.DataFrame:
-    """A row per job. Figures are headed by words."""
+    """One row per job; headline figures have readable headings."""
     figures = _headlines(records)
     rows = []
     for k, record in enumerate(records):
@@ -122,7 +123,7 @@ def _headlines(records: Records) -> list[str]:
 
 
 def _figures(records: Records, varied: Mapping[str, Sequence[str]]) -> dict[str, Drawn]:
-    """Over the one number that was varied, or over the jobs."""
+    """Figures over the one number that was varied, or over the jobs."""
     values = {
         in_words(name) + (" (kHz)" if name.endswith("f_kHz") else ""): np.array(
             [_number(record.get("headline", {}).get(name)) for record in records]
@@ -158,7 +159,7 @@ def _number(value: Any) -> float:
 
 
 def index_text(sweep: Path, *, n_figures: int = 4) -> str:
-    """The index for the terminal: what differs between jobs, and the first headline figures."""
+    """The index for the terminal: differing settings, and the first headline figures."""
     records = records_of(sweep)
     if not records:
         return f"no job of the sweep noted its end in {sweep}"
@@ -175,7 +176,7 @@ def index_text(sweep: Path, *, n_figures: int = 4) -> str:
         where = record.get("folder") or record.get("error", "")
         cells = [str(record["job"]), " ".join(varied), record["status"], *texts, where]
         table.add_row(*map(in_line, cells))
-    text = StringIO()  # of no terminal: without colours, which `say` would write out
+    text = StringIO()  # not a terminal: no colours, whose codes `say` would print
     console = Console(file=text, width=120, force_terminal=False, markup=False, emoji=False)
     console.print(table)
     return f"{text.getvalue()}{sweep / 'index.html'}\n{sweep / 'index.csv'}"

@@ -1,7 +1,7 @@
-"""What a config may call: nothing but what the stubs mark for configs, and what users mark.
+"""Targets that a config may name: those that the stubs or the user mark for configs.
 
-A config can come from anybody. Values, readers and simulators are offered; what writes where it
-is told, or runs what it is given, is not.
+A config can come from an untrusted source. Values, readers and simulators are offered. Functions
+that write to a given place, or run what they are given, are not.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from ep2sindy._old_names import gone_text, moved_text, new_name
 from ep2sindy._stubs import dotted_names
 from ep2sindy.trust.user_code import is_for_configs, load_user_module
 
-# Names in full: `ep2sindy.EBIC`, `ep2sindy.thruster.Thruster`.
+# Full names: `ep2sindy.EBIC`, `ep2sindy.thruster.Thruster`.
 FOR_CONFIGS = frozenset(name for name, entry in dotted_names().items() if entry.for_configs)
 
 
 def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
-    """What the `_target_` of a node names; of the version before, too, with a warning.
+    """The object that a node's `_target_` names; old names work with a warning.
 
-    Raises ValueError for all that configs may not name, before anything of it is imported.
+    Raises ValueError for a name that configs may not use, before anything of it is imported.
     """
     name = str(node["_target_"])
     new = new_name(name) or name
@@ -47,7 +47,7 @@ def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
 
 
 def _own(name: str, place: str) -> Callable[..., Any]:
-    """What a user has marked; only a file below the current folder is imported."""
+    """An object that the user has marked; only files below the current folder are imported."""
     module, _, last = name.rpartition(".")
     try:
         target = getattr(load_user_module(module), last)
@@ -68,7 +68,7 @@ def _own(name: str, place: str) -> Callable[..., Any]:
 def check_targets(node: Any, place: str = "") -> None:
     """Raise ValueError for a `_target_`, at any depth, that configs may not name.
 
-    What is interpolated is looked at where it stands, and once more when it is built.
+    Interpolated values are checked where they are defined, and again when they are built.
     """
     if isinstance(node, DictConfig) and "_target_" in node and _is_there(node, "_target_"):
         target_of(node, place or "the config")

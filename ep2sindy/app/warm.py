@@ -1,6 +1,6 @@
-"""`ep2sindy warm`: every kernel compiled once, so that no run waits for one.
+"""`ep2sindy warm`: compile every kernel once, so that no run waits for compilation.
 
-Runs of the command line begin with it; where it has been done, it takes no time.
+Runs of the command line begin with it; once it is done, it takes no time.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ Runs of the command line do so by themselves; in Python, a call compiles what it
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Compile, and say where the kernels are kept."""
+    """Compile, and report where the kernels are kept."""
     argparse.ArgumentParser("ep2sindy warm", description=ABOUT).parse_args(arguments)
     warm()
     say(f"all kernels are compiled; they are kept in {cache_folder()}")
 
 
 def warm() -> None:
-    """Compile all kernels, saying so, unless these sources have been compiled by this machine."""
+    """Compile all kernels with a message, unless this machine has compiled these sources."""
     stamp, state = cache_folder() / "warm", _state()
     if stamp.is_file() and stamp.read_text("utf-8") == state:
         return
     say(ANNOUNCEMENT, error=True)
     if not _compiled_side_by_side():
         return
-    with suppress(OSError):  # a disk that takes no more costs the next run this half minute again
+    with suppress(OSError):  # on a full disk, the next run repeats this half minute
         stamp.parent.mkdir(parents=True, exist_ok=True)
         stamp.write_text(state, "utf-8")
 
 
 def _state() -> str:
-    """What compiled kernels depend on: their sources, numba, Python and the processor."""
+    """Hash of what compiled kernels depend on: their sources, numba, Python and the processor."""
     import numba
     from llvmlite.binding import get_host_cpu_name
 
@@ -58,8 +58,8 @@ def _state() -> str:
 
 
 def _compiled_side_by_side() -> bool:
-    """Whether all parts, each in a process of its own, ended well; one that fails says why."""
-    inlined = '\n@compiled(inline="always")'  # part of those that call them
+    """Run all parts in separate processes; returns whether all succeeded, and reports failures."""
+    inlined = '\n@compiled(inline="always")'  # compiled as part of their callers
     texts = [path.read_text("utf-8") for path in sources()]
     n_kernels = sum(text.count("\n@compiled") - text.count(inlined) for text in texts)
     reader, writer = os.pipe()
@@ -67,7 +67,7 @@ def _compiled_side_by_side() -> bool:
     parts = [subprocess.Popen([*command, each], stdout=writer, env=environment) for each in PARTS]
     os.close(writer)
     with open(reader, encoding="utf-8") as lines, Bars().stage(n_kernels, "kernel") as advance:
-        names: set[str] = set()  # parts share some
+        names: set[str] = set()  # parts share some names
         for name in lines:
             advance(int(name not in names))
             names.add(name)
@@ -76,7 +76,7 @@ def _compiled_side_by_side() -> bool:
 
 
 def _search() -> None:
-    """Smoothers, rows, searches, estimates and free runs."""
+    """Compile smoothers, rows, searches, estimates and free runs."""
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     found = ep.discover(run)
     for method in (ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset()):
@@ -87,9 +87,9 @@ def _search() -> None:
 
 
 def _refinement() -> None:
-    """Refinement, trial runs, and the simulator along the axis."""
+    """Compile refinement, trial runs, and the simulator along the axis."""
     point, step_s = ep.thruster.OperatingPoint(300.0, 5.0), 1e-7
-    for n_samples in (20, 60):  # in one piece, and in several, which are slices
+    for n_samples in (20, 60):  # in one piece, and in several pieces, which are slices
         brief = partial(
             ep.thruster.simulate, duration_s=n_samples * step_s, warm_up_s=0.0, sample_s=step_s
         )
@@ -106,7 +106,7 @@ def _refinement() -> None:
 
 
 def _plane() -> None:
-    """The (z, r) simulator."""
+    """Compile the (z, r) simulator."""
     step_s = 1e-6
     brief = partial(ep.thruster.simulate_2d, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
     brief(n_z=12, n_r=12, progress=False)

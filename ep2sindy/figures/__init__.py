@@ -1,6 +1,6 @@
-"""Figures: values in, a matplotlib Figure out."""
+"""Figures: functions that take values and return a matplotlib Figure."""
 
 from ep2sindy.trust.user_code import away_from
 
-with away_from("matplotlibrc"):  # first of all settings to it, and may be anybody's
+with away_from("matplotlibrc"):  # read first of all settings; an untrusted folder may hold one
     import matplotlib  # noqa: F401

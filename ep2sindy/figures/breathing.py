@@ -1,4 +1,4 @@
-"""Figures of one simulated discharge: its current, spectrum, profiles, and (z, t) maps."""
+"""Figures of one simulated discharge: current, spectrum, profiles, and maps over z and time."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from ep2sindy.figures.style import (
 from ep2sindy.signals.spectrum import power_spectrum
 
 PROFILES = ("n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization")
-MAPS = {"n_n": "viridis", "n_i": "magma"}  # colours told apart by any eye, and in grey
-BAND_PERCENT = (5, 95)  # %, of the inner band of a profile
+MAPS = {"n_n": "viridis", "n_i": "magma"}  # legible with any colour vision, and in grey
+BAND_PERCENT = (5, 95)  # inner band of a profile, in percentiles
 READABLE = {"m/s": (1e-3, "km/s"), "V/m": (1e-3, "kV/m")}
 MS, KHZ = 1e3, 1e-3
 
 
 def current_figure(field: xr.Dataset, window: slice) -> Figure:
-    """The discharge current over the whole record, and over a few periods beside the beam's."""
+    """The discharge current over the whole record, and with the beam current over a few periods."""
     figure, axes = make_panels(2, 1, (9.0, 4.8))
     whole, part = axes.flat
     time = MS * field["time"].values
@@ -58,9 +58,10 @@ def current_figure(field: xr.Dataset, window: slice) -> Figure:
 def current_spectrum_figure(
     field: xr.Dataset, *, f_kHz: float, f_max_Hz: float, transit_Hz: float
 ) -> Figure:
-    """Power of the discharge current over frequency, both logarithmic; the peak is marked.
+    """Power spectrum of the discharge current on logarithmic axes, with the peak marked.
 
-    f_kHz: where the peak is, NaN for none. transit_Hz: above it ions in transit oscillate.
+    f_kHz: frequency of the peak, NaN if there is none. transit_Hz: frequency above which
+    oscillations are those of ions in transit.
     """
     frequency, power = power_spectrum(field["time"].values, field["I_d"].values)
     shown = (frequency > 0.0) & (frequency <= f_max_Hz)
@@ -81,7 +82,7 @@ def current_spectrum_figure(
 
 
 def profile_table(field: xr.Dataset) -> dict[str, Float[np.ndarray, "5 cells"]]:
-    """By variable its mean, 5 %, 95 %, least and largest value in time along the axis."""
+    """Mean, 5 %, 95 %, minimum and maximum in time of each variable along the axis."""
     found = {}
     for name in (name for name in PROFILES if name in field):
         values = along_z(field[name])
@@ -93,7 +94,7 @@ def profile_table(field: xr.Dataset) -> dict[str, Float[np.ndarray, "5 cells"]]:
 
 
 def profile_figure(field: xr.Dataset) -> Figure:
-    """Mean profiles with bands of 5 to 95 %, and of all that was, the channel's exit dashed."""
+    """Mean profiles with bands of 5 to 95 % and of the full range; the channel's exit is dashed."""
     profiles = profile_table(field)
     figure, axes = make_grid(
         len(profiles), width=10 / 3, height=2.6, extra=0.4, sharex=True, most=3,
@@ -115,7 +116,7 @@ def profile_figure(field: xr.Dataset) -> Figure:
 
 
 def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
-    """The current, and below it neutrals and ions over time and axis, for a few periods."""
+    """The current, and below it neutral and ion density over time and z, for a few periods."""
     names = [name for name in MAPS if name in field]
     shown = field.isel(time=window)
     time = MS * shown["time"].values
@@ -141,7 +142,7 @@ def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
 
 
 def along_z(array: xr.DataArray) -> Float[np.ndarray, "time z"]:
-    """Values on (time, z); over r, their average by area where there is plasma."""
+    """Values on (time, z); fields over r are averaged by area over the cells with plasma."""
     if "r" in array.dims:
         array = array.weighted(array["r"]).mean("r")
     return array.transpose("time", "z").values.astype(float)
@@ -150,7 +151,7 @@ def along_z(array: xr.DataArray) -> Float[np.ndarray, "time z"]:
 def scale_to_prefix(
     values: Float[np.ndarray, "*shape"], unit: str
 ) -> tuple[Float[np.ndarray, "*shape"], str]:
-    """Numbers to read, and what they count: 2e18 m^-3 are 2 in 10^18 m^-3."""
+    """Scale values to a readable power of ten: 2e18 m^-3 becomes 2 in units of 10^18 m^-3."""
     factor, name = READABLE.get(unit, (1.0, unit))
     largest = float(np.nanmax(np.abs(factor * values), initial=0.0))
     if 1e-2 <= largest < 1e4 or largest == 0.0:
@@ -160,7 +161,7 @@ def scale_to_prefix(
 
 
 def _hold_zero(ax: Axes, values: Float[np.ndarray, " time"]) -> None:
-    """Limits that hold zero: a steady current must not look like one that moves."""
+    """Set limits that include zero, so that a steady current does not look like a moving one."""
     low, high = min(0.0, float(values.min())), max(0.0, float(values.max()))
     ax.set_ylim(1.05 * low, (1.08 * high) or 1.0)
 
@@ -170,7 +171,7 @@ def _words(array: xr.DataArray) -> str:
 
 
 def _mark_exit(ax: Axes, field: xr.Dataset, *, along: str) -> None:
-    """The end of the channel as a dashed line, where the run says where it is."""
+    """Draw the end of the channel as a dashed line, if the run gives its position."""
     thruster = json.loads(field.attrs.get("parameters", "{}")).get("thruster", {})
     if length := thruster.get("channel_length"):
         style: dict[str, Any] = {"color": DATA if along == "x" else "white", "lw": 1.0, "ls": "--"}
@@ -178,7 +179,7 @@ def _mark_exit(ax: Axes, field: xr.Dataset, *, along: str) -> None:
 
 
 def last_periods(t: Float[np.ndarray, " time"], f_kHz: float, periods: float) -> slice:
-    """The last few periods of a record; a tenth of it where there is no frequency."""
+    """The last few periods of a record; a tenth of the record if there is no frequency."""
     share = 0.1 * (t[-1] - t[0])
     duration_s = periods / (1e3 * f_kHz) if np.isfinite(f_kHz) and f_kHz > 0.0 else share
     start = int(np.searchsorted(t, t[-1] - duration_s))

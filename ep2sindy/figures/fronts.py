@@ -17,12 +17,12 @@ from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
 from ep2sindy.selection.rule import selected
 
-# Errors below are drawn here, where a line says so: they are rounding, or zero.
+# Smaller errors are rounding or zero; they are drawn at FLOOR, on a labelled line.
 FLOOR = 1e-12
 
-TOP = 3.0  # errors above are marked at the edge: such a model is worse than none
+TOP = 3.0  # larger errors are marked at the edge: such a model is worse than none
 
-TERMS_A_LINE = 4  # of a title
+TERMS_A_LINE = 4  # terms per line of a title
 
 
 def front_figure(
@@ -31,13 +31,14 @@ def front_figure(
     *,
     label: str,
 ) -> Figure:
-    """Error against number of terms for every equation, log, the selected candidate marked.
+    """Error against number of terms for every equation, log scale, the selected candidate marked.
 
-    Of a search of trajectories, which has no rows and so no error of them, the scores instead.
+    After a search of trajectories, which has no rows and so no error on them, the scores are drawn
+    instead.
 
-    Behind the front, light, every support that the search proposed. Errors below FLOOR are drawn
-    on a line at it, those above TOP as marks at the upper edge.
-    scores: by state, one per candidate, the lowest selected; label: what they are called.
+    The supports that the search proposed are drawn light behind the front. Errors below FLOOR are
+    drawn on a line at FLOOR, and errors above TOP as marks at the upper edge.
+    scores: by state, one per candidate; the lowest is selected. label: name of the scores.
     """
     figure, axes = make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
@@ -61,7 +62,7 @@ _LAYERS = ("all supports fitted", "runners-up", "best of size", "selected")
 
 
 def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
-    """All supports, runners-up, the best of every size as a line, and the star."""
+    """Draw all supports, runners-up, the best of every size (line) and the selected (star)."""
     lowest = front.errors.min()
     if front.cloud is not None:
         _draw_cloud(ax, front.cloud, label=_LAYERS[0])
@@ -79,10 +80,10 @@ def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
 
 
 def _draw_scores(ax: Axes, front: ParetoFront, scores: np.ndarray, chosen: int, label: str) -> None:
-    """Runners-up, the best of every size as a line, and the star, by their scores.
+    """Draw the scores of runners-up, of the best of every size (line) and of the selected (star).
 
-    Linear near zero, where the best are. A candidate that cannot be run, such as an equation
-    without terms, has no finite score, and stands at the upper edge.
+    The axis is linear near zero, where the best scores are. A candidate that cannot be run, such as
+    an equation without terms, has no finite score and is drawn at the upper edge.
     """
     _draw_candidates(ax, front, _finite(scores), chosen)
     ax.set(ylabel=_score_label(label))
@@ -90,7 +91,7 @@ def _draw_scores(ax: Axes, front: ParetoFront, scores: np.ndarray, chosen: int, 
 
 
 def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: int) -> None:
-    """Runners-up, the best of every size as a line, and the star."""
+    """Draw runners-up, the best of every size as a line, and the selected candidate as a star."""
     _, runners_up, best_of_size, star = _LAYERS
     best = front.leading
     if not best.all():
@@ -111,13 +112,13 @@ def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: 
 
 
 def _finite(scores: np.ndarray) -> np.ndarray:
-    """Scores, those without a finite one at ten times the largest that has."""
+    """The scores; infinite or missing ones become ten times the largest finite score."""
     known = scores[np.isfinite(scores)]
     return np.where(np.isfinite(scores), scores, 10.0 * max(known.max(initial=1.0), 1.0))
 
 
 def _add_hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
-    """Over every candidate something that cannot be seen, and says which it is."""
+    """Put an invisible spot over every candidate, whose hover text names it."""
     has_rows = front.problem is not None
     heights = np.clip(front.errors, FLOOR, TOP) if has_rows else _finite(scores)
     for each, height, score in zip(front.candidates, heights, scores, strict=True):
@@ -128,7 +129,7 @@ def _add_hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) ->
 
 
 def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
-    """Light dots; where the model is worse than none by far, carets at the upper edge."""
+    """Draw light dots; models far worse than none are carets at the upper edge."""
     above = cloud.errors > TOP
     style: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
     ax.plot(
@@ -142,7 +143,7 @@ def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
 
 
 def _write_terms(candidate: Candidate) -> str:
-    """Of a title; a few in a line."""
+    """The terms as a title, a few per line."""
     names = [f"${latex_term_name(name)}$" for name in candidate.terms]
     lines = [names[k : k + TERMS_A_LINE] for k in range(0, len(names), TERMS_A_LINE)]
     return ",\n".join(", ".join(line) for line in lines) or "0"
@@ -153,6 +154,6 @@ def _has_label(line: Line2D) -> bool:
 
 
 def _score_label(label: str) -> str:
-    """`d_pareto` as a symbol with an index; `AICc` as it is."""
+    """A score's label: `d_pareto` as a symbol with an index; `AICc` unchanged."""
     stem, _, index = label.partition("_")
     return rf"${stem}_\mathrm{{{index}}}$" if index else label

@@ -1,6 +1,7 @@
-"""The benchmark as table and heat map, and the frontier: who finds the equations, and when.
+"""Tables and figures of the benchmark, the frontier, and models of known systems.
 
-Also known systems beside what was identified of them: attractors and trajectories.
+The benchmark is a table and a heat map of how often each variant finds the equations. Known
+systems are drawn beside the identified models, as attractors and trajectories.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from ep2sindy.figures.style import (
 from ep2sindy.library.equations import latex_name
 from ep2sindy.model.rollout import Rollout
 
-COUNTS = ("on_front", "selected")  # of realizations
+COUNTS = ("on_front", "selected")  # numbers of realizations
 
 MERITS = (*COUNTS, "mean_correct_terms")
 
@@ -47,20 +48,20 @@ SYSTEM_LABELS = {
 
 PANELS = {"on_front": "true equations on the front", "selected": "true equations selected"}
 
-# One hue from light to dark: read with any colour vision, and in grey.
+# One hue from light to dark: legible with any colour vision, and in grey.
 COLOURMAP, DARK = "Blues", 0.7
 
 IDENTIFIED = COLOURS[1]
 
-MAX_DOTS = 1500  # of the samples in a panel
+MAX_DOTS = 1500  # samples drawn in a panel
 
 
 def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.DataFrame:
-    """One figure of merit of every variant, with its published row below it where there is one.
+    """One figure of merit of every variant; a published row, if any, follows its variant's row.
 
-    cells: as `studies.benchmark.cells` gives them. published: the same, without the time.
-    Index (variant, is it published), columns (system, noise), in the order of `cells`; counts
-    become percentages of n.
+    cells: from `studies.benchmark.cells`. published: the same, without the time. Returns a table
+    with index (variant, is it published) and columns (system, noise), in the order of `cells`;
+    counts become percentages of n.
     """
     place, shown = ["system", "noise"], ["variant", "system", "noise", merit, "n"]
     known = published.merge(cells[[*place, "variant"]])
@@ -80,9 +81,9 @@ def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.
 
 
 def frontier_figure(points: pd.DataFrame) -> Figure:
-    """A panel per variant: sampling rate against duration, filled where it found the system.
+    """A panel per variant: sampling rate against duration, filled marks where it found the system.
 
-    points: as `Study.points` of `studies.frontier` gives them.
+    points: from `Study.points` of `studies.frontier`.
     """
     variants = list(points["variant"].unique())
     size = (2.6 * len(variants) + 0.4, 3.5)
@@ -101,7 +102,7 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
     return figure
 
 
-# (identified, ran) -> marker: told apart by shape and filling, not by colour alone.
+# (identified, ran) -> marker: they differ by shape and filling, not by colour alone.
 _MARKERS: Mapping[tuple[bool, bool], Mapping[str, Any]] = {
     (True, True): {"ls": "", "marker": "o", "color": COLOURS[2], "label": "identified"},
     (False, True): {
@@ -116,8 +117,7 @@ _MARKERS: Mapping[tuple[bool, bool], Mapping[str, Any]] = {
 def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
     """How often every variant finds the true equations, in percent, as numbers on a heat map.
 
-    cells, thesis: as `merit_table` takes them; the thesis's rows stand in italics below the
-    variants they are about.
+    cells, thesis: as for `merit_table`. The thesis's rows are in italics, each below its variant.
     """
     tables = {merit: merit_table(cells, thesis, merit) for merit in PANELS}
     n_rows, n_columns = tables["on_front"].shape
@@ -143,7 +143,7 @@ def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
         text.set_fontstyle("italic" if table.index[row][1] else "normal")
     for row, (_, published) in enumerate(table.index):
         if not published:
-            ax.axhline(row, color="white", lw=3)  # a variant and what the thesis says of it
+            ax.axhline(row, color="white", lw=3)  # gap between variants; thesis rows stay attached
     _name_columns(ax, table.columns)
     ax.set_ylim(len(values), 0.0)
     ax.spines[:].set_visible(False)
@@ -151,7 +151,7 @@ def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
 
 
 def _name_columns(ax: Axes, columns: pd.Index) -> None:
-    """Noise levels below, the systems they belong to above, and a gap between systems."""
+    """Write noise levels below the columns and system names above; leave a gap between systems."""
     ax.set_xticks(np.arange(len(columns)) + 0.5, [f"{100 * noise:g}" for _, noise in columns])
     ax.tick_params(axis="x", labelsize=7.5)
     ax.set_xlabel("noise (% of RMS)", fontsize=8.5)
@@ -174,10 +174,10 @@ def _name_rows(ax: Axes, rows: pd.Index) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """One realization of a known system, and the model that was found in it.
+    """One realization of a known system, and the model identified from it.
 
-    samples: with noise, of which it was found. truth: without, of all states. rollout: of the
-    model from where the truth starts. right: whether its terms are the true ones.
+    samples: noisy data of the fit. truth: noise-free, all states. rollout: run of the model from
+    the truth's initial state. right: whether the model has the true terms.
     """
 
     system: str
@@ -191,8 +191,9 @@ class Identified:
 def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) -> Figure:
     """A column per system, a row per noise level: samples, truth and identified model.
 
-    In the plane of the first and the last state, or over_time, the first state alone. Carets mark
-    where a model leaves the panel, a cross where one that diverged stops inside it.
+    Panels show the plane of the first and the last state; with over_time, the first state over
+    time. Carets mark where a model leaves the panel; a cross marks where a diverged run stops
+    inside it.
     """
     systems = list(dict.fromkeys(each.system for each in found))
     noises = sorted({each.noise for each in found})
@@ -220,7 +221,7 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
 
 
 def _frame_samples(found: Sequence[Identified], over_time: bool) -> tuple[Limits, Limits]:
-    """Of all samples of one system, whatever the models do."""
+    """Limits around all samples of one system, regardless of the models."""
     pairs = [_coordinates(each.samples.t, each.samples.states, over_time) for each in found]
     x, y = (np.concatenate(column) for column in zip(*pairs, strict=True))
     return frame_limits(x, np.empty(0)), frame_limits(y, np.empty(0))
@@ -229,7 +230,7 @@ def _frame_samples(found: Sequence[Identified], over_time: bool) -> tuple[Limits
 def _draw_one(
     ax: Axes, each: Identified, limits: tuple[Limits, Limits], *, over_time: bool
 ) -> None:
-    """Samples as dots, the truth as a line, the model as one that both show beneath."""
+    """Draw samples as dots, the truth as a line, and the model as a line that hides neither."""
     x, y = _coordinates(each.samples.t, each.samples.states, over_time)
     step = -(-len(x) // MAX_DOTS)
     ax.plot(x[::step], y[::step], ".", color=GREY, ms=3.5, mew=0, label="samples")

@@ -1,4 +1,4 @@
-"""Figures of a model that is run freely: over the data, on its cycle, and by phase."""
+"""Figures of a model's free run: over the data, on its limit cycle, and by phase."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from ep2sindy.model.comparison import LONG
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
 
-PERIODS = 6.0  # shown at either end of a record
+PERIODS = 6.0  # periods shown at either end of a record
 
 PHASES = np.linspace(0.0, 2.0, 257)  # two periods, in periods
 
 
 def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Figure:
-    """A row per state: the first and the last periods of a record, the model over the data.
+    """A row per state: the model over the data in the first and the last periods of a record.
 
-    run: the record, whose first sample the model started from.
+    run: the record; the model started from its first sample.
     """
     shown = min(PERIODS * period_s, 0.5 * float(run.t[-1] - run.t[0]))
     factor, unit = run.clock.scale(shown)
@@ -66,10 +66,10 @@ def cycle_figure(
     *,
     plane: Sequence[str],
 ) -> Figure:
-    """The model's cycle in the plane of two states, over the data, and runs from other starts.
+    """The model's limit cycle over the data in the plane of two states; runs from other starts.
 
-    cycle: one period of the model, states in the order of the run's. Dots are the starts; a run
-    that leaves the panel does not come back to it.
+    cycle: one period of the model, with states in the order of the run's. Dots mark the starts. A
+    run that leaves the panel is not drawn again.
     """
     pair = [run.state_names.index(name) for name in plane]
     figure, (ax,) = make_grid(1, width=4.4, height=3.8, extra=0.5)
@@ -95,12 +95,12 @@ def cycle_figure(
 
 
 def has_waveform(run: Trajectory, rollout: Rollout) -> bool:
-    """Whether both the data and the model's run have a period."""
+    """Whether both the data and the model's run are periodic."""
     return _waveforms(run, rollout) is not None
 
 
 def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
-    """A panel per state: samples by phase, their waveform, and the model's over two periods."""
+    """A panel per state: samples by phase, their waveform, and the model's, over two periods."""
     found = _waveforms(run, rollout)
     assert found is not None
     data, model = found
@@ -121,7 +121,7 @@ def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
 
 
 def _waveforms(run: Trajectory, rollout: Rollout) -> tuple[Cycle, Cycle] | None:
-    """Of the data, and of the model's run where transients are over, if it is long."""
+    """Waveforms of the data and of the model's run; transients of a long run are left out."""
     data = find_cycle(run.t, run.states)
     if data is None:
         return None

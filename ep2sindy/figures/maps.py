@@ -1,6 +1,6 @@
-"""Maps of the pointwise study and its regimes; along a line where the field has one axis.
+"""Maps of the pointwise study and its regimes; curves if the field has a single axis.
 
-A panel shows cells by colour over z and r; over one axis, points on an ordinate.
+A panel shows cells coloured over z and r. Over a single axis, values are points on an ordinate.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from ep2sindy.figures.style import COLOURS, DATA, MORE_COLOURS, legend_above, ma
 from ep2sindy.library.equations import latex_derivative, latex_term_name, sum_latex
 from ep2sindy.thruster.parameters import Thruster
 
-ABSENT = "#dcdcdc"  # of a term that is not in the equation; a masked cell stays white
-DECADE = 10.0  # over which magnitudes along a line are drawn on a logarithmic scale
-GAP = 0.12  # half width of the colour bar's middle, where terms are absent
+ABSENT = "#dcdcdc"  # colour of a term not in the equation; a masked cell stays white
+DECADE = 10.0  # magnitudes along a line with a larger range get a logarithmic scale
+GAP = 0.12  # half-width of the colour bar's middle, which stands for absent terms
 CM = 100.0  # per m
 PANEL_WIDTH = 1.9  # inches
 
 SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
 STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
-# Neither has a shade near white, which is a cell without a value.
+# Neither has a shade near white, which marks a cell without a value.
 SHARE_COLOURS = colormaps["viridis"]
 COUNT_COLOURS = ListedColormap(colormaps["Purples"](np.linspace(0.35, 1.0, 256)))
 
@@ -44,12 +44,12 @@ MEDIANS = "terms that act, with medians over the regime's points that have them"
 def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
     """Every coefficient over the field: a row per equation, a column per term, signed and log.
 
-    result: as `studies.pointwise` gives it. Red is a positive coefficient (a source), blue a
-    negative one, darker the larger its magnitude; grey a term that is not in the equation; white
-    a point without equations. Colours fade to that grey as R2 of the equation, times the share of
-    the bootstraps that have the term, falls to 0. A column has one scale of whole decades; terms
-    that no point selected have no column. outline: the thruster whose channel is drawn. Over one
-    axis alone, magnitudes are points over it.
+    result: from `studies.pointwise`. Red is a positive coefficient (a source), blue a negative one;
+    darker is larger in magnitude. Grey is a term that is not in the equation, white a point without
+    equations. Colours fade to grey as R2 of the equation, times the share of the bootstraps that
+    have the term, falls to 0. Each column has one scale of whole decades. Terms that no point
+    selected have no column. outline: the thruster whose channel is drawn. If the field has a single
+    axis, magnitudes are drawn as points over it.
     """
     terms = [t for t in result["term"].values if (np.abs(result["coef"].sel(term=t)) > 0).any()]
     if not terms:
@@ -82,7 +82,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
 
 
 def _trust(result: xr.Dataset) -> xr.DataArray:
-    """0 to 1 by equation, term and point: R2 times the share of bootstraps that have the term."""
+    """Trust, 0 to 1, by equation, term and point: R2 times share of bootstraps with the term."""
     share = result["inclusion"].fillna(1.0)  # unknown where there were no bootstraps
     return result[r2_name(result)].clip(0.0, 1.0) * share
 
@@ -90,20 +90,20 @@ def _trust(result: xr.Dataset) -> xr.DataArray:
 def _fade(
     colour: ColorType, trust: Float[np.ndarray, " points"]
 ) -> Float[np.ndarray, "points rgb"]:
-    """From the colour at 1 to the grey of absent terms at 0."""
+    """Blend from the colour at trust 1 to the grey of absent terms at trust 0."""
     full, none = (np.array(list(to_rgb(shade))) for shade in (colour, ABSENT))
     return none + trust[:, None] * (full - none)
 
 
 def r2_name(result: xr.Dataset) -> str:
-    """R2 of the held-out rows, or of the training rows where none were held out."""
+    """Name of R2: on the held-out rows, or on the training rows if none were held out."""
     return "r2_test" if np.isfinite(result["r2_test"]).any() else "r2_train"
 
 
 def _draw_signed_maps(
     figure: Figure, column: Sequence[Axes], coef: xr.DataArray, opacity: xr.DataArray
 ) -> None:
-    """One term in all equations, with their colour bar: the grey in its middle ends at +-10^low."""
+    """Draw one term in all equations, with a colour bar; its grey middle ends at +-10^low."""
     low, high = _decades(coef.values)
     scale = _signed_colours()
     for ax, values, shown in zip(column, coef, opacity, strict=True):
@@ -130,28 +130,28 @@ def _coef_unit(coef: xr.DataArray) -> str:
 
 
 def _decades(coef: Float[np.ndarray, "*shape"]) -> tuple[int, int]:
-    """Whole decades around the magnitudes, all but the smallest and largest hundredth of them."""
+    """Whole decades that span the magnitudes but for the smallest and largest hundredth."""
     magnitudes = np.log10(np.abs(coef[np.isfinite(coef) & (coef != 0.0)]))
     low, high = np.percentile(magnitudes, [1, 99])
     return int(np.floor(low)), max(int(np.ceil(high)), int(np.floor(low)) + 1)
 
 
 def _place(exponent: np.ndarray, low: int, high: int) -> np.ndarray:
-    """Where a magnitude stands between the colour bar's middle and its end."""
+    """Position of a magnitude between the colour bar's middle and its end."""
     return np.clip(GAP + (1.0 - GAP) * (exponent - low) / (high - low), GAP, 1.0)
 
 
 def _signed_log(
     coef: Float[np.ndarray, "*shape"], low: int, high: int
 ) -> Float[np.ndarray, "*shape"]:
-    """-1 to -GAP and GAP to 1 for coefficients, 0 for absent terms; NaN stays."""
+    """Map coefficients to -1 .. -GAP and GAP .. 1, and absent terms to 0; NaN stays NaN."""
     exponent = np.log10(np.abs(coef), where=coef != 0.0, out=np.full(coef.shape, float(low)))
     return np.sign(coef) * _place(exponent, low, high)
 
 
 def _signed_colours() -> ListedColormap:
     n = 200
-    half = round((1.0 - GAP) * n) + 1  # the faintest shade begins before GAP: rounding
+    half = round((1.0 - GAP) * n) + 1  # the faintest shade begins before GAP, because of rounding
     shades = np.linspace(0.3, 1.0, half)
     return ListedColormap(
         [
@@ -163,7 +163,7 @@ def _signed_colours() -> ListedColormap:
 
 
 def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.DataArray) -> None:
-    """Magnitudes of one term in all equations along the one axis, sources and sinks apart."""
+    """Draw magnitudes of one term in all equations along the single axis, by sign."""
     (axis,) = space_axes(coef)
     sizes = np.abs(coef.values[np.isfinite(coef.values) & (coef.values != 0.0)])
     scale = "log" if sizes.max() > DECADE * sizes.min() else "linear"
@@ -183,10 +183,10 @@ def _draw_signed_points(column: Sequence[Axes], coef: xr.DataArray, trust: xr.Da
 
 
 def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
-    """Where each regime lies, how sure that is, and the terms that act in it.
+    """Map of the regimes, their certainty, and the terms active in each.
 
-    Coefficients are medians over the regime's points that have the term, so no point need have
-    the equation as it stands. White: points without equations.
+    Coefficients are medians over the regime's points that have the term, so no single point need
+    have the equation as written. White marks points without equations.
     """
     n, n_equations = regimes.n_regimes, regimes.table["equation"].nunique()
     colours = MORE_COLOURS if n <= len(MORE_COLOURS) else colormaps["tab20"](np.arange(n) % 20)
@@ -223,9 +223,9 @@ def _regime_text(regimes: Regimes, regime: int) -> str:
 
 
 def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
-    """R2 and number of terms of every equation; what became of the points, unless all are fitted.
+    """R2 and number of terms of every equation, and the status of the points if not all are fitted.
 
-    R2 is that of the held-out rows, or of the training rows where none were held out; below 0 is
+    R2 is on the held-out rows, or on the training rows if none were held out. Values below 0 are
     drawn as 0.
     """
     name = r2_name(result)
@@ -277,7 +277,7 @@ def space_axes(array: xr.DataArray | xr.Dataset) -> list[str]:
 def _fit_size(
     array: xr.DataArray, n_rows: int, n_columns: int, *, scale: float = 1.0, extra: float
 ) -> tuple[float, float]:
-    """Of a canvas whose panels come out at the field's own proportions; extra: inches around."""
+    """Size of a canvas whose panels keep the field's proportions; extra: margins in inches."""
     spans = [float(np.ptp(_edges(array, axis))) for axis in space_axes(array)]
     width = scale * PANEL_WIDTH
     height = width * min(max(spans[1] / spans[0], 0.25), 2.0) if len(spans) == 2 else 1.3
@@ -285,7 +285,7 @@ def _fit_size(
 
 
 def _edges(array: xr.DataArray, axis: str) -> Float[np.ndarray, " edges"]:
-    """Edges of the cells in m; a single point gets a millimetre to either side."""
+    """Edges of the cells in m; a single point gets 1 mm on either side."""
     points = array[axis].values.astype(np.float64)
     return cell_edges(points) if len(points) > 1 else points[0] + np.array([-1e-3, 1e-3])
 
@@ -298,7 +298,10 @@ def draw_map(
     *,
     opacity: xr.DataArray | None = None,
 ) -> None:
-    """Cells by colour; over one axis, a strip. opacity: 0 to 1, of the same cells; NaN is 1."""
+    """Draw cells by colour; a field with a single axis becomes a strip.
+
+    opacity: 0 to 1 for the same cells; NaN counts as 1.
+    """
     space = space_axes(values)
     z = CM * _edges(values, space[0])
     if len(space) == 1:
@@ -313,7 +316,7 @@ def draw_map(
 
 
 def draw_values(ax: Axes, values: xr.DataArray, colours: Colormap, norm: Normalize) -> None:
-    """A map with its colour bar; over one axis, points on an ordinate."""
+    """Draw a map with its colour bar; with a single axis, points on an ordinate."""
     space = space_axes(values)
     if len(space) == 1:
         ax.plot(CM * values[space[0]].values, values.values, ".", color=DATA, ms=4)
@@ -334,7 +337,7 @@ def _middles(norm: BoundaryNorm) -> list[float]:
 
 
 def finish_panels(axes: np.ndarray, array: xr.DataArray, outline: Thruster | None) -> None:
-    """Labels at the rim, the channel, and one axis alone from end to end of its cells."""
+    """Finish panels: outer labels, the channel's outline, and the full range of a single axis."""
     space = space_axes(array)
     for ax in axes.flat:
         ax.tick_params(labelsize=8)
@@ -351,7 +354,7 @@ def finish_panels(axes: np.ndarray, array: xr.DataArray, outline: Thruster | Non
 
 
 def _draw_channel(ax: Axes, space: Sequence[str], thruster: Thruster) -> None:
-    """Walls, anode and front face as one line, the exit plane dashed; the limits stay."""
+    """Draw walls, anode and front face as one line, the exit plane dashed; keep the limits."""
     length, inner, outer = (
         CM * x for x in (thruster.channel_length, thruster.inner_radius, thruster.outer_radius)
     )

@@ -1,6 +1,6 @@
-"""Figures of laws of the operating point: coefficients, and points left out.
+"""Figures of laws of the operating point: coefficients, points left out, and maps.
 
-Also what a law says over its parameters: frequency and amplitude of the cycle.
+The maps show frequency and amplitude of a law's limit cycle over its parameters.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from ep2sindy.library.equations import latex_derivative, latex_name, latex_term_
 from ep2sindy.library.units import unit_product, with_prefix
 from ep2sindy.operating.law import OperatingLaw
 
-FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # of errors; what is farther off stands filled on the edge
+FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # beyond: filled marks on the edge
 
-MIN_RANGE = 0.1  # of a coefficient's size: what is constant is drawn so
+MIN_RANGE = 0.1  # least axis range, as a share of the coefficient's size
 
-MAX_LINES = 5  # values of the second parameter that are drawn
+MAX_LINES = 5  # number of the second parameter's values that are drawn
 
 QUANTITIES = ("f_kHz", "relative_amplitude")
 _MARK = {"ls": "none", "color": COLOURS[1], "zorder": 4}
@@ -56,9 +56,9 @@ def laws_figure(
     parameters: Sequence[str],
     labels: Mapping[str, str],
 ) -> Figure:
-    """Every coefficient over the last parameter, a line for each of some values of the first.
+    """Every coefficient over the last parameter, with a line for each of some values of the first.
 
-    coefficients: per point, state and term the value refined alone, and its interval's ends.
+    coefficients: per point, state and term, the value refined alone and the ends of its interval.
     """
     along, others = parameters[-1], list(parameters[:-1])
     pairs = list(law.coefficients)
@@ -89,9 +89,9 @@ def laws_figure(
 def _choose_lines(
     rows: pd.DataFrame, along: str, others: list[str]
 ) -> list[tuple[dict[str, float], pd.DataFrame]]:
-    """Values of the other parameters with their rows: at most so many, evenly chosen.
+    """At most MAX_LINES values of the other parameters, evenly chosen, with their rows.
 
-    Those with one point alone are left out, where there are others.
+    Values with a single point are left out if there are others.
     """
     by_value = rows.groupby(others) if others else [((), rows)]
     groups = [
@@ -123,7 +123,7 @@ def _draw_law(
 
 
 def _focus(ax: Axes, rows: pd.DataFrame) -> None:
-    """The range of the values, not of an interval that reaches far."""
+    """Set limits by the values alone, as an interval may be very long."""
     values = np.concatenate([rows["alone"], rows["law"]])
     low, high = values.min(), values.max()
     size = (MIN_RANGE * np.abs(values).max()) or 1.0
@@ -132,14 +132,14 @@ def _focus(ax: Axes, rows: pd.DataFrame) -> None:
 
 
 def _unit_of_coef(law: OperatingLaw, state: str, term: str) -> str:
-    """Of a term's coefficient in the rate of a state."""
+    """Unit of a term's coefficient in the equation of a state."""
     units = {name: law.units.get(name, "1") for name in law.library.variables}
     of_term = law.library.units(units)[law.library.index(term)]
     return unit_product([(units[state], 1), ("s", -1), (of_term, -1)])
 
 
 def left_out_figure(rows: pd.DataFrame) -> Figure:
-    """Frequency and amplitudes of free runs at points left out, over those of the records."""
+    """Frequency and amplitudes of free runs at points left out, against those of the records."""
     columns = [str(name) for name in rows]
     states = [name.removeprefix("amplitude_") for name in columns if name.startswith("amplitude_")]
     cycles = list(dict.fromkeys(rows["branch"]))
@@ -157,7 +157,7 @@ def left_out_figure(rows: pd.DataFrame) -> Figure:
 
 
 def _draw_frequencies(ax: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
-    """Of the free runs over those of the records."""
+    """Draw frequencies of the free runs against those of the records."""
     factor, unit = frequency_scale(rows["f_kHz"])
     for name, colour in colours.items():
         for enclosed, face in ((True, colour), (False, "white")):
@@ -182,7 +182,7 @@ def _draw_frequencies(ax: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) 
 def _draw_shapes(
     ax: Axes, rows: pd.DataFrame, states: Sequence[str], colours: Mapping[str, str]
 ) -> None:
-    """Errors of waveforms over those of amplitudes."""
+    """Draw waveform errors against amplitude errors."""
     for state, marker in zip(states, "os^Dv", strict=False):
         for name, colour in colours.items():
             of = rows[rows["branch"] == name]
@@ -190,7 +190,7 @@ def _draw_shapes(
             near = (off.abs() <= FAR_PERCENT) & (error <= FAR_WAVEFORM)
             ax.plot(off[near], error[near], marker, color=colour, mfc="none", ms=6)
             if near.all():
-                continue  # what is empty and not clipped takes all of the canvas in its layout
+                continue  # an empty artist that is not clipped would fill the canvas in the layout
             edge = off[~near].clip(-FAR_PERCENT, FAR_PERCENT), error[~near].clip(0, FAR_WAVEFORM)
             ax.plot(*edge, marker, color=colour, mfc=colour, ms=6, clip_on=False, zorder=5)
         ax.plot([], [], marker, color=DATA, mfc="none", ms=6, label=f"${latex_name(state)}$")
@@ -201,7 +201,7 @@ def _draw_shapes(
 
 
 def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:
-    """Factor on kHz, and the unit, that bring the middle of the frequencies near one."""
+    """Factor on kHz, and the unit, in which the typical frequency is near one."""
     factor, prefix = with_prefix(1e3 * float(np.nanmedian(f_kHz)))
     return 1e3 * factor, f"{prefix}Hz"
 
@@ -215,10 +215,10 @@ def cycle_map_figure(
     parameters: Sequence[str],
     labels: Mapping[str, str],
 ) -> Figure:
-    """Frequency and amplitude of a law's cycle over two parameters, over those of the records.
+    """Frequency and amplitude of a law's cycle over two parameters, with those of the records.
 
-    rows: a grid, its second parameter varying fastest. points: branch (none: it does not
-    oscillate), f_kHz and relative_amplitude of the records. fitted: those of the law.
+    rows: a grid whose second parameter varies fastest. points: branch (empty for points that do not
+    oscillate), f_kHz and relative_amplitude of the records. fitted: parameters of the law's points.
     """
     x, y = (np.unique(rows[name].to_numpy(float)) for name in parameters)
     own, quiet, other = _split_records(points, branch)
@@ -257,7 +257,7 @@ def cycle_line_figure(
     parameters: Sequence[str],
     labels: Mapping[str, str],
 ) -> Figure:
-    """The same as `cycle_map_figure` over the one parameter that there is."""
+    """The figure of `cycle_map_figure` for a law with a single parameter."""
     (name,) = parameters
     own, quiet, other = _split_records(points, branch)
     figure, (axes,) = make_panels(1, 2, (8.4, 3.6))
@@ -288,14 +288,14 @@ def _split_records(
 
 
 def _list_entries(quiet: pd.DataFrame, other: pd.DataFrame, *, face: str) -> list[Artist]:
-    """Of a legend: records, whose markers are filled so, and what else is among the points."""
+    """Legend entries: records, with this marker face, and the other kinds of points that occur."""
     there = ((quiet, CROSS, "not oscillating"), (other, DIAMOND, "record of another cycle"))
     record = Line2D([], [], ls="none", marker="o", mec=DATA, mfc=face, label="record")
     return [record, *(Line2D([], [], **mark, label=label) for of, mark, label in there if len(of))]
 
 
 def _scale_quantity(quantity: str, records: pd.DataFrame) -> tuple[float, str]:
-    """Factor on a quantity, and what its axis says."""
+    """Factor on a quantity, and the label of its axis."""
     if quantity != "f_kHz":
         return 1.0, "relative amplitude"
     factor, unit = frequency_scale(records["f_kHz"])
@@ -303,7 +303,7 @@ def _scale_quantity(quantity: str, records: pd.DataFrame) -> tuple[float, str]:
 
 
 def _colour_range(values: np.ndarray, seen: np.ndarray) -> Normalize:
-    """That of the records and of nearly all of the map, but not far beyond the records."""
+    """Colour range of the records and nearly all of the map, kept close to the records."""
     low, high = seen.min(), seen.max()
     reach = (high - low) or abs(high)
     if np.isfinite(values).any():
@@ -316,7 +316,7 @@ def _colour_range(values: np.ndarray, seen: np.ndarray) -> Normalize:
 def _draw_boundaries(
     ax: Axes, x: np.ndarray, y: np.ndarray, rows: pd.DataFrame, fitted: np.ndarray
 ) -> None:
-    """Where cycles end, where the fixed point turns stable, and the hull of what was fitted."""
+    """Draw where cycles end, where the fixed point turns stable, and the hull of fitted points."""
     shape = (len(x), len(y))
     alive = (rows["fate"] == "oscillates").to_numpy().reshape(shape).astype(float)
     if min(shape) > 1 and 0.0 < alive.mean() < 1.0:
@@ -331,7 +331,7 @@ def _draw_boundaries(
 
 
 def _enclose(points: np.ndarray) -> np.ndarray:
-    """Closed convex outline; the ends of a line where all lie on one."""
+    """Closed convex outline of the points; the two ends if all lie on one line."""
     scaled = (points - points.min(axis=0)) / np.ptp(points, axis=0)
     try:
         around = ConvexHull(scaled).vertices

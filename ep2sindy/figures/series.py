@@ -1,7 +1,7 @@
-"""Figures of time series: data, and models beside them, each in a row or panel of its own.
+"""Figures of time series: data, and models beside them, each in its own row or panel.
 
-Also phase portraits, models beside the data in the plane of two states; and the curves to draw:
-what a figure shows of runs, between which limits, under which names.
+The module also holds phase portraits of models and data in the plane of two states, and the
+preparation of curves: the part of a run to show, its limits and its labels.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 SINCE_START = "time since start of integration"
 
-RARE = 0.01  # of a derivative's samples, low or high, may be edge spikes: they set no scale
+RARE = 0.01  # share of derivative samples, low or high, kept out of the scale as edge spikes
 
 
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
@@ -73,8 +73,8 @@ def trajectory_figure(
 ) -> Figure:
     """A row per model: its run from the data's first sample (colour) over the data (grey).
 
-    Carets mark where a run leaves the panel, a cross where one that diverged stops inside it.
-    verdicts: by name, what becomes of the run. since: what the time is counted from.
+    Carets mark where a run leaves the panel; a cross marks where a diverged run stops inside it.
+    verdicts: by name, the verdict on the run. since: the origin of the time axis, in words.
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = {n: first_part(r.t, r.states, duration_s, run.clock) for n, r in rollouts.items()}
@@ -91,7 +91,7 @@ def derivative_figure(
 ) -> Figure:
     """A row per model: its right-hand side on the data (colour), the data's derivative (grey).
 
-    Spikes of the derivative set no scale: carets mark where a curve leaves the panel.
+    Spikes of the derivative do not set the scale; carets mark where a curve leaves the panel.
     """
     clock = run.clock
     slopes = clock.seconds * smoother.derivative(run.t, run.states)
@@ -115,10 +115,10 @@ def spectrum_figure(
     f_max_Hz: float,
     verdicts: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
-    """A row per model: power spectra of its run (colour) and of the data as long (grey).
+    """A row per model: power spectra of its run (colour) and of the data of equal length (grey).
 
-    The dashed line marks the data's dominant frequency; a row says its model's.
-    verdicts: by name, what becomes of the run.
+    The dashed line marks the data's dominant frequency; each row states its model's.
+    verdicts: by name, the verdict on the run.
     """
     n_samples = max(len(rollout.t) for rollout in rollouts.values())
     data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz, run.clock)
@@ -151,9 +151,10 @@ def _draw_rows(
     limits: Sequence[Limits] = (),
     diverged: Collection[str] = (),
 ) -> tuple[Figure, np.ndarray]:
-    """A row per model, a column per state; the data in grey behind. labels: of rows, by name.
+    """Draw a row per model and a column per state, with the data in grey behind.
 
-    limits: of every column; marks tell where curves leave them, and which runs diverged.
+    labels: row labels, by name. limits: of every column; marks show where curves leave them, and
+    which runs diverged.
     """
     n_rows, n_columns = len(models), len(titles)
     height = float(np.clip(5.0 / n_rows, 1.05, 2.2))
@@ -175,7 +176,7 @@ def _draw_rows(
                     )
         text = labels.get(name, name).replace(", ", ",\n")
         row[0].set_ylabel(text, rotation=0, ha="right", va="center", fontsize=9)
-    for ax in axes[1:].flat:  # columns share their axis, so the first row's factor is everyone's
+    for ax in axes[1:].flat:  # panels of a column share their axis and so the first row's factor
         ax.yaxis.get_offset_text().set_visible(False)
     for column, title in zip(axes.T, titles, strict=True):
         column[0].set_title(title, fontsize=10)
@@ -192,7 +193,7 @@ def _spectra(
     f_max_Hz: float,
     clock: Clock,
 ) -> Curves:
-    """Power of every state up to `f_max_Hz`; none for a run that stopped at once."""
+    """Power of every state up to `f_max_Hz`; empty for a run that stopped at once."""
     if len(t) < 8:
         return Curves(np.empty(0), np.empty((0, states.shape[1])))
     pairs = [power_spectrum(t, column) for column in states.T]
@@ -212,7 +213,7 @@ def _frequency_label(clock: Clock, f_max_Hz: float) -> str:
 
 
 def _power_unit(run: Trajectory, name: str) -> str:
-    """Of a state's power density."""
+    """Unit of a state's power density."""
     if run.clock.unit == "s":
         return unit_product([(run.units[name], 2), ("Hz", -1)])
     return f"{unit_product([(run.units[name], 2)])} {run.clock.unit}".removeprefix("1 ")
@@ -220,7 +221,7 @@ def _power_unit(run: Trajectory, name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """One curve per state over a shared abscissa, in the axis's own prefix."""
+    """One curve per state over a shared abscissa, scaled to the axis's prefix."""
 
     x: Float[np.ndarray, " points"]
     y: Float[np.ndarray, "points n_states"]
@@ -232,7 +233,7 @@ def first_part(
     duration_s: float,
     clock: Clock,
 ) -> Curves:
-    """What lies in the first `duration_s`, over a time that the clock shows."""
+    """The first `duration_s` of the values, over time in the clock's unit."""
     since = t - t[:1]
     shown = since <= duration_s
     return Curves(clock.scale(duration_s)[0] * since[shown], values[shown])
@@ -244,14 +245,14 @@ def limits_of(data: Curves, models: Mapping[str, Curves], rare: float = 0.0) -> 
 
 
 def find_diverged(rollouts: Mapping[str, Rollout], duration_s: float) -> set[str]:
-    """Names of the runs that stop before the end of what is shown."""
+    """Names of the runs that stop before the end of the shown time."""
     return {name for name, r in rollouts.items() if r.diverged and r.lasted_s <= duration_s}
 
 
 def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> dict[str, str]:
-    """A name, and below it what becomes of the run where that is known.
+    """Row labels: the name, and below it the verdict if it is known.
 
-    verdicts: by name; a run that diverged says itself when, counted from its start.
+    verdicts: by name; for a diverged run the label gives the time since its start instead.
     """
     found = {}
     for name, rollout in rollouts.items():
@@ -261,7 +262,7 @@ def run_labels(rollouts: Mapping[str, Rollout], verdicts: Mapping[str, str]) -> 
 
 
 def when_it_diverges(rollout: Rollout) -> str:
-    """`diverges at 182 µs`, counted from its start."""
+    """`diverges at 182 µs`; the time is counted from the run's start."""
     return f"diverges at {rollout.lasted_text or 'once'}"
 
 
@@ -275,7 +276,7 @@ def phase_figure(
 ) -> Figure:
     """A panel per model in the plane of two states: its run (colour) over the data (grey).
 
-    The dot is where it starts; other marks and verdicts as in `trajectory_figure`.
+    The dot marks the start; other marks and verdicts are as in `trajectory_figure`.
     """
     pair = [run.state_names.index(name) for name in plane]
     data = first_part(run.t, run.states[:, pair], duration_s, run.clock)
@@ -302,7 +303,7 @@ def phase_figure(
         place = ax.get_subplotspec()
         if place is not None and place.is_first_col():
             ax.set_ylabel(y_label)
-            # The first panel's factor is everyone's.
+            # All panels share the first one's factor.
             ax.yaxis.get_offset_text().set_visible(place.is_first_row())
     legend_curves(figure, axes)
     return figure

@@ -1,4 +1,4 @@
-"""Figures of a scan: what the discharge does over one parameter, or over two."""
+"""Figures of a scan: the discharge over one parameter, or over two."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from ep2sindy.figures.style import (
 BREATHES = "oscillating"
 HATCHES = {"steady": "//", "decaying": "\\\\", "transit": "..", "diverged": "xx", "failed": "++"}
 STATUS_MARKERS = {BREATHES: "o", "steady": "s", "decaying": "v", "transit": "D"}
-WORTHLESS = ("diverged", "failed")  # whose current says nothing
+WORTHLESS = ("diverged", "failed")  # statuses whose current is meaningless
 CURVES = {  # column -> title, factor
     "I_d_mean": ("discharge current (A)", 1.0),
     "f_kHz": ("frequency (kHz)", 1.0),
     "thrust_N": ("thrust (mN)", 1e3),
     "anode_efficiency": ("anode efficiency (%)", 100.0),
 }
-DARK = 0.6  # of the colour scale: black writing below, white above
+DARK = 0.6  # on the colour scale: text is black below, white above
 
 
 def stability_figure(
     points: pd.DataFrame, axes: Sequence[str], labels: Mapping[str, str]
 ) -> Figure:
-    """Standard deviation of the current over two parameters, a panel for each of the others'.
+    """Standard deviation of the current over two parameters; one panel per value of the others.
 
     points: texts in the columns `axes`, the first along x, and status, cycle, I_d_std and f_kHz.
-    labels: what the parameters are called.
+    labels: names of the parameters.
     """
     along, up, *others = axes
     groups = list(points.groupby(others, sort=False)) if others else [((), points)]
@@ -78,7 +78,7 @@ def stability_figure(
 
 
 def _draw_cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale: Normalize) -> None:
-    """One point: the colour its amplitude, hatched and named where it does not breathe."""
+    """Draw one point: amplitude as colour, hatched and labelled if it does not breathe."""
     status, std = point["status"], float(point["I_d_std"])
     known = status not in WORTHLESS and np.isfinite(std)
     colour = colormaps["Blues"](scale(std)) if known else "white"
@@ -98,7 +98,7 @@ def _draw_cell(ax: Axes, column: int, row: int, point: Mapping[Any, Any], scale:
 def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
     """Current with its standard deviation, frequency, thrust and efficiency over one parameter.
 
-    points: values or texts in the column `along`, and what CURVES names; markers tell statuses.
+    points: values or texts in the column `along`, and the columns of CURVES; markers show statuses.
     """
     figure, panels = make_panels(2, 2, (8.0, 5.2), sharex=True)
     numbers = pd.api.types.is_numeric_dtype(points[along])
@@ -128,7 +128,7 @@ def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
 
 
 def _status_style(status: str) -> dict[str, Any]:
-    """A marker, or an upright line where the current says nothing."""
+    """A marker for a status, or an upright line if the current is meaningless."""
     if status in STATUS_MARKERS:
         colour = COLOURS[0] if status == BREATHES else COLOURS[1]
         return {"ls": "none", "marker": STATUS_MARKERS[status], "color": colour}

@@ -1,6 +1,6 @@
-"""What all figures share: colours, labels and frames.
+"""Elements shared by all figures: colours, labels and frames.
 
-Frames are what a panel shows of curves that may leave it, and where they do.
+A frame sets the range of a panel whose curves may leave it, and marks where they do.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from ep2sindy.library.equations import latex_derivative, latex_name
 
 DATA, GREY = "#222222", "#aaaaaa"
 
-# Okabe & Ito 2008: told apart with any colour vision, and in print.
+# Okabe & Ito 2008: distinct with any colour vision, and in print.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
-# For panels of their own, whose colours need not be told apart from all others.
+# For separate panels, whose colours need not differ from all others.
 MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
 
 Limits = tuple[float, float]
 
 Sharing = bool | Literal["row", "col"]
 
-# Tips at the edge that a curve crosses: left, right, below, above.
+# Caret markers at the edge that a curve crosses: left, right, below, above.
 CARETS = {(0, 0): 4, (0, 1): 5, (1, 0): 7, (1, 1): 6}
 
 OFF_SCALE, STOPS = "off scale", "diverged"
 
-SIGN = "#555555"  # of marks in a legend, which stand for those of every colour
+SIGN = "#555555"  # colour of legend marks, which stand for marks of any colour
 
-N_LINE = 60  # points of the line of a law
+N_LINE = 60  # points on the line of a law
 
 
 def make_panels(
@@ -75,10 +75,10 @@ def make_grid(
     most: int = 4,
     x_label: str = "",
 ) -> tuple[Figure, Sequence[Axes]]:
-    """A canvas of n panels of this size in inches, at most so many in a row, none empty.
+    """A canvas of n panels of this size in inches, at most `most` in a row, none empty.
 
-    extra: height around them. sharex, sharey: whether they share these axes. x_label: below the
-    lowest of every column.
+    extra: additional height in inches. sharex, sharey: whether the panels share these axes.
+    x_label: written below the lowest panel of every column.
     """
     n_rows = -(-n // most)
     n_columns = -(-n // n_rows)
@@ -87,7 +87,7 @@ def make_grid(
     axes = list(grid.flat[:n])
     for ax in grid.flat[n:]:
         ax.remove()
-    for ax in axes[-n_columns:]:  # what sharing hides of a panel above a gap
+    for ax in axes[-n_columns:]:  # sharing hides the labels of a panel above a gap
         ax.tick_params(labelbottom=True)
         ax.xaxis.get_offset_text().set_visible(True)
         ax.set_xlabel(x_label)
@@ -112,20 +112,20 @@ def legend_above(
 
 
 def write_in_cell(ax: Axes, column: int, row: int, text: str, *, colour: str) -> Text:
-    """Write small letters into the middle of a cell, on a map whose cells have a side of one."""
+    """Write small text into the middle of a cell, on a map whose cells have unit sides."""
     return ax.text(
         column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7.5, color=colour
     )
 
 
 def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:
-    """Put a spot over a point that cannot be seen but says more, see `hover`."""
+    """Put an invisible spot with a hover text over a point; see `hover`."""
     (spot,) = ax.plot(x, y, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
     hover(spot, text)
 
 
 def hover(artist: Artist, text: str) -> None:
-    """Let an artist say more where a page is read with a mouse; a bar parts the lines."""
+    """Add a hover text to an artist, for pages read with a mouse; a bar separates its lines."""
     artist.set_gid(f"hover: {text}")
 
 
@@ -134,12 +134,12 @@ def axis_label(name: str, unit: str) -> str:
 
 
 def name_label(name: str, labels: Mapping[str, str]) -> str:
-    """What axes and legends call a quantity: its label, or else its name as a symbol."""
+    """Name of a quantity on axes and in legends: its label, or else its name as a symbol."""
     return labels.get(name, f"${latex_name(name)}$")
 
 
 def held_label(held: Mapping[str, float], labels: Mapping[str, str]) -> str:
-    """Parameters at their values: `$V_D$ (V)` at 300 -> `$V_D$ = 300 V`."""
+    """Parameters with their values: `$V_D$ (V)` at 300 gives `$V_D$ = 300 V`."""
     return ", ".join(_equals(name_label(name, labels), value) for name, value in held.items())
 
 
@@ -151,9 +151,10 @@ def _equals(label: str, value: float) -> str:
 def sample_line(
     x: pd.Series, along: str, held: Mapping[str, float], parameters: Sequence[str]
 ) -> tuple[Float[np.ndarray, " line"], Float[np.ndarray, "line parameters"]]:
-    """From the least to the largest x of one parameter: values of it, and points of all of them.
+    """Points along one parameter from its least to its largest value in x.
 
-    held: the values of the others.
+    Returns the values of that parameter, and the points with all parameters. held: values of the
+    others.
     """
     line = np.linspace(x.min(), x.max(), N_LINE)
     columns = [line if name == along else np.full(N_LINE, held[name]) for name in parameters]
@@ -161,7 +162,7 @@ def sample_line(
 
 
 def slope_label(name: str, unit: str) -> str:
-    """Of the derivative in time, in its unit."""
+    """Label of the time derivative, with its unit."""
     return f"${latex_derivative(name)}$ ({unit_text(unit)})"
 
 
@@ -178,8 +179,8 @@ def frame_limits(
 ) -> Limits:
     """Limits around data and models, within twice the data's range.
 
-    A model that runs away must not shrink the rest. Nor may rare values of the data: that share
-    of them, the lowest and the highest, does not count for the range, as at a derivative's ends.
+    A model that runs away must not shrink the rest. rare: share of the lowest and of the highest
+    data that does not count for the range, such as spikes at a derivative's ends.
     """
     values = np.sort(data)
     n = min(int(np.ceil(rare * len(values))), (len(values) - 1) // 2)
@@ -200,9 +201,9 @@ def find_exits(
     x_limits: Limits,
     y_limits: Limits,
 ) -> list[tuple[float, float, int]]:
-    """Where a curve leaves a panel: (x, y, marker) on the edge that it crosses first.
+    """Exits of a curve from a panel: (x, y, marker) on the edge that it crosses first.
 
-    A curve that begins outside leaves at the point of the edge that is nearest to its first.
+    A curve that begins outside is marked on the edge, at the point nearest to its first point.
     """
     points, limits = np.column_stack([x, y]), np.array([x_limits, y_limits])
     points = points[np.isfinite(points).all(axis=1)]
@@ -218,7 +219,7 @@ def find_exits(
 def _cross(
     start: np.ndarray, end: np.ndarray, limits: np.ndarray, *, nearest: bool = False
 ) -> tuple[float, float, int]:
-    """Of the line from a point inside to one outside, and the caret of that edge."""
+    """Exit of the line from an inner to an outer point, and the caret of the edge it crosses."""
     shares = {
         (axis, side): (limits[axis, side] - start[axis]) / (end[axis] - start[axis])
         for axis in (0, 1)
@@ -241,7 +242,7 @@ def mark_exits(
     limits: tuple[Limits, Limits],
     diverged: bool = False,
 ) -> None:
-    """Carets where a curve leaves the panel; a cross where a run that diverged stops inside."""
+    """Draw carets where a curve leaves the panel; a cross where a diverged run stops inside."""
     for at_x, at_y, marker in find_exits(x, y, *limits):
         ax.plot(
             at_x, at_y, marker=marker, ls="none", color=colour, ms=7.0, clip_on=False, zorder=5,
@@ -255,7 +256,7 @@ def mark_exits(
 
 
 def legend_curves(figure: Figure, axes: Sequence[Axes], n: int = 1) -> None:
-    """A legend of the first panel's first n curves, and of the marks that there are in any."""
+    """Draw a legend of the first panel's first n curves, and of the marks in any panel."""
     there = {str(line.get_label()) for ax in axes for line in ax.lines}
     signs: dict[str, Any] = {OFF_SCALE: 6, STOPS: "x"}
     marks = [

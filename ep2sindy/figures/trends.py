@@ -1,6 +1,6 @@
-"""Figures of the parametric study: tables of estimates and laws in, a matplotlib Figure out.
+"""Figures of the parametric study from tables of estimates and laws, and figures of a sweep.
 
-Also of a sweep: what its jobs found, by what they were given.
+A sweep's figure shows the results of its jobs against their settings.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from ep2sindy.operating.quantity_law import ControlLaw
 
 Style = str | tuple[int, tuple[int, ...]]
 
-# Of quantities that share panels; one alone has the first.
+# Markers of quantities that share panels; a single quantity has the first.
 MARKERS = ("o", "^", "v", "D", "P", "X")
 
-# Of the fits' laws, then of a second quantity of one fit in one panel.
+# Line styles of the fits' laws, then of a second quantity of one fit in a panel.
 LINES: tuple[Style, ...] = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 3)))
 
-APART = 0.022  # between fits at one point, of the axis: error bars must not hide each other
+APART = 0.022  # offset of fits at one point, as share of the axis: error bars stay visible
 
 
 @dataclass(frozen=True)
 class Signs:
-    """What tells fits and quantities apart: colours and lines are fits', markers quantities'.
+    """Styles of fits and quantities: colours and lines for fits, markers for quantities.
 
-    lines: by fit and quantity, of the laws: all of one fit's alike, but where it has several in
-    one panel.
+    lines: line styles of the laws, by fit and quantity. All laws of a fit share one style, unless
+    the fit has several in one panel.
     """
 
     colours: Mapping[str, str]
@@ -55,7 +55,7 @@ class Signs:
     lines: Mapping[tuple[str, str], Style]
 
     def of_fit(self, fit: str) -> Style:
-        """Of its laws, apart from those of further quantities in one panel."""
+        """Style of a fit's laws, except those of further quantities in the same panel."""
         return next((style for (name, _), style in self.lines.items() if name == fit), "none")
 
 
@@ -70,10 +70,11 @@ def trends_figure(
 ) -> Figure:
     """Quantities against one parameter at a time, the others held, with 95 % intervals.
 
-    estimates: a column per parameter, then fit, quantity, value, low, high. published: the same,
-    without ends, as open markers. laws: fit -> quantity -> law, as lines.
-    panels: a row each, of one or more quantities. trends: a column each, (parameter, those held).
-    labels: what axes and the legend call parameters, quantities and fits; else their names.
+    estimates: a column per parameter, then fit, quantity, value, low, high. published: the same
+    without low and high, drawn as open markers. laws: fit -> quantity -> law, drawn as lines.
+    panels: one row each, of one or more quantities. trends: one column each, (parameter, values of
+    the others). labels: names of parameters, quantities and fits on axes and in the legend; by
+    default their own.
     """
     size = (4.4 * len(trends) + 0.8, 2.3 * len(panels) + 1.1)
     figure, axes = make_panels(len(panels), len(trends), size, sharex="col", sharey="row")
@@ -103,7 +104,7 @@ def trends_figure(
 
 
 def rows_at(table: pd.DataFrame, held: Mapping[str, Any]) -> pd.DataFrame:
-    """The rows that have these values."""
+    """The rows with these values."""
     for name, value in held.items():
         table = table[table[name] == value]
     return table
@@ -139,7 +140,7 @@ def _draw_points(
     *,
     offset: float,
 ) -> None:
-    """One fit in one panel: estimates with their intervals, and, open, what was published."""
+    """Draw one fit in one panel: estimates with intervals, and published values as open markers."""
     for name in panel:
         ours, theirs = (table[table["quantity"] == name] for table in tables)
         style: dict[str, Any] = {"color": signs.colours[fit], "ls": "none"}
@@ -162,7 +163,7 @@ def _draw_laws(
     fit: str,
     signs: Signs,
 ) -> None:
-    """Lines of one fit's laws from the least to the largest value of the parameter."""
+    """Draw the laws of one fit as lines, from the least to the largest value of the parameter."""
     for name in (name for name in panel if name in laws):
         line, points = sample_line(x, *trend, laws[name].library.variables)
         style: dict[str, Any] = {"color": signs.colours[fit], "ls": signs.lines[fit, name]}
@@ -170,7 +171,7 @@ def _draw_laws(
 
 
 def _list_entries(signs: Signs, labels: Mapping[str, str], *, published: bool) -> list[Line2D]:
-    """A fit's entry bears the line of its laws; a quantity's its marker, and a line of its own."""
+    """Legend entries: a fit has its laws' line; a quantity its marker, and a line if it has one."""
 
     def entry(label: str, **style: object) -> Line2D:
         return Line2D([], [], **({"color": SIGN, "ls": "none"} | style), label=label)  # type: ignore[arg-type]
@@ -196,9 +197,9 @@ def sweep_figure(
     x_label: str,
     jobs: Sequence[str],
 ) -> Figure:
-    """A panel per headline figure: a dot per job that has it, which says under the mouse which.
+    """A panel per headline figure, with a dot per job; hovering over a dot names the job.
 
-    x: what the jobs were given, or their numbers. values: NaN where a job has none.
+    x: the setting of each job, or its number. values: NaN if a job has none.
     """
     figure, axes = make_grid(len(values), width=3.4, height=2.5, extra=0.2, most=3)
     for ax, (name, numbers) in zip(axes, values.items(), strict=True):

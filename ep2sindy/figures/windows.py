@@ -1,4 +1,4 @@
-"""Figures of windows: their number and length against error and loss."""
+"""Figures of error and loss against the number and length of windows."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
 def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Figure:
     """Coefficient error against noise: a panel per window length, a line per number of windows.
 
-    cells: as `studies.weak_windows.window_cells` gives them. references: settings without
-    windows to choose, drawn in every panel.
+    cells: from `studies.weak_windows.window_cells`. references: settings without a choice of
+    windows, drawn in every panel.
     """
-    # Without noise the errors are those of the integrals, decades below: the table has them.
+    # Errors without noise come from the quadrature and are decades lower; see the table.
     noisy = cells[cells["noise"] > 0.0]
     shown = noisy if len(noisy) else cells
     lengths = cells["n_points"].dropna().unique()

@@ -1,7 +1,7 @@
 """The thesis's synthetic benchmark: how often each variant of the method finds known equations.
 
-`+exp=benchmark`. Source: the thesis, appendix, II-E and III-C. What a variant is, and its figures
-of merit, `+exp=frontier` takes as well.
+The experiment is `+exp=benchmark`. Source: the thesis, appendix, II-E and III-C. The experiment
+`+exp=frontier` uses the same variants and figures of merit.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ FIGURE = (
     "Realizations in which all true equations are among the candidates (left), and are the ones "
     "selected (right), in %. A dash: the variant selects nothing, or N/A in the thesis."
 )
-EXAMPLE_FIGURES = {"attractors": False, "trajectories": True}  # over time
+EXAMPLE_FIGURES = {"attractors": False, "trajectories": True}  # name -> drawn over time
 EXAMPLES = (
     "The first realization of every system and noise level: samples, truth, and the model that "
     "{variant} selects, integrated from where the truth starts. True terms need not follow a "
@@ -73,7 +73,7 @@ TITLES = {
 
 @runtime_checkable
 class Variant(Protocol):
-    """A complete method: trajectories and a library in, supports out; a `Regression` is one."""
+    """A complete method: it maps trajectories and a library to supports. `Regression` is one."""
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
@@ -81,10 +81,10 @@ class Variant(Protocol):
 
 
 def build_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) -> dict[str, Variant]:
-    """The methods of these names, as `definitions` says; no other is built.
+    """Build the named methods from `definitions`; the others are not built.
 
-    Raises ValueError for an unknown name, one whose package is not installed, or what has no
-    `find`.
+    Raises ValueError for an unknown name, for a method whose package is not installed, or for an
+    object without a `find` method.
     """
     unknown = [name for name in names if name not in definitions]
     if unknown:
@@ -106,7 +106,7 @@ def build_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) ->
 
 
 def merits(finding: Finding, system: System) -> dict[str, float]:
-    """The three figures of merit for one realization, as numbers; NaN where none was selected."""
+    """The three figures of merit of one realization, as numbers; NaN if no support was selected."""
     truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
     found = {"on_front": float(all(truth[state] in finding.kept[state] for state in truth))}
     if finding.selected is None:
@@ -120,10 +120,11 @@ def merits(finding: Finding, system: System) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Study:
-    """Draw, search, count: every variant on the same realizations of every system and noise.
+    """Run every variant on the same realizations of all systems and noises; count successes.
 
-    noises: standard deviations of the white noise, in RMS of each state. n_trajectories: of each
-    realization. variants: names among the definitions. thesis: its tables, to stand beside ours.
+    noises: standard deviations of the white noise, in RMS of each state. n_trajectories: number of
+    trajectories in each realization. variants: names among the definitions. thesis: the thesis's
+    tables, shown beside ours.
     """
 
     systems: Names
@@ -158,11 +159,12 @@ class Study:
         seed: int = 0,
         progress: Callable[[int], None] = lambda n_more: None,
     ) -> pd.DataFrame:
-        """Every variant on every realization, realizations being the workers' pieces.
+        """Figures of merit of every variant on every realization; workers share the realizations.
 
-        One row per system, noise, number and variant: on_front and selected (is the whole system
-        right), correct_terms (true terms among those selected), cpu_s. A variant that selects
-        nothing has NaN there. Raises ValueError for an unknown system, or nothing to run.
+        One row per system, noise, number and variant. on_front and selected: 1 if the equations of
+        all states are right, else 0. correct_terms: number of true terms among the selected ones.
+        cpu_s: time of the search. selected and correct_terms are NaN for a variant that selects
+        nothing. Raises ValueError for an unknown system, or if there is nothing to run.
         """
         check_systems(self.systems)
         tasks = list(product(self.systems, sorted(self.noises), range(self.n_realizations)))
@@ -181,7 +183,7 @@ def _outcomes(
     system, runs = realization(name, noise, number, n_trajectories=n_trajectories, seed=seed)
     rows: list[dict[str, object]] = []
     for label, variant in variants.items():
-        # A stream of its own, so that leaving a variant out changes no other.
+        # Each variant has its own random stream, so that leaving one out changes no other.
         rng = np.random.default_rng([seed, number, *label.encode()])
         start = time.process_time()
         finding = variant.find(runs, system.model.library, rng=rng)
@@ -197,8 +199,9 @@ def _outcomes(
 def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
     """Counts over all realizations, one row per system, noise and variant.
 
-    on_front, selected: number of realizations; mean_correct_terms; n; cpu_s_per_search: median,
-    so that compiling during the first search does not count.
+    on_front, selected: numbers of realizations. mean_correct_terms: mean over the realizations.
+    n: number of realizations. cpu_s_per_search: the median, so that compilation during the first
+    search does not count.
     """
     grouped = outcomes.groupby(["system", "noise", "variant"], sort=False)
     return grouped.agg(
@@ -212,7 +215,7 @@ def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class FirstRealizations:
-    """The first realization of every system and noise, and what a variant made of it."""
+    """First realizations of every system and noise level, with the models a variant found."""
 
     variant: str
     found: Sequence[Identified]
@@ -227,9 +230,10 @@ def first_realizations(
     seed: int,
     progress: Progress = SILENT,
 ) -> FirstRealizations | None:
-    """By the last variant that makes models, searched as the benchmark does; None without one.
+    """Models found in the first realizations by the last variant that makes models.
 
-    Others offer supports alone.
+    The search is the same as in the benchmark. Other variants give supports only; the result is
+    None if no variant makes models.
     """
     recipes = [(name, each) for name, each in variants.items() if isinstance(each, DiscoveryMethod)]
     if not recipes:
@@ -250,7 +254,7 @@ def first_realizations(
 
 
 def published_cells(thesis: Mapping[str, Any]) -> pd.DataFrame:
-    """The thesis's tables in the shape of our cells; selected as a number of realizations."""
+    """The thesis's tables in the format of `cells`, with `selected` as a number of realizations."""
     columns = ["on_front", "selected_percent_of_those", "mean_correct_terms"]
     rows = [
         (variant, system, *values)
@@ -269,10 +273,10 @@ def published_cells(thesis: Mapping[str, Any]) -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Every outcome, and counts of them.
+    """All outcomes of the benchmark, and counts of them.
 
-    published: the thesis's cells, as `cells` without the time. first: what is drawn of
-    the first realizations; None where no variant makes models.
+    published: the thesis's cells, in the format of `cells` without the time. first: the first
+    realizations, which are drawn; None if no variant makes models.
     """
 
     variants: Mapping[str, Variant]
@@ -285,7 +289,7 @@ class Outcome:
         return {}
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        """Outcomes, and our cells beside what the thesis found in the same ones."""
+        """All outcomes, and our cells beside the thesis's values for the same cells."""
         columns = {merit: f"thesis_{merit}" for merit in MERITS}
         keys = ["system", "noise", "variant"]
         beside = self.published.rename(columns=columns)[[*keys, *columns.values()]]
@@ -324,7 +328,7 @@ class Outcome:
         ]
 
     def summary(self) -> dict[str, Any]:
-        """Counts as whole numbers; null where a variant selects nothing."""
+        """The counts as whole numbers; `selected` is null for a variant that selects nothing."""
         rows = self.cells.astype({"on_front": int}).to_dict("records")
         return {
             "cells": [
@@ -334,7 +338,7 @@ class Outcome:
         }
 
     def headline(self) -> dict[str, float]:
-        """Means over systems and noise levels; what selects nothing has 0 % selected, NaN terms."""
+        """Means over systems and noises; a variant that selects nothing has 0 %, and NaN terms."""
         scalars = {}
         for name, rows in self.cells.groupby("variant", sort=False):
             for merit in COUNTS:
@@ -346,7 +350,7 @@ class Outcome:
 
 
 def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table:
-    """A row per variant and per published one, a column per system, noise levels in a cell."""
+    """One row per variant or published one, one column per system; noise levels share a cell."""
     table = merit_table(cells, published, merit)
     digits = 2 if merit == "mean_correct_terms" else 0
     cpu_ms = 1e3 * cells.groupby("variant")["cpu_s_per_search"].mean()
@@ -357,7 +361,7 @@ def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table
         if is_published:
             italic.append(len(rows))
         elif values.isna().all():
-            continue  # it leaves the selection to the user
+            continue  # this variant leaves the selection to the user
         row = {"variant": f"{name}, thesis" if is_published else name}
         for system in cells["system"].unique():
             row[_heading(system, merit)] = "/".join(places(v, digits) for v in values[system])

@@ -1,4 +1,4 @@
-"""Relations between the coefficients of equations, beside none: `+exp=constrained`."""
+"""Fits with relations between coefficients, compared to fits without: `+exp=constrained`."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ KINDS = ("base", "constrained")
 
 @dataclass(frozen=True)
 class ModelCase:
-    """The terms of every state, and relations between their coefficients."""
+    """The terms of every state, and the relations between their coefficients."""
 
     terms: Terms
     relations: Relations
 
     def constraints(self, name: str, states: Sequence[str]) -> tuple[Library, list[Constraint]]:
-        """A library of the terms, and the constraint of either kind of fit."""
+        """A library of the terms, and the constraints of the fits without and with relations."""
         library, terms = terms_of(self.terms, states=states, key=f"models.{name}.terms")
         return library, [constraint(library, terms, given) for given in ((), self.relations)]
 
@@ -53,7 +53,7 @@ Models = Annotated[
 
 @dataclass(frozen=True)
 class Study:
-    """Fit every model with and without its relations, and judge it on the end of the record."""
+    """Fit every model with and without its relations, and test it on the end of the record."""
 
     source: Source
     formulation: Formulation
@@ -74,7 +74,7 @@ class Study:
         for (name, (library, constraints)), stream in count_pieces(
             run.watch, pairs, "model", "fits and free runs"
         ):
-            # Both draw the same: what differs between them is then the constraint alone.
+            # Both fits use the same random numbers, so that they differ by the constraint alone.
             seed = int(stream.integers(2**63))
             for kind, each in zip(KINDS, constraints, strict=True):
                 rng = np.random.default_rng(seed)

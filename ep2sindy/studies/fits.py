@@ -1,6 +1,7 @@
-"""Known terms fitted in several ways to the first part of a record, judged alike on the rest.
+"""Fits of known terms to the first part of a record, all tested alike on the rest.
 
-For the experiments that do so: what a config says of terms, the fits, and how they read.
+Shared by the experiments that fit known terms: the config entry for terms, the fits, and their
+tables and figures.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from ep2sindy.studies.views import (
     trajectories,
 )
 
-Terms = Mapping[str, Sequence[int | str]]  # by state; the constant, 1, may come as a number
+Terms = Mapping[str, Sequence[int | str]]  # by state; the constant term 1 may be a number
 Relations = Annotated[
     Sequence[str],
     Check(
@@ -52,7 +53,7 @@ Relations = Annotated[
         lambda value: isinstance(value, list) and bool(value),
     ),
 ]
-DIVERGED = 10.0  # residual, in std, of samples that a run does not reach
+DIVERGED = 10.0  # residual, in std, at samples that a run diverges before
 TITLE = "integrated over held-out time from its first sample (nrmse 1: no better than a constant)"
 INTERVALS = (
     "The intervals say how far the windows' residuals move the coefficients; starts are fitted "
@@ -73,7 +74,7 @@ def terms_of(
 ) -> tuple[Library, dict[str, list[str]]]:
     """The terms of every state, and a library that holds each of them once.
 
-    key: what the config calls this model, for the message.
+    key: the config's key for this model, for error messages.
     """
     if set(given) != set(states) or not all(given.values()):
         came = {state: list(names) for state, names in given.items()}
@@ -92,11 +93,12 @@ def terms_of(
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A fit and what it does on the held-out part.
+    """A fit and its performance on the held-out part.
 
-    from_sample: started at the first sample; from_fit: at a start fitted to the first samples,
-    for one sample may lie off every orbit of the model. cpu_s: of the fit, without that of the
-    model it starts from. status, loss: of a refinement; None and NaN for least squares.
+    from_sample: the run started at the first sample. from_fit: the run started at an initial state
+    fitted to the first samples, because a single sample may lie off every orbit of the model.
+    cpu_s: time of the fit, without the time of the model that it starts from. status, loss: those
+    of a refinement; None and NaN for least squares.
     """
 
     model: SparseModel
@@ -108,9 +110,9 @@ class Evaluation:
 
 
 def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
-    """The first part of a record, and the last `held_out` of its samples.
+    """The first part of a record, and the last `held_out` share of its samples.
 
-    Raises ValueError for a share that leaves either of them under 20 samples.
+    Raises ValueError if either part would have fewer than 20 samples.
     """
     n_train = round(run.n_samples * (1.0 - held_out))
     if min(n_train, run.n_samples - n_train) < 20:
@@ -130,10 +132,10 @@ def fit_and_evaluate(
     *,
     rng: np.random.Generator,
 ) -> Evaluation:
-    """Least squares under the constraint, in one form of the regression.
+    """Fit by least squares under the constraint, in one form of the regression.
 
-    Without covariance: smoothed rows and overlapping windows are not independent, and intervals
-    that took them for it would be too narrow.
+    There is no covariance: smoothed rows and overlapping windows are not independent, and intervals
+    that assume independence would be too narrow.
     """
     begun = process_time()
     model = constrained_fit(
@@ -153,7 +155,7 @@ def evaluate(
     status: str | None = None,
     loss: float = float("nan"),
 ) -> Evaluation:
-    """Integrate a fitted model over the held-out part, from its first sample and from a fit."""
+    """Integrate a model over the held-out part, from its first sample and from a fitted start."""
     return Evaluation(
         model=model,
         from_sample=free_run(model, held),
@@ -165,9 +167,9 @@ def evaluate(
 
 
 def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
-    """The initial state whose trajectory is closest to the first one and a half periods.
+    """Initial state whose trajectory is closest to the first one and a half periods of data.
 
-    Distances in standard deviations of the data; the search begins at the first sample.
+    Distances are in standard deviations of the data. The search starts from the first sample.
     """
     n_samples = min(dominant_window([run], model.states), run.n_samples)
     data = run.window(0, n_samples).columns(model.states)
@@ -184,10 +186,10 @@ def _fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Models by name, fitted to `train` and judged on `held`.
+    """Models by name, fitted to `train` and tested on `held`.
 
-    labels: what a reader calls the models. relations: that the constrained ones obey. findings,
-    more_tables, more_figures, more_sections: what the study itself adds.
+    labels: readable names of the models. relations: those that the constrained models obey.
+    findings, more_tables, more_figures, more_sections: what the study itself adds.
     """
 
     train: Trajectory
@@ -203,7 +205,7 @@ class Outcome:
 
     @property
     def f_data_Hz(self) -> float:
-        """Of the first state on the held-out part, as models are held against it."""
+        """Dominant frequency of the first state on the held-out part; models are compared to it."""
         return dominant_frequency(self.held.t, self.held.states[:, 0])
 
     @property
@@ -246,10 +248,10 @@ class Outcome:
         ]
 
     def _table(self) -> Table:
-        """A row per model: how it runs."""
+        """One row per model: how it runs."""
         metrics = [self._frequency, *METHOD]
         rows = ResultTable(self.labelled, metrics).screen("method")
-        if rows["status"].isna().all():  # least squares has none
+        if rows["status"].isna().all():  # least squares has no status
             del rows["status"]
         return Table(
             rows,
@@ -261,7 +263,7 @@ class Outcome:
 
     @property
     def _frequency(self) -> Metric[Evaluation]:
-        """Of a model, beside that of the data."""
+        """The frequency of a model, beside that of the data."""
 
         def text(judged: Evaluation) -> str:
             run = judged.from_sample
@@ -283,7 +285,7 @@ class Outcome:
         return ResultTable(self.judged, METHOD).headline()
 
 
-# A free run: CSV by state; in JSON and headlines what has states is that of the first.
+# Metrics of a free run. CSV has values by state; JSON and headlines have the first state's.
 RUN: Metrics[FreeRun] = [
     Metric("f_Hz", lambda run: run.frequency_Hz, View.CSV),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.JSON),
@@ -322,12 +324,15 @@ def _started_text(run: FreeRun) -> str:
 
 
 def _or_verdict(run: FreeRun, text: str) -> str:
-    """The text, or what became of a model that has no frequency."""
+    """The text; for a model without a frequency, its verdict instead."""
     return run.text if np.isnan(run.f_error) else text
 
 
 def evaluation_summary(judged: Evaluation) -> dict[str, Any]:
-    """f_kHz, f_error, nrmse, amplitude_ratio: of the first state, from the first sample."""
+    """Summary of the run from the first sample: f_kHz, f_error, nrmse, amplitude_ratio.
+
+    Quantities by state are those of the first state.
+    """
     return model_summary(judged.model) | facts(judged, METHOD)
 
 

@@ -1,6 +1,6 @@
-"""The identification frontier: how fast and how long one must sample to find known equations.
+"""Identification frontier: the sampling rate and duration needed to find known equations.
 
-`+exp=frontier`. Source: the thesis, appendix, III-B.
+The experiment is `+exp=frontier`. Source: the thesis, appendix, III-B.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FIGURE = (
 
 @dataclass(frozen=True)
 class Study:
-    """Sample a system at every rate and for every duration, search, judge.
+    """Sample a system at all rates and durations, run every variant, and check the results.
 
     variants: names among the definitions.
     """
@@ -57,13 +57,13 @@ class Study:
         seed: int = 0,
         progress: Callable[[int], None] = lambda n_more: None,
     ) -> pd.DataFrame:
-        """Every variant on one noise-free trajectory per sampling rate and duration.
+        """Result of every variant on one noise-free trajectory per sampling rate and duration.
 
         All trajectories start from the system's initial state. One row per variant, rate and
-        duration: n_samples, identified (is the whole system on the fronts), and reason, why a
-        variant could not run on so few samples, or an empty string.
-        Raises ValueError for nothing to run, and where a variant cannot run on the longest and
-        fastest of all: that is no matter of samples.
+        duration. identified: whether the true equations of all states are on the fronts. reason:
+        why a variant could not run on so few samples, or an empty string. Raises ValueError if
+        there is nothing to run, or if a variant cannot run on the longest and fastest trajectory of
+        all: the cause is then not the number of samples.
         """
         # The largest comes first: a variant that cannot run at all fails before the work is done.
         points = sorted(product(self.rates_Hz, self.durations_s), reverse=True)
@@ -87,7 +87,7 @@ def _point(
     sampled = replace(system, rate_Hz=rate_Hz, duration_s=duration_s)
     rows: list[dict[str, object]] = []
     for name, variant in variants.items():
-        # A stream of its own, so that leaving a variant out changes no other.
+        # Each variant has its own random stream, so that leaving one out changes no other.
         rng = np.random.default_rng([seed, *name.encode()])
         identified, reason = False, ""
         try:
@@ -114,7 +114,10 @@ def _point(
 
 
 def lowest_rates(points: pd.DataFrame) -> pd.DataFrame:
-    """A row per variant: identified points, then the frontier in Hz; NaN where there is none."""
+    """One row per variant: number of identified points, then the lowest rates in Hz by duration.
+
+    The lowest rate is the one from which on all rates identify the system; NaN if there is none.
+    """
     rows = []
     for variant, of_variant in points.groupby("variant", sort=False):
         row: dict[str, object] = {
@@ -131,7 +134,7 @@ def lowest_rates(points: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """points: as `Study.points` gives them."""
+    """Result of the frontier. points: the table that `Study.points` returns."""
 
     system: System
     points: pd.DataFrame

@@ -1,6 +1,6 @@
-"""Integral least squares beside base, weak and constrained models: `+exp=ils`.
+"""Integral least squares compared to base, weak and constrained models: `+exp=ils`.
 
-Also how far the result of a refinement depends on the windows that were drawn.
+The study also measures how far the result of a refinement depends on the windows drawn.
 """
 
 from __future__ import annotations
@@ -69,12 +69,13 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class Study:
-    """Base, weak and constrained least squares, and refinements of base and constrained.
+    """Base, weak and constrained least squares, and refinements of the base and constrained models.
 
-    Beside them the model that lives, from the library of degree 2, refined alike.
-    model: the terms of every state. relations: of the constrained fits. living: how the model
-    that lives is found. window: samples in each; None takes two periods. windows: lengths for loss
-    against window length. n_draws: of windows, for the spread of what refinements do.
+    Beside them stands the living model from the library of degree 2, refined in the same way.
+    model: the terms of every state. relations: those of the constrained fits. living: settings of
+    the search for the living model. window: samples in each window; None takes two periods.
+    windows: lengths for the plot of loss against window length. n_draws: number of draws of
+    windows, for the spread of the refinements' results.
     """
 
     source: Source
@@ -143,13 +144,13 @@ class Study:
     def _living(
         self, train: Trajectory, *, rng: np.random.Generator, progress: Progress
     ) -> SparseModel:
-        """The model that lives on its own, in the library of degree 2."""
+        """The model that oscillates on its own, in the library of degree 2."""
         rows = Regression(self.formulation)
         library = polynomial(train.state_names, degree=2)
         return self.living.found(train, library, rows, rng=rng, progress=progress).model
 
     def _check_windows(self, train: Trajectory) -> None:
-        """Raise ValueError for windows that the fitted part of the data cannot hold."""
+        """Raise ValueError for windows that are longer than the fitted part of the data."""
         asked = {"window": [self.window or MIN_SAMPLES], "windows": self.windows}
         for key, lengths in asked.items():
             for length in lengths:
@@ -162,7 +163,7 @@ class Study:
     def _refinement(
         self, start: SparseModel, relations: Constraint, train: Trajectory, window: int | None
     ) -> Callable[..., Refinement]:
-        """The refinement of a start, which waits for its rng and whatever else differs."""
+        """The refinement from a start, as a function of its rng and the remaining arguments."""
         from ep2sindy.refinement.problem import RefinementSettings
         from ep2sindy.refinement.refine import refine  # PyTorch takes seconds to load
 
@@ -213,7 +214,7 @@ def refine_and_judge(
 def window_table(
     by_window: Mapping[str, Mapping[int, Evaluation]], *, dt_s: float, period_s: float
 ) -> pd.DataFrame:
-    """One row per method and window length; _started: from a fitted start."""
+    """One row per method and window length; columns in _started are for a fitted initial state."""
     rows = []
     for method, judgements in by_window.items():
         for window, each in judgements.items():
@@ -235,7 +236,7 @@ def window_table(
 def watcher(
     tell: Callable[..., None], method: str, constraint: Constraint
 ) -> Callable[[Iteration], None]:
-    """What tells every iteration of a refinement, one scalar each, its number being the step."""
+    """A callback that logs every iteration of a refinement as scalars; the step is its number."""
     names = [constraint.coefficients[k] for k in constraint.free]
     steps = count()
 
@@ -253,14 +254,14 @@ def watcher(
     return watch
 
 
-# How far what a refinement does depends on the windows that were drawn.
+# How far the result of a refinement depends on the windows that were drawn.
 
 
 FIGURES = ("f_error", "nrmse", "amplitude", "waveform")
 
 
 def _figures(run: FreeRun) -> dict[str, float]:
-    """Of one free run; amplitude and waveform are those of the state that is farthest off."""
+    """Figures of one free run; amplitude and waveform error are those of the worst state."""
     ratios = np.array(list(run.amplitude_ratio.values()))
     return {
         "f_error": run.f_error,
@@ -271,7 +272,7 @@ def _figures(run: FreeRun) -> dict[str, float]:
 
 
 def draws_table(draws: Mapping[str, Sequence[FreeRun]]) -> pd.DataFrame:
-    """One row per method and draw of windows: its model run over held-out time."""
+    """One row per method and draw of windows: the model's run over the held-out part."""
     rows = [
         {"method": name, "draw": k, "verdict": str(run.verdict), **_figures(run)}
         for name, runs in draws.items()
@@ -281,7 +282,7 @@ def draws_table(draws: Mapping[str, Sequence[FreeRun]]) -> pd.DataFrame:
 
 
 def spread_summary(runs: Sequence[FreeRun]) -> dict[str, Any]:
-    """`spread`: lowest and highest of each figure over the draws, and how many live."""
+    """`spread`: lowest and highest value of each figure over the draws; number that live."""
     if not runs:
         return {}
     found: dict[str, Any] = {
@@ -294,7 +295,7 @@ def spread_summary(runs: Sequence[FreeRun]) -> dict[str, Any]:
 
 
 def _spread(runs: Sequence[FreeRun]) -> dict[str, tuple[float, float]]:
-    """Lowest and highest of each figure, of the draws that have it; NaN where none has."""
+    """Lowest and highest value of each figure over the draws that have it; NaN if none has it."""
     found = {}
     for name in FIGURES:
         values = np.array([_figures(run)[name] for run in runs])
@@ -304,7 +305,7 @@ def _spread(runs: Sequence[FreeRun]) -> dict[str, tuple[float, float]]:
 
 
 def spread_section(draws: Mapping[str, Sequence[FreeRun]]) -> Section:
-    """A row per method: what its figures range over."""
+    """One row per method: the range of its figures over the draws."""
     rows = []
     for name, runs in draws.items():
         spread = _spread(runs)

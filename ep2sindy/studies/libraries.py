@@ -63,11 +63,11 @@ _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<a
 
 @dataclass(frozen=True)
 class LibraryCase:
-    """A polynomial library; variables_if_present are left out where the field lacks them.
+    """A polynomial library; variables_if_present are left out if the field lacks them.
 
-    functions, function_degree: as `ep.polynomial` takes them; `my_module.tanh` is the function that
-    my_module registers by that name. n_norm: what a knee takes for this library, if not what the
-    recipe says.
+    functions, function_degree: as in `ep.polynomial`; `my_module.tanh` is the function that
+    my_module registers by that name. n_norm: the knee's norm for this library, if it differs from
+    the recipe's.
     """
 
     variables: Sequence[str]
@@ -90,7 +90,7 @@ class LibraryCase:
         )
 
     def recipe(self, recipe: AnyMethod) -> AnyMethod:
-        """The recipe that all libraries share, with this one's norm where the rule has one."""
+        """The shared recipe, with this library's norm if the selection rule has one."""
         if self.n_norm is None or not isinstance(recipe.selection, Knee):
             return recipe
         return replace(recipe, selection=replace(recipe.selection, n_norm=self.n_norm))
@@ -98,15 +98,15 @@ class LibraryCase:
 
 @dataclass(frozen=True)
 class Study:
-    """Discover a model with every library, integrate it from the first sample, compare.
+    """Discover a model with every library, integrate it from the first sample, and compare.
 
-    formulation, bootstraps: of rows, also where the recipe searches trajectories. rollout_s: how
-    far to integrate; None, or more than there is, means to the data's end.
-    thesis: by library, published equations: state -> term -> SI coefficient; where the library
-    has the terms, and the data can tell them from others, they are fitted as well. living: how
-    libraries without inputs are searched for a model that lives; None leaves that out. held_out:
-    the last share of the record, which judges such a model. compared: what its terms are held
-    against.
+    formulation, bootstraps: those of the regression rows, also used where the recipe searches
+    trajectories. rollout_s: integration time; None, or a time beyond the data, means to the data's
+    end. thesis: published equations by library: state -> term -> SI coefficient. They are fitted as
+    well if the library has the terms and the data can tell them from others. living: how libraries
+    without inputs are searched for a model that lives; None leaves that out. held_out: the last
+    share of the record, on which such a model is tested. compared: the quantities that its terms
+    are compared to.
     """
 
     source: Source
@@ -132,7 +132,7 @@ class Study:
             run.say(f"{len(runs)} records in one search; figures show the first")
         if hint := alone(data):
             run.warn(hint)
-        # Each case draws from its own stream, so that adding a case changes no other.
+        # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
         length_m = zone_length_m(self.source, opened[0])
@@ -159,10 +159,10 @@ class Study:
         rng: np.random.Generator,
         progress: Progress,
     ) -> LibraryResult:
-        """What one library finds in all records, and how its model and the published one run.
+        """Discovery of one library in all records; free runs of its model and the published one.
 
-        They run over the first record, the model over the others as well; a model that lives is
-        searched in the first. length_m: of the zone.
+        Both run over the first record; the discovered model also runs over the other records. A
+        model that lives is searched for in the first record. length_m: length of the zone.
         """
         s = self.rollout_s
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
@@ -197,7 +197,7 @@ class Study:
 
 
 def alone(data: Trajectory) -> str | None:
-    """What to say where one state without inputs is asked to oscillate; else None."""
+    """A message if a single oscillating state without inputs is modelled; otherwise None."""
     if len(data.names) > 1 or find_cycle(data.t, data.states) is None:
         return None
     (name,) = data.names
@@ -208,8 +208,9 @@ def alone(data: Trajectory) -> str | None:
 
 
 def register_named(names: Sequence[str]) -> list[str]:
-    """Names as a library takes them: `my_module.tanh(2*x)` imports my_module and is `tanh(2*x)`.
+    """Names in the form that a library takes.
 
+    `my_module.tanh(2*x)` imports my_module and becomes `tanh(2*x)`.
     Raises ValueError for a module that cannot be imported or does not register the name.
     """
     return [_register_one(str(name)) for name in names]
@@ -237,9 +238,9 @@ def _register_one(text: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What every library found in the same data; files: of all records, data being the first.
+    """The discoveries of all libraries in the same data.
 
-    smoother: of the data's derivative.
+    files: names of all records; data is the first of them. smoother: gives the data's derivative.
     """
 
     data: Trajectory
@@ -250,7 +251,7 @@ class Outcome:
 
     @property
     def published(self) -> dict[str, FreeRun]:
-        """Models of published terms, where they could be fitted to our data."""
+        """Free runs of the models of published terms, if these could be fitted to our data."""
         return {n: r.published for n, r in self.results.items() if r.published is not None}
 
     @property
@@ -259,7 +260,7 @@ class Outcome:
 
     @property
     def living(self) -> dict[str, Living]:
-        """Models that were searched for on their own cycle, by library."""
+        """The living models that were searched for, by library."""
         return {n: r.living for n, r in self.results.items() if r.living is not None}
 
     def models(self) -> dict[str, SparseModel]:
@@ -280,7 +281,7 @@ class Outcome:
 
     @property
     def comparison(self) -> ResultTable[FreeRun]:
-        """One row per model: frequencies, trajectory error, and a word on the trajectory."""
+        """One row per model: frequencies, trajectory error, and the verdict on the trajectory."""
         published = {f"{name}, thesis's terms": each for name, each in self.published.items()}
         return ResultTable(self.selected | published, frequencies(self.data))
 
@@ -326,7 +327,7 @@ class Outcome:
         return found
 
     def _in_short(self) -> Section:
-        """The equations that were found and how they run; a screen ends with them anyway."""
+        """The equations found and how they run, page only: the screen ends with them anyway."""
         blocks: list[Block] = []
         for name, result in self.results.items():
             living, clock = result.living, self.data.clock
@@ -355,7 +356,7 @@ class Outcome:
 
 
 def frequencies(data: Trajectory) -> Metrics[FreeRun]:
-    """How models run beside the data: frequencies by state, trajectory error, verdict."""
+    """Metrics of models' runs against the data: frequencies by state, trajectory error, verdict."""
     text = data.clock.frequency_text
     f_data = {
         state: dominant_frequency(data.t, column)

@@ -1,4 +1,4 @@
-"""What one library finds, and how it reads: candidates, the samples' noise, free runs."""
+"""Result of one library and its presentation: candidates, noise of the samples, free runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ep2sindy.selection.rule import selected
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.term_roles import Roles
 
-# What the columns of a front mean, by the labels of selection rules where those need words.
+# What the columns of a front mean; RULES explains the labels of the selection rules.
 COLUMNS = (
     "R2: of the derivative, on rows held out from the fit where there are any; share: of the "
     "bootstraps that proposed these terms."
@@ -52,11 +52,11 @@ FITS = (
 
 @dataclass(frozen=True, eq=False)
 class LibraryResult:
-    """One library's discovery and its selected model; the published terms, fitted to our data.
+    """One library's discovery with its selected model, and the published terms fitted to our data.
 
-    given: the published terms as printed, by state. living: a model that lives on its own; None
-    where it was not asked for, or the library has inputs. roles: of its terms. elsewhere: the
-    selected model over the records beside the first.
+    given: the published coefficients as printed, by state. living: a model that oscillates on its
+    own; None if none was asked for, or if the library has inputs. roles: of the terms of the living
+    model. elsewhere: free runs of the selected model over the records after the first.
     """
 
     recipe: AnyMethod
@@ -71,11 +71,11 @@ class LibraryResult:
 
     @property
     def label(self) -> str:
-        """What the scores are called."""
+        """The name of the selection score."""
         return self.recipe.selection.label
 
     def front_tables(self, name: str) -> dict[str, pd.DataFrame]:
-        """The fronts as in the thesis's Tables I-III, and terms that the data cannot tell apart."""
+        """Fronts as in the thesis's Tables I-III, and terms that the data cannot tell apart."""
         found = self.discovery
         fronts = [self._front_table(front) for front in found.fronts.values()]
         ambiguities = [(a.exact, " ".join(a.terms), a.message) for a in found.ambiguities]
@@ -87,7 +87,7 @@ class LibraryResult:
     def _front_table(self, front: ParetoFront) -> pd.DataFrame:
         table = ResultTable(candidate_rows(front), candidate_metrics(self.label)).csv()
         without = ["r2_test", "r2_train"] if front.problem is None else []
-        return table.drop(columns=without)  # a search of trajectories has no rows
+        return table.drop(columns=without)  # a search of trajectories has no regression rows
 
     def sections(self, name: str, data: Trajectory) -> list[Section]:
         found = [_candidates_section(name, self, data.clock)]
@@ -118,8 +118,8 @@ class LibraryResult:
 class CandidateRow:
     """A candidate of a front.
 
-    terms: as the model has them, which may be weighted otherwise. left: of the noise, by the terms
-    of the model; None where that is not known.
+    terms: coefficients as in the model, which may come from a weighted fit. left: statistics of the
+    residuals of the model's terms relative to the noise; None if the noise is not known.
     """
 
     candidate: Candidate
@@ -139,7 +139,7 @@ TRAJECTORY: Metrics[FreeRun] = [
 
 
 def candidate_metrics(label: str) -> Metrics[CandidateRow]:
-    """Columns of a front, and what is said of the selected one; label: what scores are called."""
+    """Columns of a front, and facts on the selected candidate. label: the name of the scores."""
     return [
         Metric("equation", lambda row: row.candidate.equation, View.CSV),
         Metric("terms", lambda row: row.terms, View.JSON),
@@ -180,7 +180,7 @@ def refit(
     runs: Sequence[Trajectory],
     rng: np.random.Generator,
 ) -> dict[str, Candidate]:
-    """Published terms fitted to our rows, where the data can tell them from others."""
+    """Published terms fitted to our rows, where the data can tell the terms from others."""
     fits = {}
     problems = _rows_by_state(found, rows, runs, rng) if published else {}
     for state, terms in published.items():
@@ -195,7 +195,7 @@ def refit(
 def _rows_by_state(
     found: Discovery, rows: Regression, runs: Sequence[Trajectory], rng: np.random.Generator
 ) -> dict[str, RegressionRows]:
-    """By state the rows that were searched; of a search of trajectories, rows for a fit."""
+    """The searched rows by state; after a search of trajectories, rows assembled for a fit."""
     fronts = found.fronts.values()
     if known := {front.equation: front.problem for front in fronts if front.problem is not None}:
         return known
@@ -242,7 +242,7 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
 
 
 def left_over(state: str, test: NoiseTest) -> list[str]:
-    """A line on what the selected terms leave of the rows, where their noise is known."""
+    """A line on the residuals of the selected terms, if the noise of the rows is known."""
     if (left := test.left.get(state)) is None:
         return []
     return [
@@ -257,7 +257,7 @@ def candidate_text(candidate: Candidate) -> str:
 
 
 def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
-    """Candidates, the selected one bold; below them the last fit, and what was published."""
+    """Table of the candidates, the selected one in bold; below, the final and published fits."""
     found, front = result.discovery, result.discovery.fronts[state]
     rows, held_out = candidate_rows(front), front.held_out
     header, other = ("R2 test", "R2 train") if held_out else ("R2 train", "R2 test")
@@ -282,7 +282,7 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
         fit = equation(here.coef_by_term, "its terms here")
         more.append({"terms": str(here.n_terms), header: r2, "model": fit})
     table = pd.concat([table, pd.DataFrame(more)], ignore_index=True).fillna("")
-    for column in (header, "share"):  # of a search without rows, or without bootstraps
+    for column in (header, "share"):  # empty after a search without rows, or without bootstraps
         if table[column].isin(["-", ""]).all():
             del table[column]
     unit = clock.rate_unit(found.model.units[state])
@@ -295,14 +295,14 @@ def readable_front(result: LibraryResult, state: str, clock: Clock) -> Table:
 
 
 def column_note(label: str) -> str:
-    """What the columns of the fronts say."""
+    """Explanation of the columns of the fronts."""
     rule = RULES.get(label, f"{label}: the score of the selection, least selected")
-    # Candidates that are weighed by trajectories have neither rows nor bootstraps.
+    # Candidates scored by trajectories have neither rows nor bootstraps.
     return f"{rule}." if label == "deviance" else f"{rule}. {COLUMNS}"
 
 
 def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[str, Any]:
-    """The published terms fitted to our data."""
+    """Summary of the published terms as fitted to our data."""
     return {
         "equations": {
             name: {
@@ -317,7 +317,7 @@ def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[
 
 
 def estimate_section(name: str, found: Estimate, data: Trajectory) -> Section:
-    """What the samples say of their noise, whether the model explains them, and what else may."""
+    """Section on the noise of the samples, the misfit of the model, and other possible supports."""
     rows = ResultTable([found], [*noise_sizes(data), *ESTIMATE]).screen(by_state=True)
     blocks: list[Block] = [
         Table(rows, title="noise of the samples", note=NOISE),
@@ -334,7 +334,7 @@ def estimate_section(name: str, found: Estimate, data: Trajectory) -> Section:
 
 
 def noise_sizes(data: Trajectory) -> Metrics[Estimate]:
-    """The noise in SI, and beside the state's spread."""
+    """The noise in SI, and relative to the state's spread."""
 
     def size(found: Estimate) -> dict[str, str]:
         sizes = by_state(found, found.noise_std)
@@ -357,7 +357,7 @@ def by_state(found: Estimate, values: np.ndarray) -> dict[str, float]:
 
 
 def odds(value: float) -> str:
-    """`1:27`; 1:1 is even."""
+    """The odds as text, such as `1:27`; 1:1 is even."""
     return f"1:{1.0 / value:.3g}"
 
 

@@ -1,6 +1,7 @@
-"""A closed model that lives: found by free runs in a part of a record, judged on the rest.
+"""A closed living model, found by free runs in one part of a record and tested on the rest.
 
-With how it reads: a section, tables, figures and a summary for the studies that show it.
+A living model is one that keeps oscillating on its own. The module also holds the section,
+tables, figures and summary for the studies that show such a model.
 """
 
 from __future__ import annotations
@@ -52,14 +53,14 @@ CAPTIONS = {
     "waveform": "One period by phase, shown twice: samples, their waveform, and the model's.",
 }
 STARTS = ((0.5, 0.5), (0.5, 2.0), (1.0, 1.0), (2.0, 0.5), (2.0, 2.0))  # times the cycle's mean
-N_PERIODS = 12.0  # of a run from another start
+N_PERIODS = 12.0  # duration of a run from another start, in periods
 
 
 @dataclass(frozen=True)
 class LivingSearch:
     """How a library without inputs is searched for a model that lives.
 
-    depth: candidates per size and equation.
+    depth: number of candidates per size and equation.
     """
 
     search: Search
@@ -75,14 +76,14 @@ class LivingSearch:
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> Discovery:
-        """What it finds in a record, by the formulation and bootstraps of `rows`."""
+        """The discovery in a record, with the formulation and bootstraps of `rows`."""
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         return discover(train, library, own, seed=rng, progress=progress)
 
     @property
     def bounds(self) -> FreeRunBounds:
-        """What its rule calls living."""
-        from ep2sindy.selection.free_run import FreeRunScore  # torch, for those alone who search
+        """The bounds by which the selection rule calls a model living."""
+        from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for a search
 
         rule = self.selection
         return rule.bounds if isinstance(rule, FreeRunScore) else FreeRunBounds()
@@ -90,7 +91,7 @@ class LivingSearch:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A model selected by its derivatives, refined as it is: how that ended, and how it runs."""
+    """A refinement of the model selected by derivatives: its status and its free run."""
 
     status: str
     run: FreeRun
@@ -98,11 +99,12 @@ class Refined:
 
 @dataclass(frozen=True, eq=False)
 class Living:
-    """A closed model and what it does over held-out time, from the first sample there.
+    """A closed model and its run over the held-out part.
 
-    run: from that sample as a Kalman smoother has it: noise in it is not the model's. cycle: that
-    it oscillates on, and the share of starts around that reach it; None where none was found.
-    by_derivatives: the equations selected by their derivatives, refined as they are.
+    run: starts at the first held-out sample, smoothed by a Kalman smoother so that the sample's
+    noise is not attributed to the model. cycle: the limit cycle of the model; None if none was
+    found. share: the share of starts around it that reach it. by_derivatives: the equations
+    selected by their derivatives, refined with the same terms.
     """
 
     discovery: Discovery
@@ -121,7 +123,7 @@ class Living:
         return int(np.count_nonzero(self.model.coef))
 
     def section(self, name: str) -> Section:
-        """Equations with intervals, how they run, and what the derivatives' choice does instead."""
+        """Equations with intervals, how they run, and the behaviour of the derivatives' choice."""
         model, clock = self.model, self.run.rollout.clock
         rows = ResultTable([self], LIVING).screen(by_state=True)
         blocks: list[Block] = [
@@ -134,7 +136,7 @@ class Living:
         return Section(f"{name}: a model that {_ending(self)}", blocks)
 
     def figures(self, name: str) -> dict[str, Captioned]:
-        """By name; those of a cycle only where there is one."""
+        """Figures by name; those of a cycle only if there is one."""
         run, held = self.run, self.held
         drawn: dict[str, Any] = {}
         if self.cycle is not None:
@@ -149,7 +151,7 @@ class Living:
         return {f"{key}_{name}": Captioned(draw, CAPTIONS[key]) for key, draw in drawn.items()}
 
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` says."""
+        """The entry in `summary.json`."""
         return facts(self, LIVING)
 
 
@@ -232,7 +234,7 @@ def _title(living: Living) -> str:
 
 
 def _note(living: Living) -> str:
-    """Selection, stability, and what the columns are."""
+    """Note on the selection, the stability, and the columns of the table."""
     found = [f"Selection: {living.discovery.note}."]
     if living.cycle is not None and living.share is not None:
         moduli = ", ".join(f"{abs(m):.3g}" for m in living.cycle.multipliers[1:])
@@ -248,7 +250,7 @@ def _note(living: Living) -> str:
 
 
 def _by_derivatives(living: Living) -> str:
-    """What the equations that derivatives select do when they are refined."""
+    """Text on the equations selected by derivatives, after their refinement."""
     refined = living.by_derivatives
     text = "; ".join(
         equation_text(state, refined.run.model.terms(state)) for state in refined.run.model.states
@@ -274,7 +276,7 @@ def _cycle_figure(living: Living) -> Figure:
 
 
 def _paths(living: Living) -> list[Rollout]:
-    """Runs from starts around the cycle's mean, in the first two states."""
+    """Runs from starts around the cycle's mean, in the plane of the first two states."""
     assert living.cycle is not None
     mean = living.cycle.states.mean(axis=0)
     factors = np.ones((len(STARTS), len(mean)))
@@ -283,7 +285,7 @@ def _paths(living: Living) -> list[Rollout]:
 
 
 def runs_from(starts: Iterable[np.ndarray], model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
-    """Runs over twelve periods of a cycle, from other states."""
+    """Runs from other initial states, over twelve periods of a cycle."""
     t = np.linspace(0.0, N_PERIODS * cycle.period_s, 1200)
     return [model.simulate(t, start, blow_up=30.0) for start in starts]
 
@@ -299,9 +301,9 @@ def living_model(
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> Living:
-    """Find it in one part of a record, and run it over the other.
+    """Find a living model in one part of a record, and run it over the other.
 
-    selected: the model that was selected by derivatives, to be refined for comparison.
+    selected: the model selected by derivatives, which is refined for comparison.
     """
     found = settings.found(train, library, rows, rng=rng, progress=progress)
     with progress.stage(None, "", "free run and limit cycle"):
@@ -313,14 +315,14 @@ def living_model(
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
-    """The first sample, smoothed."""
+    """The first sample of a record, smoothed."""
     first = run.window(0, min(run.n_samples, 200))
     smoothed: np.ndarray = KalmanSmoother().smooth(first.t, first.columns(model.states))
     return smoothed[0]
 
 
 def cycle_of(run: FreeRun) -> LimitCycle | None:
-    """The closed orbit that a free run ends on."""
+    """The closed orbit on which a free run ends."""
     if run.model.inputs or run.rollout.diverged or run.verdict is Verdict.DIES_OUT:
         return None
     frequency_Hz = np.nanmax(list(run.frequency_Hz.values()), initial=0.0)
@@ -330,7 +332,7 @@ def cycle_of(run: FreeRun) -> LimitCycle | None:
 
 
 def two_periods(run: Trajectory) -> int | None:
-    """Samples in two periods; None where there is no period, or not two windows of them."""
+    """Samples in two periods; None if there is no period, or no room for two such windows."""
     cycle = find_cycle(run.t, run.states)
     if cycle is None or cycle.n_periods < 4.0:
         return None
@@ -340,8 +342,8 @@ def two_periods(run: Trajectory) -> int | None:
 def _refined(
     model: SparseModel, train: Trajectory, held: Trajectory, progress: Progress
 ) -> Refined:
-    """On windows of two periods, where there are periods."""
-    from ep2sindy.refinement.refine import refine  # torch, for those alone who refine
+    """Refine a model on windows of two periods, if the data have a period."""
+    from ep2sindy.refinement.refine import refine  # loads torch, only for a refinement
 
     found = refine(model, [train], window=two_periods(train), rng=0, progress=progress)
     return Refined(found.status, free_run(found.model, held, initial=start_of(held, model)))

@@ -1,4 +1,4 @@
-"""One model at several operating points, its trends and control laws: `+exp=parametric`."""
+"""One model at several operating points, with trends and control laws: `+exp=parametric`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class CaseSettings:
-    """One way to fit the terms: relations of their coefficients, and what these mean."""
+    """One way to fit the terms: relations of the coefficients, and the quantities these mean."""
 
     relations: Sequence[str] | None
     quantities: Mapping[str, Quantity]
@@ -85,9 +85,9 @@ class SearchLibrary:
 
 @dataclass(frozen=True)
 class LawSettings:
-    """Quantities as polynomials of the parameters.
+    """Settings for laws, which give quantities as polynomials of the parameters.
 
-    tied_degree: of the polynomials that tie the coefficients of the support for all points.
+    tied_degree: degree of the polynomials that tie the coefficients of the common support.
     """
 
     degree: int
@@ -97,7 +97,7 @@ class LawSettings:
 
 @dataclass(frozen=True)
 class Trend:
-    """Along one parameter, the others held."""
+    """A trend along one parameter, with the others held fixed."""
 
     along: str
     at: Mapping[str, float]
@@ -105,7 +105,7 @@ class Trend:
 
 @dataclass(frozen=True)
 class Panels:
-    """Quantities that share a panel of the figure, and what axes and legend call them."""
+    """Quantities that share a panel of the figure, and their labels on axes and in legends."""
 
     panels: Sequence[Sequence[str]]
     labels: Mapping[str, str]
@@ -124,11 +124,12 @@ Published = Mapping[str, Sequence[Mapping[str, float]]]  # fit -> points with th
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Fit, refine and search every operating point; then laws, trends and one support for all.
+    """Fit, refine and search every operating point; then find laws, trends and a common support.
 
-    parameters: where the data group takes each; None for nowhere. points: values of all
-    parameters each, and `data`: what else differs from the data group. model: state -> terms.
-    thesis: published quantities; a fit that it has is shown beside ours.
+    parameters: the place of each parameter in the data group; None if it has none. points: the
+    values of all parameters at each point, and `data` for other differences from the data group.
+    model: state -> terms. thesis: published quantities by fit; they are shown beside our fit of the
+    same name.
     """
 
     source: Source
@@ -171,7 +172,7 @@ class Study:
         alone, together = np.random.default_rng(run.seed).spawn(2)
 
         def tell(number: int, result: PointResult) -> None:
-            """To TensorBoard; a step is the number of a point in the config."""
+            """Log a point to TensorBoard; the step is the number of the point in the config."""
             run.board.scalars(live(result), step=number)
 
         results = fit_points(
@@ -205,10 +206,10 @@ class Study:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What all points gave, and what is made of them together.
+    """Results of all points, and the laws, trends and common support derived from them.
 
-    laws: by fit and quantity. joint: the search over all points at once; None where there was
-    none. along: (parameter, those held) of every trend. published: as `published_table` makes it.
+    laws: by fit and quantity. joint: the search over all points at once; None if there was none.
+    along: (parameter, values of the others) of every trend. published: from `published_table`.
     """
 
     study: PointStudy
@@ -221,12 +222,12 @@ class Outcome:
 
     @property
     def searches(self) -> dict[str, Sequence[Fitted | None]]:
-        """What searches chose, one entry per point, None where there was nothing to fit."""
+        """Results of the searches, one entry per point; None if a point was not fitted."""
         alone = {"each point": [result.searched for result in self.results]}
         return alone | ({"all points": self.joint.fitted} if self.joint else {})
 
     def models(self, pattern: str = "point_{}_{}") -> dict[str, SparseModel]:
-        """By number of the point and name of the fit."""
+        """Models by number of the point and name of the fit."""
         return {
             pattern.format(number, name): fit.model
             for number, result in enumerate(self.results)
@@ -250,7 +251,7 @@ class Outcome:
         }
 
     def figures(self) -> dict[str, Captioned]:
-        """None where no point oscillates or no trend was asked for: it would say nothing."""
+        """The figures; empty if no point oscillates or no trend was asked for."""
         estimates = self._tables["quantities"]
         if estimates.empty or not self.along or not self.shown.panels:
             return {}
@@ -280,7 +281,7 @@ class Outcome:
         ]
 
     def _fit(self, fit: str) -> Section:
-        """One row per point: its quantities with half their intervals, and the thesis's."""
+        """One row per point: quantities with half their interval widths, and published values."""
         estimates = rows_at(self._tables["quantities"], {"fit": fit})
         units = next(each.fits[fit].model.units for each in self.results if each.fits)
         headings = {
@@ -301,7 +302,7 @@ class Outcome:
         return Section(f"{_spoken(fit)}{thesis}", [Table(pd.DataFrame(rows))], level=3)
 
     def _together(self) -> list[Section]:
-        """What is made of all points."""
+        """Sections on all points together: laws, trends, common support."""
         shown = self._tables
         tied = _table(shown["tied"], ["state"])
         if self.joint and self.joint.why_not_tied:
@@ -356,7 +357,7 @@ def _point_line(result: PointResult) -> str:
 
 
 def _heading(name: str, unit: str) -> str:
-    """`g_inj (m^-3 s^-1)`: a quantity with its unit, unless its name ends in that: `L_m`."""
+    """`g_inj (m^-3 s^-1)`: a quantity with its unit; names such as `L_m` already end in theirs."""
     return name if unit == "1" or name.endswith(f"_{unit}") else f"{name} ({unit})"
 
 
@@ -365,23 +366,23 @@ def _spoken(fit: str) -> str:
 
 
 def _cell(row: Mapping[Any, Any]) -> str:
-    """`0.0241 ±0.0001 (0.025)`: value, half the interval, what was published."""
+    """`0.0241 ±0.0001 (0.025)`: value, half the interval's width, published value."""
     text = with_error(row["value"], 0.5 * (row["high"] - row["low"]))
     return text if np.isnan(row["thesis"]) else f"{text} ({row['thesis']:.3g})"
 
 
 def with_error(value: float, reach: float) -> str:
-    """`0.03640 ±2e-05`: the value down to the digit of its error, three digits or more."""
+    """`0.03640 ±2e-05`: the value to the digit of its error, with at least three digits."""
     digits = 3
     if np.isfinite(reach) and reach > 0.0 and value != 0.0:
-        # Of the error as it is printed: 9.6e-05 reads 1e-04.
+        # Digits of the error as it is printed: 9.6e-05 reads 1e-04.
         places = np.floor(np.log10([abs(value), float(f"{reach:.1g}")]))
         digits = int(np.clip(places[0] - places[1] + 1, 3, 8))
     return f"{f'{value:#.{digits}g}'.removesuffix('.')} ±{reach:.1g}"
 
 
 def _table(rows: pd.DataFrame, by: Sequence[str]) -> list[Block]:
-    """Without columns that say nothing; a rule follows where those of `by` change."""
+    """A table without its empty columns; a rule is drawn where the values of `by` change."""
     if rows.empty:
         return [Text("None.")]
     if "fit" in rows:
@@ -416,7 +417,7 @@ def published_table(
 
 
 def estimates_table(results: Sequence[PointResult], published: pd.DataFrame) -> pd.DataFrame:
-    """One row per point, fit and quantity, with what was published."""
+    """One row per point, fit and quantity, with the published value."""
     parameters = list(results[0].parameters)
     rows = [
         (*result.parameters.values(), fit, result.usable(fit), name, e.value, e.low, e.high)
@@ -427,7 +428,7 @@ def estimates_table(results: Sequence[PointResult], published: pd.DataFrame) -> 
     columns = [*parameters, "fit", "usable", "quantity", "value", "low", "high"]
     table = pd.DataFrame(rows, columns=columns)
     known = published.rename(columns={"value": "thesis"})
-    if not rows:  # without rows columns have no types to merge on
+    if not rows:  # an empty table's columns have no types to merge on
         return table.assign(thesis=float("nan"))
     return table.merge(known, how="left", on=[*parameters, "fit", "quantity"])
 
@@ -457,7 +458,7 @@ def supports_table(
 ) -> pd.DataFrame:
     """Terms of every search at each point, with R2 of the derivative.
 
-    searches: one entry per point, None where there was nothing to fit.
+    searches: one entry per point, None if the point was not fitted.
     """
     rows = []
     for k, result in enumerate(results):
@@ -472,7 +473,7 @@ def supports_table(
 
 
 def tied_table(joint: JointResult | None) -> pd.DataFrame:
-    """What it costs to tie the coefficients of the support for all points: R2 at each of them."""
+    """R2 at every point, with coefficients tied over all points and without."""
     rows = []
     if joint and joint.tied:
         for state, test in joint.tied.tests.items():
@@ -491,7 +492,7 @@ def laws_table(laws: Mapping[str, Mapping[str, ControlLaw]]) -> pd.DataFrame:
 
 
 def _law_text(name: str, law: ControlLaw) -> str:
-    """A law reads like an equation, but no derivative: `L_m = 0.00816 + 5.37e-05 V_D_V`."""
+    """A law as text: `L_m = 0.00816 + 5.37e-05 V_D_V`, like an equation without the derivative."""
     return equation_text(name, law.coef_by_term).replace("'", "", 1)
 
 
@@ -500,7 +501,7 @@ def trends_table(
     along: Sequence[tuple[str, Mapping[str, float]]],
     published: pd.DataFrame,
 ) -> pd.DataFrame:
-    """Exponents along each parameter, the others held, and those of the published values."""
+    """Exponents along each parameter with the others fixed, for our and the published values."""
     tables = [pd.DataFrame()]
     for parameter, at in along:
         table = trends(results, along=parameter, at=at)
@@ -516,7 +517,7 @@ def trends_table(
 def point_summary(
     result: PointResult, cases: Mapping[str, Case], searched: Mapping[str, Fitted | None]
 ) -> dict[str, Any]:
-    """Quantities are null where a point has no fit, or a refinement nothing finite."""
+    """Summary of a point; quantities are null without a fit, or if a refinement is not finite."""
     found = {name: _fit_summary(result.fits.get(name), case) for name, case in cases.items()}
     refined: dict[str, dict[str, Any]] = {}
     for name, case in cases.items():
@@ -545,7 +546,7 @@ def point_summary(
 def _fit_summary(
     fit: Fitted | None, case: Case
 ) -> tuple[dict[str, float | None], dict[str, list[float]] | None, dict[str, float] | None]:
-    """Values by quantity; ends of their intervals; R2 by state."""
+    """Values by quantity, ends of their intervals, and R2 by state."""
     if fit is None:
         return dict.fromkeys(case.quantities), None, None
     known = fit.estimates
@@ -569,7 +570,7 @@ def laws_summary(laws: Laws) -> dict[str, Any]:
 
 
 def joint_summary(joint: JointResult | None) -> dict[str, Any] | None:
-    """The support for all points, and its coefficients as polynomials of the parameters."""
+    """The common support of all points, and its coefficients as polynomials of the parameters."""
     if joint is None:
         return None
     return {
@@ -580,7 +581,7 @@ def joint_summary(joint: JointResult | None) -> dict[str, Any] | None:
 
 
 def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
-    """How well laws predict, by fit and quantity; NaN for one that was not found."""
+    """Prediction error of the laws by fit and quantity; NaN for a law that was not found."""
     errors = {}
     for fit, case in fits.items():
         for name in case.quantities:
@@ -591,7 +592,7 @@ def law_errors(laws: Laws, fits: Mapping[str, Case]) -> dict[str, float]:
 
 
 def live(result: PointResult) -> dict[str, float]:
-    """What TensorBoard shows of a point as it comes."""
+    """Scalars that TensorBoard shows for a point as soon as it is done."""
     scalars: dict[str, float] = {}
     for fit, fitted in result.fits.items():
         scalars |= {f"{fit}/{name}": each.value for name, each in fitted.estimates.items()}

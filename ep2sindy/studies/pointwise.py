@@ -1,4 +1,4 @@
-"""A search at every grid point, and the regimes that come out: `+exp=pointwise`."""
+"""A search at every grid point, and the regimes found: `+exp=pointwise`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.trust.user_code import own_source
 
 PACKAGE = Path(__file__).resolve().parents[1]
-# What does not change the result of a point, and may differ when a broken run is taken up.
+# Settings that do not change a point's result; they may differ when a broken run is continued.
 AFTERWARDS = {"output", "parallel", "max_regimes", "keep", "outline", "experiment", "study"}
 FADING = (
     "It fades to grey where it says little: as the equation's R2 (held-out rows, if any), times "
@@ -50,7 +50,7 @@ CAPTIONS = {
     "quality": "R2 on held-out rows if there are any, number of terms, and what became of the "
     "points if not all were fitted.",
 }
-# Over one axis.
+# Captions for a field with a single axis.
 LINE_CAPTIONS = CAPTIONS | {
     "coefficients": "Magnitude of every term's coefficient along the axis; the colour is its sign, "
     f"source or sink. {FADING} No mark: the term is not in the equation, or there is no equation.",
@@ -59,11 +59,11 @@ LINE_CAPTIONS = CAPTIONS | {
 
 @dataclass(frozen=True)
 class Study:
-    """Search everywhere, group what was found.
+    """Search an equation at every grid point, and group the points into regimes.
 
-    terms: those of variables_if_present are left out where the field lacks their variables.
-    keep: folder of finished blocks, where a run that takes up a broken one finds them. outline:
-    the thruster whose channel is drawn into the maps.
+    terms: those of variables_if_present are left out if the field lacks their variables. keep: the
+    folder of finished blocks, from which a run continues a broken one. outline: the thruster whose
+    channel is drawn into the maps.
     """
 
     data: Deferred
@@ -80,10 +80,10 @@ class Study:
     outline: Thruster | None
 
     def __post_init__(self) -> None:
-        self.search(self.library(lacking=()), seed=0)  # what cannot work is refused here
+        self.search(self.library(lacking=()), seed=0)  # refuses settings that cannot work
 
     def library(self, *, lacking: Collection[str]) -> Library:
-        """The terms, without those of variables that a field lacks."""
+        """The library of terms, without those of variables that a field lacks."""
         factors = {name: variables_of(name) for name in map(str, self.terms)}
         terms = [name for name, variables in factors.items() if not {*lacking} & {*variables}]
         used = dict.fromkeys([*self.states, *(v for name in terms for v in factors[name])])
@@ -119,7 +119,7 @@ class Study:
     def _searched(
         self, field: xr.Dataset, search: PointSearch, kept: Kept, run: Run
     ) -> tuple[xr.Dataset, int]:
-        """The result, from where an earlier run was broken off; points that it had done."""
+        """The result, continued from a broken run if any, and number of points from that run."""
         blocks = blocks_of(field, self.block_points)
         n_before = sum(block.n_points for block in blocks if kept.holds(block))
         n_points = sum(block.n_points for block in blocks)
@@ -144,9 +144,9 @@ class Study:
 
 @dataclass(frozen=True, eq=False)
 class Rates:
-    """The run's own progress, and points per second in TensorBoard while the run goes on.
+    """Progress of the run, and points per second in TensorBoard during the run.
 
-    n_before: points that were done already, and come first.
+    n_before: number of points that an earlier run had finished; they come first.
     """
 
     run: Run
@@ -169,7 +169,7 @@ class Rates:
 
 
 def blocks_key(settings: Mapping[str, Any]) -> str:
-    """What the result of a block depends on: settings, the files they name, the code."""
+    """Hash of everything that a block's result depends on: settings, their files, the code."""
     decisive = {key: value for key, value in settings.items() if key not in AFTERWARDS}
     decisive["files"] = [
         (str(path), each.stat().st_size, each.stat().st_mtime_ns)
@@ -184,14 +184,14 @@ def blocks_key(settings: Mapping[str, Any]) -> str:
 
 
 def own_sources(settings: Mapping[str, Any]) -> list[Path]:
-    """Modules and packages other than ours that the settings name: the user's own code."""
+    """The user's own code: modules and packages other than ours that the settings name."""
     names = [text for key, text in texts(settings) if key in ("_target_", "study") and "." in text]
     found = {own_source(name) for name in names if not name.startswith("ep2sindy.")}
     return sorted(path for path in found if path is not None)
 
 
 def texts(settings: object, key: str = "") -> Iterator[tuple[str, str]]:
-    """Every text among some settings, at any depth, after the key that it stands under."""
+    """Every (key, text) pair among some settings, at any depth."""
     if isinstance(settings, Mapping):
         for name, value in settings.items():
             yield from texts(value, str(name))
@@ -204,9 +204,9 @@ def texts(settings: object, key: str = "") -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What was found at the points: `pointwise.nc` holds all of it.
+    """Equations found at the grid points; `pointwise.nc` holds the full result.
 
-    wall_s: of the search. n_before: points that a broken run before this one had done.
+    wall_s: duration of the search. n_before: number of points from an earlier, broken run.
     """
 
     result: xr.Dataset
@@ -221,17 +221,17 @@ class Outcome:
 
     @property
     def points_per_s(self) -> float:
-        """Of this run: without the points that a broken run before it had done."""
+        """Points per second of this run, without the points of an earlier, broken run."""
         return (self.n_points - self.n_before) / self.wall_s
 
     @property
     def status_counts(self) -> dict[str, int]:
-        """Points by what became of them."""
+        """Number of points by status."""
         return {name: int((self.result["status"] == k).sum()) for k, name in enumerate(STATUSES)}
 
     @property
     def empty_counts(self) -> dict[str, int]:
-        """Fitted points by the equation that has no term there; only where there are any."""
+        """Number of fitted points without a term, for the equations that have such points."""
         axes = [axis for axis in SPACE if axis in self.result.dims]
         counts = (self.result["n_terms"] == 0).sum(axes)
         return {str(e): int(n) for e, n in zip(counts["equation"].values, counts, strict=True) if n}
@@ -273,7 +273,7 @@ class Outcome:
         ]
 
     def _points_text(self) -> str:
-        """How many, how fast, and what became of them."""
+        """Text with the number of points, the speed, and the statuses."""
         counts = {name.replace("_", " "): n for name, n in self.status_counts.items() if n}
         became = ", ".join(f"{n} {name}" for name, n in counts.items())
         empty = ", ".join(f"in {state}' at {n}" for state, n in self.empty_counts.items())
@@ -310,10 +310,10 @@ class Outcome:
 
 
 def terms_table(result: xr.Dataset) -> pd.DataFrame:
-    """How often each term acts and how large it is, over all fitted points.
+    """How often each term is selected and how large it is, over all fitted points.
 
-    selected: share of the points. inclusion: mean over the points of its share of the bootstraps.
-    coef, low, high: median, 16 % and 84 % of the points that have the term.
+    selected: share of the points. inclusion: share of the bootstraps that have the term, averaged
+    over the points. coef, low, high: median, 16 % and 84 % over the points that have the term.
     """
     fitted = (result["status"] == 0).values
     rows: list[dict[str, Any]] = []
@@ -349,7 +349,7 @@ def _readable_terms(table: pd.DataFrame) -> Table:
 
 
 def regimes_text(regimes: Regimes) -> str:
-    """How many there are, and how sure."""
+    """Text with the number of regimes and their certainty."""
     count = f"{regimes.n_regimes} regime{'s' if regimes.n_regimes > 1 else ''}"
     limit = ", as many as max_regimes allows: the points may bear more" if regimes.at_limit else ""
     known = regimes.confidence.values[np.isfinite(regimes.confidence.values)]
@@ -357,7 +357,7 @@ def regimes_text(regimes: Regimes) -> str:
 
 
 def _regime_section(regimes: Regimes, regime: int) -> Section:
-    """Its equations, and how they spread over its points."""
+    """Section on one regime: its equations, and the spread of coefficients over its points."""
     rows = regimes.table[regimes.table["regime"] == regime]
     first = rows.iloc[0]
     points = f"{first['n_points']} point{'s' if first['n_points'] > 1 else ''}"
@@ -375,7 +375,7 @@ def _regime_section(regimes: Regimes, regime: int) -> Section:
 
 
 def _spread(rows: pd.DataFrame) -> pd.DataFrame:
-    """Terms of a regime's points."""
+    """The spread of the terms' coefficients over a regime's points."""
     return pd.DataFrame(
         {
             "equation": rows["equation"] + "'",

@@ -1,4 +1,4 @@
-"""One structure and one law for many operating points, and the models between: `+exp=predict`."""
+"""One structure and one law for many operating points, and predictions between: `+exp=predict`."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ CAPTIONS = {
 
 @dataclass(frozen=True)
 class Followed:
-    """Windows of every record: so many, of so many periods of the median frequency."""
+    """Windows of every record: number, and length in periods of the median frequency."""
 
     n_windows: Count
     periods: Positive
@@ -101,7 +101,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Where no model is given: all products of the states to this degree, and how many terms."""
+    """Search without a given model: all products of the states to a degree, and how many terms."""
 
     degree: Count
     max_terms: Count
@@ -119,12 +119,13 @@ Points = Annotated[
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Fit one law to all operating points that oscillate, and judge it where it was not fitted.
+    """Fit one law to all operating points that oscillate, and test it at points left out.
 
-    parameters: where the data group takes each; None for nowhere. points: blocks, each with one
-    value or a list of values for all parameters, and `data`: what else differs from the data
-    group. model: state -> terms; None has them chosen. degrees: of the polynomials, one chosen.
-    map_points: along each parameter. labels: what figures call parameters.
+    parameters: the place of each parameter in the data group; None if it has none. points: blocks,
+    each with one value or a list of values for all parameters, and `data` for other differences
+    from the data group. model: state -> terms; None selects them. degrees: candidate degrees of the
+    polynomials, of which one is selected. map_points: number of points along each parameter.
+    labels: names of the parameters in figures.
     """
 
     source: Source
@@ -143,7 +144,7 @@ class Study:
         given = expand(self.points, list(self.parameters))
         sources = point_sources(self.source, self.parameters, given)
         names = list(self.parameters)
-        # What cannot bear a law even if all points oscillate must cost no simulation.
+        # Points too few for a law, even if all oscillate, are refused before any simulation.
         law_basis(
             polynomial(names, degree=min(self.degrees)),
             np.array([[source.parameters[name] for name in names] for source in sources]),
@@ -209,7 +210,7 @@ class Study:
 def _records(
     opened: Sequence[OperatingRecord], run: Run
 ) -> tuple[list[OperatingRecord], dict[str, str]]:
-    """Records that hold enough periods, and the status of every point by its label."""
+    """The records that hold enough periods, and the status of every point by its label."""
     records, statuses = [], {}
     for point in opened:
         statuses[point.label] = point.status
@@ -225,10 +226,10 @@ def _records(
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Operating points, the law of each cycle, and what it says of points that it has not seen.
+    """Operating points, the law of each cycle, and its predictions at points left out.
 
-    statuses: of every point, by its label. members: parameters of the records, by cycle.
-    branches: by cycle, those that have a law. labels: what figures call parameters.
+    statuses: of every point, by its label. members: parameters of the records, by cycle. branches:
+    by cycle, for the cycles that have a law. labels: names of the parameters in figures.
     """
 
     points: Sequence[Mapping[str, float]]
@@ -243,7 +244,7 @@ class Outcome:
         return list(self.points[0])
 
     def models(self) -> dict[str, SparseModel]:
-        """By cycle and number of the record: what the law says there."""
+        """The law's models at the records, named by cycle and number of the record."""
         return {
             f"{name}_{number}": model
             for name, branch in self.branches.items()
@@ -262,7 +263,7 @@ class Outcome:
         ]
 
     def _also_there(self, label: str, own: str) -> list[str]:
-        """Other cycles whose law oscillates at a point, inside its points."""
+        """Other cycles whose law oscillates at a point within the range of that law's points."""
         return [
             name
             for name, branch in self.branches.items()
@@ -344,7 +345,7 @@ class Outcome:
         return f" at {', '.join(self.parameters)} = {', '.join(texts)}"
 
     def _cycle(self, name: str) -> str:
-        """Of a heading: nothing where there is but one cycle."""
+        """The cycle's name for a heading; empty if there is only one cycle."""
         return "" if len(self.members) == 1 else f" of the {name} cycle"
 
     def _structures(self, name: str) -> Section:
@@ -455,7 +456,7 @@ def points_table(
     records: Sequence[OperatingRecord],
     members: Mapping[str, Sequence[Parameters]],
 ) -> pd.DataFrame:
-    """One row per operating point: what its record is, and on which cycle."""
+    """One row per operating point: status of its record, and its cycle."""
     known = {record.label: record for record in records}
     cycle = {point_label(p): name for name, group in members.items() for p in group}
     rows = []
@@ -475,7 +476,7 @@ def points_table(
 
 
 def laws_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
-    """One row per number of a law, with its 95 % interval."""
+    """One row per coefficient of a law, with its 95 % interval."""
     rows = []
     for name, branch in branches.items():
         law = branch.law
@@ -491,7 +492,7 @@ def laws_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
 
 
 def coefficients_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
-    """Coefficients at every point: refined alone, and by the law, each with 95 % intervals."""
+    """Coefficients at every point, refined alone and from the law, each with 95 % intervals."""
     rows = []
     for name, branch in branches.items():
         pairs = zip(branch.fit.records, branch.fit.fits, branch.tied.models, strict=True)
@@ -510,7 +511,10 @@ def coefficients_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class LeftOutPoint:
-    """What the law of the other points makes of one. also: other cycles whose law oscillates."""
+    """Prediction at one point by the law of the other points.
+
+    also: other cycles whose law oscillates there.
+    """
 
     branch: str
     result: LeaveOneOut
@@ -526,7 +530,7 @@ class LeftOutPoint:
 
 
 def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint]]:
-    """Of points that were left out; which cycle they are on is shown where there are several."""
+    """Metrics of points left out; their cycle is shown if there are several."""
     several = View.SHOWN if len({point.branch for point in points}) > 1 else View.FILES
     factor, unit = frequency_scale(pd.Series([point.f_kHz for point in points]))
     relative = percent(2, sign=True)
@@ -571,7 +575,7 @@ def _yes_or_no(value: bool) -> str:
 
 
 def structures_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
-    """One row per structure and degree that was tried, with weighted laws at points left out."""
+    """One row per structure and degree tried, with the weighted laws' errors at points left out."""
     tables = [
         ResultTable(branch.trials, structure_metrics(name, branch)).csv()
         for name, branch in branches.items()
@@ -608,7 +612,7 @@ def _terms_text(trial: StructureTrial) -> str:
 
 
 def _median_f_error(trial: StructureTrial) -> float:
-    """Over the points left out; a run without a frequency is infinitely far off."""
+    """Median over the points left out; a run without a frequency counts as infinitely far off."""
     errors = np.array([abs(point.run.f_error) for point in trial.found])
     return float(np.median(np.where(np.isnan(errors), np.inf, errors)))
 
@@ -637,7 +641,10 @@ def map_table(branches: Mapping[str, Branch], which: str) -> pd.DataFrame:
 def agreement(
     branches: Mapping[str, Branch], statuses: Mapping[str, str]
 ) -> tuple[int, int, int, int]:
-    """Points where some law says rightly whether it oscillates, of all; quiet ones, of these."""
+    """How often laws predict rightly whether a point oscillates, over all points and quiet ones.
+
+    Returns (right, all points, right among the quiet points, quiet points).
+    """
     says = dict.fromkeys(statuses, False)
     for branch in branches.values():
         for point in branch.at_points:

@@ -1,9 +1,9 @@
 """PySINDy 2.1 in the synthetic benchmark: the candidate supports of four of its methods.
 
-Every derivative, library, weak integral and sparse regression is PySINDy's own; here it is
-set up, its supports are named our way, and each is scored by the R2 of its least-squares
-refit on the method's own rows. The settings differ from PySINDy's defaults where another
-choice found the truth more often in this benchmark:
+Every derivative, library, weak integral and sparse regression is PySINDy's own. This module
+sets them up, translates the supports to our names, and scores each by the R2 of its
+least-squares refit on the method's own rows. The settings differ from PySINDy's defaults where
+another choice found the truth more often in this benchmark:
 
 - no ridge (default 0.05): on normalised columns it is as large as the smaller eigenvalues of
   the Gram matrix, and the Lorenz and Van der Pol truths are then almost never found;
@@ -38,10 +38,10 @@ class SINDyRows:
 
     @cached_property
     def triangle(self) -> tuple[np.ndarray, np.ndarray]:
-        """theta and x_dot in terms + states rows, by QR: the Gram matrix is unchanged.
+        """theta and x_dot reduced to terms + states rows by QR; the Gram matrix is unchanged.
 
-        So are column norms, least-squares coefficients and residuals, and with them every
-        support that PySINDy selects; only the time it takes shrinks.
+        Column norms, least-squares coefficients and residuals are unchanged too, and so is every
+        support that PySINDy selects. Only the time it takes shrinks.
         """
         rows = np.concatenate([self.theta, self.x_dot], axis=1)
         triangle = np.asarray(np.linalg.qr(rows, mode="r"))
@@ -59,7 +59,7 @@ class SINDyRows:
         library: Library,
         states: Sequence[str],
     ) -> Candidates:
-        """Each support but the empty one once, smallest first, with the R2 of its refit."""
+        """Each distinct support but the empty one, smallest first, with the R2 of its refit."""
         theta, x_dot = self.triangle
         total = np.square(self.x_dot - self.x_dot.mean(axis=0)).sum(axis=0)
         found: Candidates = {}
@@ -77,9 +77,9 @@ class SINDyRows:
 
 @dataclass(frozen=True)
 class PySINDySmoothing:
-    """Savitzky-Golay, then second-order differences; theta holds the smoothed states.
+    """Savitzky-Golay smoothing, then second-order differences; theta holds the smoothed states.
 
-    window: samples. order: of the local polynomials.
+    window: length in samples. order: order of the local polynomials.
     """
 
     window: int = 25
@@ -100,7 +100,7 @@ class PySINDySmoothing:
 
 @dataclass(frozen=True)
 class PySINDyStlsq:
-    """Sequentially thresholded least squares, the threshold swept."""
+    """Sequentially thresholded least squares over a range of thresholds."""
 
     n_thresholds: int = 20
     smallest: float = 1e-3
@@ -116,7 +116,7 @@ class PySINDyStlsq:
 
 @dataclass(frozen=True)
 class PySINDySsr:
-    """Stepwise sparse regression: the smallest normalised coefficient leaves, one at a time."""
+    """Stepwise sparse regression: the smallest normalised coefficient is removed, one at a time."""
 
     smoothing: PySINDySmoothing = PySINDySmoothing()
 
@@ -166,9 +166,9 @@ class PySINDyEnsemble:
 
 @dataclass(frozen=True)
 class PySINDyWeakForm:
-    """Weak form on random domains of each run, the threshold of STLSQ swept.
+    """Weak form on random domains of each run, with STLSQ over a range of thresholds.
 
-    half_width: of a domain, as a share of the run.
+    half_width: half the length of a domain, as a share of the run.
     """
 
     n_domains: int = 300
@@ -188,7 +188,7 @@ class PySINDyWeakForm:
         return rows.candidates(masks, library, runs[0].state_names)
 
     def _rows(self, run: Trajectory, library: Library, rng: np.random.Generator) -> SINDyRows:
-        # The bias belongs to the inner library: the outer one's is not integrated against phi.
+        # The bias must come from the inner library: the outer one's is not integrated against phi.
         features, order = pysindy_library(library, run.state_names)
         with legacy_random(rng):
             weak = pysindy.WeakPDELibrary(
@@ -205,7 +205,7 @@ class PySINDyWeakForm:
 
 @dataclass(frozen=True)
 class PySINDyVariant:
-    """A method of PySINDy in our benchmark: candidates, of which the user would have to choose.
+    """A method of PySINDy in our benchmark; it gives candidates, and the user would have to choose.
 
     kept: for every state the best support of each size by R2, and the empty one.
     """
@@ -225,7 +225,7 @@ class PySINDyVariant:
 def best_of_each_size(
     candidates: Sequence[tuple[tuple[str, ...], float]],
 ) -> list[frozenset[str]]:
-    """The support of highest R2 of every size, the empty one first."""
+    """The support of highest R2 of every size, after the empty support."""
     ranked = sorted(candidates, key=lambda c: c[1])
     best = {len(terms): frozenset(terms) for terms, _ in ranked}
     return [frozenset(), *(best[size] for size in sorted(best))]
@@ -234,7 +234,7 @@ def best_of_each_size(
 def pysindy_library(
     library: Library, states: Sequence[str]
 ) -> tuple[pysindy.PolynomialLibrary, list[int]]:
-    """PySINDy's library of the same terms, and where each of our terms stands in it.
+    """PySINDy's library of the same terms, and the index of each of our terms in it.
 
     Raises ValueError unless `library` holds every product of the states up to its degree.
     """
@@ -266,7 +266,7 @@ def threshold_masks(
 
 @contextmanager
 def expected_warnings() -> Iterator[None]:
-    """Silence a sweep's thresholds that empty an equation, and the weak library's own indexing."""
+    """Silence two expected warnings: thresholds that empty an equation, weak-library indexing."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparsity parameter is too big", UserWarning)
         warnings.filterwarnings("ignore", "STLSQ did not converge", ConvergenceWarning)
@@ -277,7 +277,7 @@ def expected_warnings() -> Iterator[None]:
 
 @contextmanager
 def legacy_random(rng: np.random.Generator) -> Iterator[None]:
-    """Let PySINDy, which draws from NumPy's global state, draw from `rng`; then restore it."""
+    """Make PySINDy, which uses NumPy's global state, draw from `rng`; restore it afterwards."""
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(rng.integers(2**32, dtype=np.uint32))  # noqa: NPY002
     try:

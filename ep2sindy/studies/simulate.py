@@ -1,7 +1,7 @@
-"""Run the simulator, once or over any of its parameters, and show what it did: `+exp=simulate`.
+"""Run the simulator once, or over any of its parameters, and show the results: `+exp=simulate`.
 
-One run shows where its power went and how it breathes; a scan shows every combination of some
-settings.
+A single run shows where its power goes and how it breathes. A scan shows every combination of
+some settings.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.cache import write
 from ep2sindy.thruster.verdict import TRANSIT_HZ
 
-MIN_SAMPLES = 16  # fewer cannot be drawn
+MIN_SAMPLES = 16  # fewer samples cannot be drawn
 AVERAGED = " Averaged over r by area."
 CAPTIONS = {
     "current": "Discharge current over the record (above) and over the part that is shaded there, "
@@ -59,7 +59,7 @@ SCANNED = (
     "f_kHz", "I_d_mean", "I_d_std", "thrust_N", "isp_s", "anode_efficiency", "mass_balance",
     "energy_balance",
 )  # fmt: skip
-HEADING = 9  # characters in a line of a table's heading
+HEADING = 9  # characters per line in a table's heading
 MAP = (
     "Standard deviation of the discharge current over the scanned parameters: the colour and the "
     "first number of a cell; below it frequency and cycle (strong: a standard deviation above 90 % "
@@ -86,7 +86,7 @@ Scan = Annotated[
 
 @dataclass(frozen=True)
 class Windowed:
-    """How much figures show: the last periods of the record, and spectra up to a frequency."""
+    """The range that figures show: the record's last periods, and spectra up to a frequency."""
 
     periods: Positive
     f_max_Hz: PositiveOrAll
@@ -94,11 +94,11 @@ class Windowed:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """One run, or one for every combination of some values.
+    """Simulate once, or once for every combination of some values.
 
     scan: places in the data group, such as `operating_point.voltage`, and their values; None for
-    one run. labels: what places are called in tables and figures; else by their names.
-    Raises ValueError for a place where nothing stands.
+    one run. labels: names of the places in tables and figures; by default their own.
+    Raises ValueError for a place that does not exist in the data group.
     """
 
     data: Deferred
@@ -108,7 +108,7 @@ class Study:
     labels: Mapping[str, str]
 
     def __post_init__(self) -> None:
-        scan_points(self.data, self.scan or {})  # a misspelt place must cost no simulation
+        scan_points(self.data, self.scan or {})  # refuses a misspelt place before any simulation
 
     def compute(self, run: Run) -> Outcome | ScanOutcome:
         return self._scanned(run) if self.scan else self._one(run)
@@ -145,7 +145,7 @@ def check_simulation(field: object, data: Deferred) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Settings of one run: values by their place in the data group, and the data with them."""
+    """Settings of one run: values by place in the data group, and the data with these values."""
 
     values: Mapping[str, Any]
     data: Deferred
@@ -157,9 +157,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What became of a point.
+    """Result of one point.
 
-    notes: what is amiss beside the status. message: why it could not be run.
+    notes: warnings besides the status. message: why it could not be run.
     """
 
     status: str
@@ -171,7 +171,7 @@ class Simulated:
 
 
 def scan_points(data: Deferred, scan: Mapping[str, Sequence[Any]]) -> list[Point]:
-    """Every combination, the last place varying fastest; ValueError for a place that is not."""
+    """Every combination, the last place varying fastest; ValueError for an unknown place."""
     found = []
     for values in product(*scan.values()):
         chosen = dict(zip(scan, values, strict=True))
@@ -180,17 +180,17 @@ def scan_points(data: Deferred, scan: Mapping[str, Sequence[Any]]) -> list[Point
 
 
 def quiet(data: Deferred) -> Deferred:
-    """Runs come side by side: their bars would mix."""
+    """Turn off progress bars: points run in parallel, and their bars would mix."""
     try:
         return data.changed({"progress": False})
     except ValueError:
-        return data  # it shows none
+        return data  # these data show no progress
 
 
 def run_point(point: Point) -> Simulated:
-    """Run a point; one that cannot be run says why, and leaves the others alone.
+    """Run a point; if it cannot be run, record the reason, so that other points still run.
 
-    Raises WriteError where the simulation cannot be kept: that is none of the point's.
+    Raises WriteError if the simulation cannot be kept: that is not the point's fault.
     """
     try:
         run = point.data.build()
@@ -212,7 +212,7 @@ def run_point(point: Point) -> Simulated:
 
 
 def value_text(value: Any) -> str:
-    """`250`, `BN`, `ColdStart(n_i=1e+17)`: a value as tables and axes have it."""
+    """A value as text in tables and on axes: `250`, `BN`, `ColdStart(n_i=1e+17)`."""
     if isinstance(value, Mapping):
         name = str(value.get("_target_", "")).rpartition(".")[2]
         inner = [f"{k}={value_text(v)}" for k, v in value.items() if k != "_target_"]
@@ -224,7 +224,7 @@ def value_text(value: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A run, and how much of it figures show: `field.nc` holds all of it."""
+    """A run, and the range that figures show; `field.nc` holds all of it."""
 
     field: xr.Dataset
     periods: float
@@ -232,7 +232,7 @@ class Outcome:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """What a run is judged by, in SI; NaN for what it did not live to have."""
+        """Figures of merit of a run in SI; NaN for those missing because the run diverged."""
         attributes = dict(self.field.attrs)
         if "I_beam" in self.field and self.field.sizes["time"]:
             attributes["I_beam_mean"] = self.field["I_beam"].mean()
@@ -294,7 +294,7 @@ class Outcome:
         ]
 
     def _performance(self) -> pd.DataFrame:
-        """What it did in words and units."""
+        """Performance of the run, in words and units."""
         n, attributes = self.numbers, self.field.attrs
         mode = "transit" if attributes["status"] == "transit" else "breathing"
         share = f"{100.0 * n['I_d_std'] / n['I_d_mean']:.0f}"
@@ -342,7 +342,7 @@ def _with(number: str, unit: str) -> str:
 
 
 def power_table(field: xr.Dataset) -> pd.DataFrame:
-    """Mean power in W by where it goes, and its share of what the plasma takes."""
+    """Mean power in W by sink, and its share of the power that the plasma takes."""
     known = [name for name in POWERS if name in field and field.sizes["time"]]
     power = {name: float(field[name].mean()) for name in known}
     text = {name: str(field[name].attrs.get("long_name", name)) for name in known}
@@ -355,7 +355,7 @@ def power_table(field: xr.Dataset) -> pd.DataFrame:
 
 
 def power_text(field: xr.Dataset) -> Table | Text:
-    """The same to read."""
+    """The power table for reading."""
     table = power_table(field)
     if table.empty:
         return Text("This run has no record of its power.")
@@ -369,7 +369,7 @@ def power_text(field: xr.Dataset) -> Table | Text:
 
 @dataclass(frozen=True, eq=False)
 class ScanOutcome:
-    """All points and what became of them; labels: what some places are called."""
+    """All points of a scan and their results. labels: names of some places."""
 
     points: Sequence[Point]
     results: Sequence[Simulated]
@@ -377,7 +377,7 @@ class ScanOutcome:
 
     @property
     def rows(self) -> pd.DataFrame:
-        """One row per point: its settings, verdict, numbers in SI, and why it failed."""
+        """One row per point: settings, verdict, numbers in SI, and the reason if it failed."""
         nothing = dict.fromkeys(SCANNED, float("nan"))
         rows = []
         for point, each in zip(self.points, self.results, strict=True):
@@ -388,7 +388,7 @@ class ScanOutcome:
 
     @property
     def scanned(self) -> list[str]:
-        """Places that take several values; all where none does."""
+        """Places that take several values; the first place if none does."""
         several = [name for name in self._places if len(self._texts[name].unique()) > 1]
         return several or self._places[:1]
 
@@ -398,7 +398,7 @@ class ScanOutcome:
 
     @property
     def _texts(self) -> pd.DataFrame:
-        """The rows with their settings as text."""
+        """The rows, with the settings as text."""
         texts = {
             name: [value_text(each.values[name]) for each in self.points] for name in self._places
         }
@@ -435,7 +435,7 @@ class ScanOutcome:
         return [Section("Scan", [*lines, self._table(), *pictures(["curves", "stability"])])]
 
     def _failures(self) -> list[Text]:
-        """Why points could not be run, each reason once."""
+        """Reasons why points could not be run, each once."""
         failed: dict[str, list[str]] = {}
         for point, each in zip(self.points, self.results, strict=True):
             if each.message:

@@ -1,4 +1,4 @@
-"""Simulations that a study takes: what they are, what is amiss with them, kernels for many."""
+"""Checks and messages for simulations used as data, and compilation of their kernels."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import xarray as xr
 from ep2sindy.report.run import Run
 from ep2sindy.studies.study import Deferred
 
-MIN_SAMPLES = 200  # some periods of breathing at the usual step: less says nothing of it
+MIN_SAMPLES = 200  # some breathing periods at the usual step; fewer cannot be judged
 GLIMPSE_SAMPLES = 20
-BALANCE_TOLERANCE = 1e-3  # of what enters; a record in float32 closes to 1e-4
+BALANCE_TOLERANCE = 1e-3  # relative to the inflow; a float32 record closes to 1e-4
 BALANCES = {"mass_balance": "mass", "energy_balance": "energy"}
 VERDICTS = {
     "diverged": "the simulation diverged: the end of its record is no physics",
@@ -23,16 +23,16 @@ VERDICTS = {
 
 
 class DivergedError(ValueError):
-    """A run that ended before there was anything to study."""
+    """A run that diverged before it had recorded enough to study."""
 
 
 def is_simulation(attributes: Mapping[str, Any]) -> bool:
-    """Whether they are those that a run of this package's simulators has."""
+    """Whether these are the attributes of a run of this package's simulators."""
     return {"status", "I_d_mean", "I_d_std", "parameters"} <= set(attributes)
 
 
 def check_recorded(field: xr.Dataset) -> None:
-    """Raise DivergedError for a run that broke before it had recorded anything of use."""
+    """Raise DivergedError for a run that diverged before it had recorded enough to study."""
     if is_simulation(field.attrs) and field.attrs["status"] == "diverged":
         n_samples = field.sizes["time"]
         if n_samples < MIN_SAMPLES:
@@ -44,7 +44,7 @@ def check_recorded(field: xr.Dataset) -> None:
 
 
 def amiss(attributes: Mapping[str, Any]) -> list[str]:
-    """Everything that whoever takes this simulation must know; none where all is well."""
+    """Warnings about a simulation, empty if there are none."""
     status = attributes["status"]
     if status == "oscillating":
         return doubts(attributes)
@@ -59,13 +59,13 @@ def amiss(attributes: Mapping[str, Any]) -> list[str]:
 
 
 def doubts(attributes: Mapping[str, Any]) -> list[str]:
-    """What is amiss beside the status: rates beyond their table, balances that do not close."""
+    """Warnings besides the status: rates used beyond their table, balances that do not close."""
     found = []
     if (rates := attributes.get("rates", "covered")) != "covered":
         found.append(str(rates))
     for name, words in BALANCES.items():
         value = attributes.get(name, 1.0)
-        if not abs(value - 1.0) <= BALANCE_TOLERANCE:  # NaN is amiss, too
+        if not abs(value - 1.0) <= BALANCE_TOLERANCE:  # a NaN balance fails, too
             found.append(
                 f"the simulation's {words} balance does not close: (out + stored)/in is {value:.4f}"
             )
@@ -73,7 +73,7 @@ def doubts(attributes: Mapping[str, Any]) -> list[str]:
 
 
 def say_simulation(run: Run, attributes: Mapping[str, Any]) -> None:
-    """One line on a simulation, and its warnings, for the screen, the page and the summary."""
+    """Report a simulation in one line, with its warnings, on screen, page and in the summary."""
     if not is_simulation(attributes):
         return
     known = [name for name in BALANCES if name in attributes]
@@ -88,13 +88,13 @@ def say_simulation(run: Run, attributes: Mapping[str, Any]) -> None:
 
 
 def status_text(attributes: Mapping[str, Any]) -> str:
-    """`oscillating, strong cycle`; a status alone where there is no cycle."""
+    """`oscillating, strong cycle`; the status alone if there is no cycle."""
     cycle = attributes.get("cycle", "none")
     return attributes["status"] + (f", {cycle} cycle" if cycle != "none" else "")
 
 
 def compile_kernels(data: Sequence[Deferred]) -> None:
-    """A glimpse of a run in this process: workers then find the compiled kernels on disk."""
+    """Run a few samples in this process, so that workers find the compiled kernels on disk."""
     with TemporaryDirectory() as folder:
         for each in data:
             sample_s = each.settings.get("sample_s") or 1e-6
@@ -102,5 +102,5 @@ def compile_kernels(data: Sequence[Deferred]) -> None:
             try:
                 each.changed({"sample_s": sample_s, **brief}).build()
             except (ValueError, OSError):
-                continue  # this point says why when its turn comes
+                continue  # the point reports the reason when it is run
             return

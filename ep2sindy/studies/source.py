@@ -1,4 +1,4 @@
-"""Where a study's data come from: a field, its preparation, the trajectory; operating points."""
+"""Data of a study: the field, its preparation, its trajectory; also several operating points."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from ep2sindy.studies.simulated import (
 from ep2sindy.studies.study import Deferred
 
 Step = Callable[[xr.Dataset], xr.Dataset]
-WITHOUT_BREATHING = (  # what a simulation says of itself
+WITHOUT_BREATHING = (  # attributes of a simulation
     Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
 )  # fmt: skip
 
 
 def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
-    """The one record that the data are, prepared; raises ValueError for several files.
+    """The single record of the data, after preparation; raises ValueError for several files.
 
-    Raises DivergedError for a simulation that broke before it could be studied.
+    Raises DivergedError for a simulation that diverged before it could be studied.
     """
     records = _records(data)
     if len(records) > 1:
@@ -54,17 +54,18 @@ def open_prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
 
 
 def _records(data: Deferred) -> list[Deferred]:
-    """One for every file that `data.path` names, or the one that the data are."""
+    """One entry for every file that `data.path` names, or the data themselves."""
     path = data.settings.get("path")
     files = [path] if path is None else files_of(path)
     return [data] if files == [path] else [data.changed({"path": file}) for file in files]
 
 
 def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
-    """What the data say of themselves stays: a step's arithmetic drops it, and a run that
-    diverged would be silent."""
+    """The prepared field, with the attributes of the data. Arithmetic in a step drops them, and
+    a diverged run would then pass without a warning.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulUnit)  # said of the data that are used
+        warnings.simplefilter("ignore", DoubtfulUnit)  # the warning comes once, for the data used
         field: xr.Dataset = data.build()
     check_recorded(field)
     said = dict(field.attrs)
@@ -75,7 +76,7 @@ def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
 
 @runtime_checkable
 class Sampling(Protocol):
-    """How a field becomes a trajectory; states and products are its own."""
+    """How a field becomes a trajectory. states and products are attributes of the method."""
 
     states: Sequence[str]
     products: Sequence[str]
@@ -83,13 +84,13 @@ class Sampling(Protocol):
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory: ...
 
     def place(self, field: xr.Dataset) -> str:
-        """Where on the field's grid, in words; empty for a field without one."""
+        """The place on the field's grid, in words; empty for a field without a grid."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A field, the steps that prepare it, and how it becomes a trajectory."""
+    """A field, the steps that prepare it, and the method that makes a trajectory of it."""
 
     data: Deferred
     prepare: Sequence[Step]
@@ -100,11 +101,11 @@ class Source:
         return list(self.trajectory.states)
 
     def field(self) -> xr.Dataset:
-        """The one record; see `open_prepared`."""
+        """The single record; see `open_prepared`."""
         return open_prepared(self.data, self.prepare)
 
     def fields(self) -> list[xr.Dataset]:
-        """One for every file that `data.path` names, or the one that the data are."""
+        """One field for every file that `data.path` names, or the single field of the data."""
         return [_prepared(record, self.prepare) for record in _records(self.data)]
 
     def inputs(self, libraries: Iterable[Library]) -> list[str]:
@@ -115,26 +116,26 @@ class Source:
         return [name for name in variables if name not in known]
 
     def sampled(self, field: xr.Dataset, libraries: Iterable[Library], run: Run) -> Trajectory:
-        """The trajectory that libraries need, and a word on it for those who watch."""
-        say_simulation(run, field.attrs)  # first: it may say why the rest cannot work
+        """The trajectory that the libraries need; also reports the data on screen and page."""
+        say_simulation(run, field.attrs)  # first, as it may explain later errors
         data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=run.title)
         say_data(run, data, field, self.trajectory.place(field))
         return data
 
 
 def zone_of(source: Source) -> Zone | None:
-    """That the trajectory is averaged over; None for the whole field, and for a point of it."""
+    """The zone that the trajectory is averaged over; None for the whole field or a point of it."""
     return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
 
 
 def zone_length_m(source: Source, field: xr.Dataset) -> float | None:
-    """Of the zone that the trajectory is averaged over, along z; None for the whole axis."""
+    """Length along z of the zone that is averaged over; None for the whole axis."""
     z: Any = resolve_zone(zone_of(source), field).z
     return None if z is None else float(z[1] - z[0])
 
 
 def say_field(run: Run, field: xr.Dataset) -> None:
-    """Which data, for a study of every grid point."""
+    """Report which data are used, for a study of every grid point."""
     t = grid_points(field, "time")
     words = [
         field.attrs.get("file", ""),
@@ -146,14 +147,14 @@ def say_field(run: Run, field: xr.Dataset) -> None:
 
 
 def say_doubts(run: Run, field: xr.Dataset) -> None:
-    """Numbers of a file that look like another unit."""
+    """Warn of numbers in a file that look like another unit."""
     if "file" in field.attrs:
         for text in unit_doubts(field):
             run.warn(text)
 
 
 def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
-    """Which data: the file, the zone, samples and units; what is missing, what looks amiss."""
+    """Report the data: file, zone, samples, units, missing values and warnings."""
     units = ", ".join(f"{name} in {unit}" for name, unit in data.units.items())
     where = [field.attrs.get("file", ""), place]
     frequencies = ", ".join(
@@ -174,11 +175,11 @@ def say_data(run: Run, data: Trajectory, field: xr.Dataset, place: str) -> None:
 
 
 def data_summary(data: Trajectory) -> dict[str, Any]:
-    """What a summary says of a trajectory."""
+    """The summary of a trajectory."""
     return {
         "n_samples": data.n_samples,
         "dt_s": data.dt_s,
-        "time_unit": data.clock.unit,  # that people read; numbers are in seconds
+        "time_unit": data.clock.unit,  # for display only; numbers are in seconds
         "f_kHz": 1e-3 * dominant_frequency(data.t, data.states[:, 0]),
         "variables": list(data.names),
         "units": dict(data.units),
@@ -187,7 +188,7 @@ def data_summary(data: Trajectory) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class PointSource:
-    """One operating point, and where its data come from. It can be sent to another process."""
+    """One operating point and the source of its data. It can be sent to another process."""
 
     parameters: Mapping[str, float]
     source: Source
@@ -197,9 +198,9 @@ class PointSource:
         return point_label(self.parameters)
 
     def open(self, inputs: Sequence[str]) -> OperatingRecord:
-        """Open or simulate it; what does not breathe comes without trajectory.
+        """Open or simulate the point; a point that does not breathe comes without a trajectory.
 
-        A state that stays exactly where it is makes a point steady: no trajectory may hold it.
+        A state that stays exactly constant makes a point steady, as no trajectory may hold it.
         """
         with naming(self.parameters):
             try:
@@ -219,9 +220,10 @@ class PointSource:
 
 
 def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of the values in each block; a point that comes again comes once.
+    """Every combination of the values in each block; repeated points count once.
 
-    That is, with the same data. 300 and 300.0 are one, in whatever order a block names parameters.
+    Points are repeated if they have the same values and the same data. 300 and 300.0 are equal, and
+    the order of parameters in a block does not matter.
     """
     found: dict[str, dict[str, Any]] = {}
     for block in blocks:
@@ -243,7 +245,7 @@ def point_sources(
 ) -> list[PointSource]:
     """The source once per operating point, with its parameters and data in the data group.
 
-    places: parameter -> where the data group takes it; None for nowhere.
+    places: parameter -> its place in the data group; None if it has none.
     Raises ValueError for points without all parameters, or that would open the same data twice.
     """
     names = list(places)
@@ -271,7 +273,7 @@ def point_sources(
 def open_points(
     sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, run: Run
 ) -> list[OperatingRecord]:
-    """Open or simulate all points, and say which data they are and what is amiss with them."""
+    """Open or simulate all points, and report their data and warnings."""
     stage = run.progress(len(sources), "point opened")
     points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
     _say_used(run, points)
@@ -282,7 +284,7 @@ def open_points(
 
 
 def _say_used(run: Run, points: Sequence[OperatingRecord]) -> None:
-    """Which data: in one line where all points are averaged alike, else one each."""
+    """Report which data are used: one line if all points are averaged alike, else one line each."""
     used = {point.label: point.used for point in points if point.used}
     if len({*used.values()}) == 1:
         run.say(f"data: {next(iter(used.values()))}")
@@ -309,6 +311,6 @@ def _changed(data: Deferred, places: Mapping[str, float], more: Mapping[str, Any
         ) from error
     data = data.changed({}, more)
     try:
-        return data.changed({"progress": False})  # points come side by side: bars would mix
+        return data.changed({"progress": False})  # points run in parallel: their bars would mix
     except ValueError:
-        return data  # it shows none
+        return data  # these data show no progress

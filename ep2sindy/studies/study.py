@@ -1,7 +1,7 @@
-"""The study protocol: what an experiment is, from its settings to what people read.
+"""The protocol of studies: an experiment with its settings, and its outcome.
 
-And what a number in a config must be, beside its type: `n_realizations: Count` in a study says it
-once, for the reader and for the check.
+The module also holds annotated types for numbers in a config. `n_realizations: Count` in a study
+states the requirement once, for the reader and for the check.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from ep2sindy.report.run import Run
 
 @runtime_checkable
 class Outcome(Protocol):
-    """All that a study leaves. The runner writes it: models and tables first, then the views.
+    """Everything that a study returns. The runner writes models and tables first, then the views.
 
-    figures: by name, drawn when they are written. sections: what the terminal and the page show.
+    figures: by name, drawn when they are written. sections: content of the terminal and the page.
     summary: the findings, for `summary.json`; experiment and seed are added to it. headline: the
-    few numbers by which runs are compared, in TensorBoard and in the index of a sweep; their
-    names do not depend on what was found.
+    few numbers by which runs are compared, in TensorBoard and in the index of a sweep. Their names
+    do not depend on the findings.
     """
 
     def models(self) -> Mapping[str, SparseModel]: ...
@@ -43,11 +43,11 @@ class Outcome(Protocol):
 
 @runtime_checkable
 class Experiment(Protocol):
-    """A frozen dataclass whose fields are the keys of the config that it takes.
+    """A frozen dataclass whose fields are the keys of its config.
 
-    A field of type AnyMethod or Source stands for the groups that it is made of: formulation,
-    search, ...; data, prepare, trajectory. Everything but the data is built before
-    `compute` is called, so that a misspelt key costs no simulation.
+    A field of type AnyMethod or Source is made of several groups of the config: formulation,
+    search, ...; data, prepare, trajectory. Everything but the data is built before `compute` is
+    called, so that a misspelt key costs no simulation.
     """
 
     def compute(self, run: Run) -> Outcome: ...
@@ -55,7 +55,7 @@ class Experiment(Protocol):
 
 @dataclass(frozen=True)
 class Check:
-    """What a value must be, in words that follow `must be`, and whether one is."""
+    """A requirement on a value: the words after `must be` in an error, and a test."""
 
     message: str
     test: Callable[[Any], bool]
@@ -63,12 +63,12 @@ class Check:
 
 @runtime_checkable
 class Deferred(Protocol):
-    """An object that the config names, built when asked for: data, say, may be a simulation.
+    """An object named in the config and built on request, since data, for one, may be a simulation.
 
-    changed: the same with other values at some places, such as `operating_point.voltage`, then
-    `more` merged in; ValueError for a place where nothing stands. str() gives all settings, in an
-    order of its own: equal objects have equal text. It can be sent to another process.
-    settings: as plain values, `_target_` among them.
+    changed: a copy with other values at some places, such as `operating_point.voltage`, and then
+    `more` merged in; raises ValueError for a place that does not exist. str() gives all settings in
+    a fixed order, so that equal objects have equal text. A Deferred can be sent to another process.
+    settings: plain values, including `_target_`.
     """
 
     @property

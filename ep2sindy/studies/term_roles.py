@@ -1,4 +1,4 @@
-"""What the terms of a living model mean: beside the zone's means, left out, tied by ionization."""
+"""Roles of a living model's terms: compared to zone means, left out in turn, tied together."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Compared:
-    """What the coefficients of ions and neutrals in a zone are held against.
+    """Quantities that the coefficients of ions and neutrals in a zone are compared to.
 
-    ions, neutrals: the states. ion_velocity (m/s), ionization_rate (m^3/s): variables of the data;
-    neutral_speed in m/s, None where it is not known.
+    ions, neutrals: the states. ion_velocity (m/s), ionization_rate (m^3/s): variables of the data.
+    neutral_speed: in m/s, None if it is not known.
     """
 
     ions: str
@@ -42,10 +42,11 @@ class Compared:
     def expected(
         self, data: Trajectory, length_m: float | None
     ) -> dict[tuple[str, str], tuple[str, float]]:
-        """(state, term) -> what a balance of the zone has there, in words and in SI.
+        """The coefficients that a balance of the zone gives: (state, term) -> (words, SI value).
 
-        d n/dt = -u n/L + inflow, and what ionization gives to ions it takes from neutrals.
-        length_m: of the zone, None where it has none. What the data lack is left out.
+        The balance is d n/dt = -u n/L + inflow, and ionization takes from the neutrals what it
+        gives to the ions. length_m: length of the zone, None if it has none. Terms whose variables
+        the data lack are left out.
         """
         found: dict[tuple[str, str], tuple[str, float]] = {}
         product = f"{self.ions}*{self.neutrals}"
@@ -63,9 +64,11 @@ class Compared:
 
 @dataclass(frozen=True, eq=False)
 class Role:
-    """A term of the model; without: how the model runs that lacks it, refined; None if it cannot.
+    """One term of the model.
 
-    expected: what a balance of the zone has in its place, in words and in SI; None for nothing.
+    expected: the term's coefficient in a balance of the zone, in words and in SI; None if the
+    balance has no such term. without: free run of the refined model without the term; None if it
+    cannot be refined.
     """
 
     state: str
@@ -77,8 +80,11 @@ class Role:
 
 @dataclass(frozen=True, eq=False)
 class Roles:
-    """The terms of a model. shared: the run of the model whose ionization is one coefficient, with
-    opposite signs; None where that cannot be refined."""
+    """The roles of a model's terms.
+
+    shared: run of the model in which ionization is one coefficient with opposite signs for ions and
+    neutrals; None if it cannot be refined.
+    """
 
     terms: Sequence[Role]
     shared: FreeRun | None
@@ -87,7 +93,7 @@ class Roles:
         return ResultTable(self.terms, ROLES).csv()
 
     def section(self, name: str) -> Section:
-        """A row per term: what a balance of the zone expects there, and the model without it."""
+        """One row per term: its value in a balance of the zone, and the model without it."""
         shared = facts(self.shared, WITHOUT)
         text = f"Ionization as one coefficient of opposite signs: {shared['verdict']}"
         if self.shared is not None:
@@ -98,7 +104,7 @@ class Roles:
         return Section(f"{name}: what the terms mean", [table, Text(f"{text}.")], level=3)
 
     def summary(self) -> dict[str, Any]:
-        """What `summary.json` says."""
+        """The entry in `summary.json`."""
         text = None if self.shared is None else self.shared.model.text()
         return {
             "terms": [facts(role, ROLES) for role in self.terms],
@@ -106,7 +112,7 @@ class Roles:
         }
 
 
-# Of a refined model that lacks a term; None where it cannot be refined.
+# Metrics of a refined model without one term; None if it cannot be refined.
 WITHOUT: Metrics[FreeRun | None] = [
     Metric(
         "verdict", lambda run: run.text if run else "cannot be refined", View.SHOWN, "without it"
@@ -148,9 +154,9 @@ def term_roles(
     length_m: float | None,
     progress: Progress = SILENT,
 ) -> Roles:
-    """Each term left out in turn, and ionization shared, refined on `train` and run over `held`.
+    """Leave out each term in turn, then share the ionization coefficient; refine and run all.
 
-    length_m: of the zone.
+    Models are refined on `train` and run over `held`. length_m: length of the zone.
     """
     model, expected = found.model, compared.expected(data, length_m)
     support = {state: list(model.terms(state)) for state in model.states}
@@ -180,7 +186,7 @@ def _run(
     *,
     window: int | None,
 ) -> FreeRun | None:
-    """These terms fitted, refined on windows of so many samples, and run; None if they cannot."""
+    """Fit terms, refine them on windows of `window` samples, and run them; None if not finite."""
     held_to = constraint(found.model.library, support, relations)
     problems = list(dict.fromkeys(front.rows for front in found.fronts.values()))
     start = constrained_fit(problems, held_to, units=train.units)
@@ -199,7 +205,7 @@ def _refined(
     *,
     window: int | None,
 ) -> Refinement:
-    from ep2sindy.refinement.refine import refine  # torch, for those alone who refine
+    from ep2sindy.refinement.refine import refine  # loads torch, only for a refinement
 
     return refine(
         start,

@@ -1,6 +1,6 @@
 """A living model from one measured signal: `+exp=trace`.
 
-It is judged on the end of the record, and by runs from starts off its cycle.
+The model is tested on the end of the record, and by runs from starts off its cycle.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ from ep2sindy.studies.views import (
 
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
 
-# Of each equation where none is known, so that their combinations stay few.
+# Candidates per equation if no equation is known, so that there are few combinations.
 DEPTH_OF_BOTH = 2
 
-MIN_JUDGED = 4.0  # periods of the end of a record, to be held out
+MIN_JUDGED = 4.0  # periods that a held-out part must have
 
-STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distances from the cycle's middle, in those of its states
+STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distance from the cycle's middle, relative to its states
 
 CAPTIONS = {
     "free_run": "The model run freely from one sample (colour) over the record that it never saw "
@@ -73,13 +73,13 @@ CAPTIONS = {
 
 @dataclass(frozen=True)
 class Study:
-    """Make states of one signal, search the equation that is not known, judge it by free run.
+    """Embed one signal, search its unknown equation, and test the model by a free run.
 
-    signal: the variable. unit: of one that the data group does not describe, or instead of what it
-    says; None: as it says, else none. offset: added to the samples, in SI. embedding: auto,
-    log_rate, rate or delays; harmonics: of the period that the smoother follows. decimate,
-    detrend: see `trace`. degree: of the library. held_out: the end of the record that the model
-    never sees, and is judged on.
+    signal: the variable. unit: needed if the data group does not describe the signal, or to
+    override its unit; None takes the described unit, or none. offset: added to the samples, in SI.
+    embedding: auto, log_rate, rate or delays. harmonics: number of harmonics of the period that the
+    smoother follows. decimate, detrend: see `trace`. degree: of the library. held_out: the share at
+    the end of the record that is not fitted and serves as the test.
     """
 
     source: Source
@@ -142,9 +142,9 @@ class Study:
 
     def _found(self, chosen: Chosen, states: Trajectory, run: Run) -> Discovery:
         recipe, rule = self.recipe, self.recipe.selection
-        if isinstance(rule, SystemSelection):  # what was measured counts, not what is made of it
+        if isinstance(rule, SystemSelection):  # the measured signal is judged, not derived states
             from ep2sindy.selection.free_run import (
-                FreeRunScore,  # torch, for those alone who refine
+                FreeRunScore,  # loads torch, only for this rule
             )
 
             if isinstance(rule, FreeRunScore):
@@ -171,7 +171,7 @@ def embeddings(harmonics: float) -> dict[str, Embedding]:
 
 
 def lost_mean(signal: Trace) -> str | None:
-    """What to say of pulses of one sign about a mean of zero; None of other signals."""
+    """A message if the signal is one-sided pulses about a mean of zero; otherwise None."""
     away = signal.x - np.median(signal.x)
     one_way = float(np.mean(away**3) / np.mean(away**2) ** 1.5)
     if not one_way > PULSES:
@@ -184,9 +184,9 @@ def lost_mean(signal: Trace) -> str | None:
 
 
 def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str] = ()) -> Deferred:
-    """Data read from a file with this variable alone, whatever else a config expects there.
+    """Data read from a file with this variable alone, whatever other variables a config expects.
 
-    without: axes that are not asked for. Data that are not read from a file stay as they are.
+    without: axes that are not required. Data that are not read from a file are unchanged.
     """
     variables: Mapping[str, Any] | None = data.settings.get("variables")
     if variables is None:
@@ -204,7 +204,7 @@ def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str
 
 
 def count_fitted(signal: Trace, states: Trajectory, held_out: float) -> int:
-    """Samples to fit: all of a record too short for a part of it to be held out."""
+    """Number of samples to fit; all of them if the record is too short to hold out a part."""
     n_fitted = round((1.0 - held_out) * states.n_samples)
     periods = states.dt_s / signal.period_s * np.array([n_fitted, states.n_samples - n_fitted])
     enough = periods[0] >= MIN_PERIODS + 0.5 and periods[1] >= MIN_JUDGED
@@ -212,7 +212,7 @@ def count_fitted(signal: Trace, states: Trajectory, held_out: float) -> int:
 
 
 def as_measured(signal: Trace, held: Trajectory) -> Trajectory:
-    """Held-out states with the samples of the signal in place of the smoothed ones."""
+    """Held-out states, with the measured samples of the signal in place of the smoothed ones."""
     first = int(np.searchsorted(signal.t, held.t[0] - 1e-6 * held.dt_s))
     states = held.states.copy()
     states[:, 0] = signal.x[first : first + held.n_samples]
@@ -228,7 +228,7 @@ def evaluate(
     *,
     label: str,
 ) -> Outcome:
-    """The model run freely over the held-out part, against the signal as it was measured."""
+    """Run the model freely over the held-out part, and compare it to the measured signal."""
     measured = as_measured(signal, held)
     run: FreeRun = free_run(found.model, measured, initial=held.states[0], judged=(signal.name,))
     cycle = cycle_of(run)
@@ -238,11 +238,11 @@ def evaluate(
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one signal taught.
+    """The model found from one signal, and its tests.
 
-    states: all of the record, smoothed. measured: what judges, the signal as it was measured; run:
-    the model over it, from its first sample smoothed. cycle: of the model, if it has one; share:
-    of starts that reach it. label: what the scores are called.
+    states: all of the record, smoothed. measured: the test data, with the signal as measured. run:
+    the model over them, from their first smoothed sample. cycle: the model's limit cycle, if it has
+    one. share: share of the starts that reach it. label: name of the scores.
     """
 
     signal: Trace
@@ -372,7 +372,7 @@ class Outcome:
 
     @property
     def multiplier(self) -> float:
-        """The largest modulus beside the flow's own."""
+        """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
         if self.cycle is None:
             return float("nan")
         return float(np.abs(self.cycle.multipliers[1:]).max())
@@ -446,13 +446,13 @@ def _marked(row: CandidateRow) -> Equation:
 
 
 def _best_of_sizes(table: pd.DataFrame, most: int = 3) -> list[int]:
-    """Rows of the best of every size: by score, then as they stand."""
+    """The best rows of every size, ordered by score and then by position."""
     order = table.sort_values(["terms", "score"], kind="stable")
     return sorted(order.groupby("terms").head(most).index.tolist())
 
 
 def paths_off(model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
-    """Runs from states off the cycle: nearer to its middle, and farther."""
+    """Runs from states off the cycle, some nearer to its middle and some farther."""
     middle = cycle.states.mean(axis=0)
     places = np.arange(len(STARTS)) * len(cycle.states) // len(STARTS)
     starts = middle + np.array(STARTS)[:, None] * (cycle.states[places] - middle)
@@ -461,5 +461,5 @@ def paths_off(model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
 
 
 def _inside(value: float, states: np.ndarray) -> float:
-    """A start with the sign that the signal has on the cycle, if it has one."""
+    """A start value with the sign that the signal has on the cycle, if that is fixed."""
     return max(value, 0.5 * float(states.min())) if (states > 0.0).all() else value

@@ -1,4 +1,4 @@
-"""What several studies show alike: runs as figures and tables, models as equations and tables."""
+"""Views shared by several studies: figures and tables of runs, equations and tables of models."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CAPTIONS = {
 
 @dataclass(frozen=True)
 class PlotRange:
-    """How much figures show: the start of a record, and the low end of spectra."""
+    """The range that figures show: the start of a record, and the low end of spectra."""
 
     duration_s: PositiveOrAll
     f_max_Hz: PositiveOrAll
@@ -52,7 +52,7 @@ class PlotRange:
 
 
 def rollout_tables(data: Trajectory, models: Mapping[str, FreeRun]) -> dict[str, pd.DataFrame]:
-    """Model and data, sample by sample, so that the figures can be drawn again."""
+    """Model and data, sample by sample, so that the figures can be redrawn."""
     found = {}
     for name, integrated in models.items():
         rollout, states = integrated.rollout, integrated.model.states
@@ -73,10 +73,10 @@ def run_figures(
     smoother: Smoother | None = None,
     since: str = series.SINCE_START,
 ) -> dict[str, Captioned]:
-    """Those of CAPTIONS that are named; phase portraits only of two states or more.
+    """The named figures of CAPTIONS; phase portraits need two states or more.
 
-    smoother: takes the data's derivative; without one there are no derivatives.
-    since: what the times of runs are counted from.
+    smoother: gives the data's derivative; without one there are no derivative figures.
+    since: the origin of the time axis of runs, in words.
     """
     span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
     rollouts = {name: integrated.rollout for name, integrated in models.items()}
@@ -111,13 +111,13 @@ def trajectories(
     *,
     since: str = series.SINCE_START,
 ) -> Captioned:
-    """Trajectories of other models, or from other starts."""
+    """Trajectories of other models, or from other initial states."""
     (figure,) = run_figures(["trajectories"], data, models, shown, since=since).values()
     return replace(figure, caption=caption)
 
 
 def intervals(model: SparseModel) -> dict[str, dict[str, tuple[float, float]]] | None:
-    """95 % intervals by state and term; None where they are not known."""
+    """95 % intervals by state and term; None if they are not known."""
     if model.covariance is None:
         return None
     return {state: model.intervals(state) for state in model.states}
@@ -131,9 +131,9 @@ def model_summary(model: SparseModel) -> dict[str, Any]:
 
 
 def coefficients(models: Mapping[str, SparseModel], *, heading: str) -> pd.DataFrame:
-    """One row per model, state and term: in SI, with 95 % intervals where they are known.
+    """One row per model, state and term, in SI, with 95 % intervals if they are known.
 
-    heading: of the column that holds the models' names.
+    heading: heading of the column with the models' names.
     """
     rows = []
     for name, model in models.items():
@@ -154,7 +154,7 @@ def display_equation(
     lead: str = "",
     on_screen: bool = True,
 ) -> Equation:
-    """One equation of a model with its unit, per unit of the clock."""
+    """One equation of a model with its unit, per time unit of the clock."""
     terms = {name: clock.seconds * coef for name, coef in model.terms(state).items()}
     unit = clock.rate_unit(model.units[state])
     return Equation(state, terms, lead=lead, unit=unit, on_screen=on_screen)
@@ -167,7 +167,7 @@ def interval_table(
     *,
     page_only: bool = False,
 ) -> list[Block]:
-    """Coefficients of some equations, by default of all, with 95 % intervals; none if unknown."""
+    """Coefficients of some or all equations with 95 % intervals; empty if these are not known."""
     if model.covariance is None:
         return []
     units = {term.name: term.unit(model.units) for term in model.library.terms}
@@ -186,9 +186,9 @@ def interval_table(
 def equation_sections(
     models: Mapping[str, SparseModel], clock: Clock = SECONDS, *, page_only: bool = False
 ) -> list[Section]:
-    """Under the name of each model its equations, with intervals where they are known.
+    """One section per model with its equations, and intervals if they are known.
 
-    page_only: of the intervals.
+    page_only: whether the intervals are left off the screen.
     """
     return [
         Section(

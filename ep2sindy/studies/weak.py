@@ -1,6 +1,6 @@
-"""Known terms in the weak form, with windows of several lengths: `+exp=weak`.
+"""Known terms fitted in the weak form, with windows of several lengths: `+exp=weak`.
 
-The forms and their fits `+exp=weak_windows` takes as well.
+The experiment `+exp=weak_windows` uses the same forms and fits.
 """
 
 from __future__ import annotations
@@ -50,11 +50,12 @@ INTERVALS = (
 
 @dataclass(frozen=True)
 class Study:
-    """Fit the same terms in every form, integrate each model, compare.
+    """Fit the same terms in every form, integrate each model, and compare.
 
-    formulation: the differential form; its smoother shows the data's derivative. boxes: random
-    windows. automatic: smooth windows. model: the terms of every state. rollout_s: how far to
-    integrate; None means to the data's end. thesis: published equations to stand beside.
+    formulation: the differential form; its smoother gives the data's derivative in figures. boxes:
+    the form with random windows. automatic: the form with smooth windows. model: the terms of every
+    state. rollout_s: integration time; None means to the data's end. thesis: published equations
+    for comparison.
     """
 
     source: Source
@@ -96,7 +97,10 @@ class Study:
 
 @dataclass(frozen=True)
 class Setting:
-    """A form of the regression; weighted: its fit follows the noise of the samples to the rows."""
+    """A form of the regression.
+
+    weighted: whether its fit propagates the samples' noise to the rows.
+    """
 
     formulation: Formulation
     weighted: bool = False
@@ -111,22 +115,22 @@ class Setting:
 
     @property
     def windows(self) -> WindowFunctions | None:
-        """The test functions of this form, if it is a weak one."""
+        """The test functions of this form; None if it is not a weak form."""
         return self.formulation.test_functions if isinstance(self.formulation, Weak) else None
 
     @property
     def boxes(self) -> Boxes | None:
-        """The random windows of this form, if it has any."""
+        """The random windows of this form; None if it has none."""
         return self.windows if isinstance(self.windows, Boxes) else None
 
 
 @dataclass(frozen=True, eq=False)
 class SettingFit:
-    """What one setting makes of a trajectory.
+    """Fit of a trajectory in one setting.
 
     r2: by state, on the setting's own rows, which differ from setting to setting.
     half_width: by state, in samples, for smooth windows; empty for others.
-    f_error: dominant frequency of the first state against the data's, minus one; NaN where the
+    f_error: dominant frequency of the first state relative to the data's, minus one; NaN if the
     integrated model diverges or dies out.
     """
 
@@ -140,7 +144,7 @@ class SettingFit:
         return {state: value(state) for state in self.integrated.model.states}
 
     def window_steps(self, state: str) -> int:
-        """Steps in one window, from end to end; 0 without windows."""
+        """Steps in one window, from end to end; 0 if the form has no windows."""
         boxes = self.setting.boxes
         return boxes.n_points - 1 if boxes else 2 * self.half_width.get(state, 0)
 
@@ -155,7 +159,7 @@ def settings_of(
 ) -> dict[str, Setting]:
     """The differential form, random windows of every number and length, and smooth windows.
 
-    boxes: the form with random windows, whose number and length are null.
+    boxes: the form with random windows; it leaves their number and length null.
     """
     chosen = {"n_windows": n_windows[0], "n_points": n_points[0]}
     for key in chosen:
@@ -176,7 +180,7 @@ def settings_of(
 def boxes_grid(
     form: Weak, *, n_windows: Sequence[int], n_points: Sequence[int]
 ) -> dict[str, Setting]:
-    """One form with every number and length of windows, named by those that vary."""
+    """One form with every number and length of windows, named by those of the two that vary."""
     grid = {}
     for windows in n_windows:
         for points in n_points:
@@ -188,7 +192,7 @@ def boxes_grid(
 
 
 def check_windows(settings: Mapping[str, Setting], n_samples: int) -> None:
-    """Raise ValueError for boxes that are longer than a trajectory of `n_samples`."""
+    """Raise ValueError for random windows longer than a trajectory of `n_samples`."""
     longest = max((s.boxes.n_points for s in settings.values() if s.boxes), default=0)
     if longest > n_samples:
         raise ValueError(
@@ -205,7 +209,7 @@ def fit_terms(
     *,
     rng: np.random.Generator,
 ) -> dict[str, tuple[EquationFit, RegressionRows]]:
-    """Fit given terms, state by state, and keep the rows that they were fitted to.
+    """Fit given terms, state by state, and keep the rows of the fits.
 
     Raises ValueError as the form's `assemble` and `fit_support` do.
     """
@@ -232,9 +236,9 @@ def fit_settings(
 ) -> dict[str, SettingFit]:
     """Fit the same terms in every setting and integrate each model from the first sample.
 
-    terms: state -> its terms. f_data_Hz: the frequency that models are held against. rollout_s:
-    how far to integrate; None, or more than there is, means to the data's end.
-    Each setting draws its windows from a stream of its own.
+    terms: state -> its terms. f_data_Hz: frequency of the data, to which models are compared.
+    rollout_s: integration time; None, or a time beyond the data, means to the data's end.
+    Each setting draws its windows from its own random stream.
     Raises ValueError, before any fit, for windows longer than the data.
     """
     check_windows(settings, run.n_samples)
@@ -264,7 +268,7 @@ def fit_settings(
 def _half_widths(
     run: Trajectory, functions: WindowFunctions | None, rng: np.random.Generator
 ) -> dict[str, int]:
-    """Of smooth windows, by state."""
+    """Half-width of the smooth test functions for each state, in samples."""
     if not isinstance(functions, Bumps):
         return {}
     windows = [functions.windows(run.t, x, rng=rng) for x in run.states.T]
@@ -283,7 +287,7 @@ def _r2_own_rows(fit: EquationFit, problem: RegressionRows) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What every setting makes of the data; f_data_Hz: dominant frequency of the first state."""
+    """Fits of the data in every setting. f_data_Hz: dominant frequency of the first state."""
 
     study: Study
     data: Trajectory
@@ -292,7 +296,7 @@ class Outcome:
 
     @property
     def labelled(self) -> dict[str, SettingFit]:
-        """By what a reader calls the settings."""
+        """The fits by readable names of the settings."""
         return {_label(name, fitted): fitted for name, fitted in self.fitted.items()}
 
     def models(self) -> dict[str, SparseModel]:
@@ -341,7 +345,7 @@ class Outcome:
         )
 
     def _metrics(self) -> Metrics[SettingFit]:
-        """Samples, length and periods of the first state are those of one window."""
+        """Metrics of the fits; samples, length and periods are of the first state's window."""
         clock, dt_s = self.data.clock, self.data.dt_s
 
         def frequency(fitted: SettingFit) -> str:
@@ -398,13 +402,13 @@ def first_frequency_Hz(fitted: SettingFit) -> float:
 
 
 def _label(name: str, fitted: SettingFit) -> str:
-    """`70 points` for random windows; other names as words."""
+    """`70 points` for random windows; other names with commas for underscores."""
     boxes = fitted.setting.boxes
     return f"{boxes.n_points} points" if boxes else name.replace("_", ", ")
 
 
 def _windows_summary(fitted: SettingFit, dt_s: float) -> dict[str, Any]:
-    """Windows of those kinds that have any, and intervals where they are known."""
+    """Windows of the kinds that a setting has, and intervals if they are known."""
     found: dict[str, Any] = {}
     if boxes := fitted.setting.boxes:
         found = {"n_points": boxes.n_points, "n_windows": boxes.n_windows}

@@ -1,7 +1,7 @@
-"""How the number and length of windows decide the coefficients that noise leaves.
+"""Dependence of coefficient errors under noise on the number and length of windows.
 
-`+exp=weak_windows`. Source: the thesis, appendix, III-A: the true support is known, and least
-squares does the rest.
+The experiment is `+exp=weak_windows`. Source: the thesis, appendix, III-A. The true support is
+known, and least squares gives the coefficients.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ FIGURE = (
 
 @dataclass(frozen=True)
 class Study:
-    """Draw noise, fit, measure: known terms in every form, with windows of every kind.
+    """Errors of coefficients of known terms under noise, in every form, with all kinds of windows.
 
-    rate_Hz: at which the system is sampled. formulation: the differential form. boxes: random
-    windows. automatic: smooth windows. noises: standard deviations
-    of the white noise, in RMS of each state. A realization is one draw of it, the same for all
-    settings and, but for its size, for all levels.
+    rate_Hz: sampling rate of the system. formulation: the differential form. boxes: the form with
+    random windows. automatic: the form with smooth windows. noises: standard deviations of the
+    white noise, in RMS of each state. A realization is one draw of the noise. All settings share
+    it, and so do all noise levels but for its size.
     """
 
     system: System
@@ -78,10 +78,10 @@ class Study:
         seed: int = 0,
         progress: Callable[[int], None] = lambda n_more: None,
     ) -> pd.DataFrame:
-        """The error of every setting on every realization, realizations being the pieces.
+        """The coefficient error of every setting on every realization.
 
-        One row per noise, number and setting. Raises ValueError, before any fit, for windows that
-        are longer than the trajectory, or nothing to run.
+        Workers share the realizations. One row per noise, number and setting. Raises ValueError,
+        before any fit, for windows longer than the trajectory, or if there is nothing to run.
         """
         check_windows(settings, round(self.system.duration_s * self.rate_Hz))
         tasks = list(product(self.noises, range(self.n_realizations)))
@@ -90,7 +90,7 @@ class Study:
 
 
 def true_library(system: System) -> Library:
-    """The terms of all of a system's equations, each once."""
+    """The terms of all equations of a system, each once."""
     names = [name for state in system.model.states for name in system.model.terms(state)]
     return named_terms(system.model.library.variables, list(dict.fromkeys(names)))
 
@@ -98,7 +98,7 @@ def true_library(system: System) -> Library:
 def coefficient_error(
     system: System, run: Trajectory, setting: Setting, *, rng: np.random.Generator
 ) -> float:
-    """||beta - beta_true|| / ||beta_true||, the coefficients of all equations in one vector."""
+    """||beta - beta_true|| / ||beta_true||; beta holds the coefficients of all equations."""
     truth = {state: system.model.terms(state) for state in system.model.states}
     terms = {state: list(of) for state, of in truth.items()}
     found = fit_terms([run], true_library(system), terms, setting, rng=rng)
@@ -115,7 +115,7 @@ def _realization(
     run = system.trajectory(noise=noise, rng=np.random.default_rng([seed, number]))
     rows: list[dict[str, object]] = []
     for name, setting in settings.items():
-        # A stream of its own, so that leaving a setting out changes no other.
+        # Each setting has its own random stream, so that leaving one out changes no other.
         rng = np.random.default_rng([seed, number, *name.encode()])
         error = coefficient_error(system, run, setting, rng=rng)
         rows.append({"setting": name, "noise": noise, "number": number, "error": error})
@@ -138,7 +138,10 @@ def window_cells(errors: pd.DataFrame, settings: Mapping[str, Setting]) -> pd.Da
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """errors: as `Study.errors` gives them. cells: their means, from `window_cells`."""
+    """Errors of all settings.
+
+    errors: from `Study.errors`. cells: their means, from `window_cells`.
+    """
 
     system: System
     settings: Mapping[str, Setting]
@@ -191,7 +194,7 @@ class Outcome:
 
 
 def by_noise(cells: pd.DataFrame) -> pd.DataFrame:
-    """A row per setting, a column of mean errors per noise level, as text."""
+    """One row per setting, one column of mean errors per noise level, as text."""
     shown = cells.assign(noise=[f"{100 * noise:g} % noise" for noise in cells["noise"]])
     table = shown.pivot(index="setting", columns="noise", values="error_mean")
     order = [shown["setting"].unique(), shown["noise"].unique()]

@@ -1,4 +1,4 @@
-"""Simulations kept on disk, named by a hash of everything that determines them."""
+"""Simulations kept on disk; the file name holds a hash of everything that determines them."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from ep2sindy.trust.checksum import verified, with_checksum
 def read_or_run(
     cache: str | Path | None, name: str, parameters: dict[str, Any], run: Callable[[], xr.Dataset]
 ) -> xr.Dataset:
-    """What `run` returns, from the folder `cache` where one is named; see `kept`."""
+    """The result of `run`, read from or kept in the folder `cache` if one is given; see `keep`."""
     return run() if cache is None else keep(Path(cache) / name, to_json(parameters), run)
 
 
 def keep(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
-    """What `run` returns, read from the file that is named by a stem and a hash, or run and kept.
+    """The result of `run`, read from a file named by a stem and a hash, or run and kept there.
 
-    The hash is of all parameters and of this package's source text, so a changed formula is never
-    answered from an old file. Both ways return the same values. The file says what it was made of
-    and holds a checksum; one that does not fit, or cannot be read, is reported, recomputed and
-    replaced. Results appear under their final name only once complete.
-    Raises OSError if the folder cannot be written, before anything runs.
+    The hash covers all parameters and this package's source text, so that a changed formula never
+    returns an old result. Both ways return the same values. The file states its parameters and
+    holds a checksum. A file that does not match, or cannot be read, is reported, recomputed and
+    replaced. Results appear under their final name only once complete. Raises OSError if the folder
+    cannot be written, before anything runs.
     """
     key = fingerprint(parameters, sources=Path(__file__).parent)
     path = stem.with_name(f"{stem.name}_{key}.nc")
@@ -42,7 +42,7 @@ def keep(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             with on_screen(sys.stdout):
                 tqdm.write(in_line(f"{path} cannot be read ({error}); simulating it again"))
-    with writing(path.parent):  # now, not after the simulation
+    with writing(path.parent):  # checked now, not after the simulation
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent)
         with TemporaryFile(dir=path.parent):
@@ -53,7 +53,7 @@ def keep(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Datas
 
 
 def read(path: Path) -> xr.Dataset:
-    """Load a kept result into memory; raises OSError, ValueError or KeyError if damaged."""
+    """Load a kept result into memory; raises OSError, ValueError or KeyError if it is damaged."""
     with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
         field = stored.load()
     field.attrs["parameters"]  # written last: a file without it is incomplete
@@ -61,7 +61,7 @@ def read(path: Path) -> xr.Dataset:
 
 
 def write(field: xr.Dataset, path: Path) -> None:
-    """Write compressed, whole or not at all."""
+    """Write a compressed file, completely or not at all."""
     compressed = {
         str(variable): {"zlib": True, "complevel": 1, "shuffle": True}
         for variable in field.data_vars

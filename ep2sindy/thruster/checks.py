@@ -1,4 +1,4 @@
-"""Checks that the values of this room share: numbers in their range, tables without a gap."""
+"""Checks shared by the dataclasses of `thruster`: numbers in range, tables without gaps."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def check_increasing(owner: object, name: str) -> None:
     if values.ndim != 1 or values.size < 2:
         raise ValueError(f"{type(owner).__name__}.{name} must hold two numbers or more")
     steps = np.diff(values)
-    if not np.all(steps > 0.0):  # NaN too
+    if not np.all(steps > 0.0):  # NaN fails, too
         row = int(np.argmin(steps > 0.0)) + 1
         raise ValueError(
             f"{type(owner).__name__}.{name} must increase: {values[row]:g} follows "
@@ -43,7 +43,7 @@ def check_increasing(owner: object, name: str) -> None:
 
 
 def check_rows(owner: object, first: str, *names: str) -> None:
-    """Raise ValueError for a named column that has not one finite number for each of `first`."""
+    """Raise ValueError for a named column without one finite number for each entry of `first`."""
     wanted = len(getattr(owner, first))
     for name in names:
         values: Sequence[float] = getattr(owner, name)

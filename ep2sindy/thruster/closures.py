@@ -9,7 +9,7 @@ from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.propellants import PropellantTable
 
 TABLE_STEP_EV = 0.02  # linear interpolation is then within 5e-4 of the formulas above 2 eV
-TABLE_TOP_EV = 200.0  # a mean energy beyond counts as divergence: the fits end below
+TABLE_TOP_EV = 200.0  # the fits end below; a larger mean energy counts as divergence
 
 # Columns, one row per temperature; coefficients in SI, energies in eV.
 (
@@ -31,7 +31,7 @@ TABLE_TOP_EV = 200.0  # a mean energy beyond counts as divergence: the fits end 
 def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 12"]:
     """Tabulate every closure at steps of TABLE_STEP_EV; columns as named in this module."""
     T = TABLE_STEP_EV * np.arange(round(TABLE_TOP_EV / TABLE_STEP_EV) + 1)
-    T[0] = 0.1 * TABLE_STEP_EV  # the formulas divide by T; nothing happens this cold
+    T[0] = 0.1 * TABLE_STEP_EV  # the formulas divide by T; all rates vanish at so low a T
     rates, wall, mass = thruster.propellant, thruster.wall, thruster.propellant.mass
     table = np.zeros((T.size, 12))
     table[:, IONIZATION] = rates.ionization(T)
@@ -45,7 +45,7 @@ def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 12"]:
     table[:, ION_LOSS] = wall.ion_loss(T, thruster.gap, mass)
     table[:, DRIFT_EVENTS] = rates.drift_events(T)
     if thruster.charge_states > 1:
-        assert isinstance(rates, PropellantTable)  # the thruster has seen to it
+        assert isinstance(rates, PropellantTable)  # the thruster checks this
         table[:, DOUBLE] = rates.double_ionization(T)
         table[:, SECOND] = rates.second_ionization(T)
     return table
@@ -54,7 +54,7 @@ def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 12"]:
 def coulomb_log_at_unit_density(T_e_eV: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
     """ln(Lambda) of electron-ion collisions plus 0.5 ln(n in m^-3).
 
-    Source: NRL Plasma Formulary; slower and faster than ions bind, below and above 10 eV.
+    Source: NRL Plasma Formulary, with its formulas for T_e below and above 10 eV.
     """
     cold, hot = 1e-6 * T_e_eV**-3, 1e-6 * T_e_eV**-2
     return np.where(T_e_eV < 10.0, 23.0 - 0.5 * np.log(cold), 24.0 - 0.5 * np.log(hot))

@@ -1,4 +1,4 @@
-"""The JSON input of HallThruster.jl, versions 0.18 to 0.22, as a thruster and its operating point.
+"""JSON input of HallThruster.jl, versions 0.18 to 0.22, as a thruster and its operating point.
 
 Layout and defaults: https://um-pepl.github.io/HallThruster.jl (Use JSON for input and output;
 Configuration; Simulation parameters).
@@ -42,7 +42,7 @@ NEEDED: Any = object()
 
 
 class Node:
-    """A mapping and its place in the file. `end()` refuses the keys that nobody took."""
+    """A mapping and its place in the file. `end()` refuses the keys that were not taken."""
 
     def __init__(self, values: Any, place: str) -> None:
         if not isinstance(values, Mapping):
@@ -51,7 +51,7 @@ class Node:
         self._left = dict(values)
 
     def take(self, key: str, default: Any = NEEDED) -> Any:
-        """The value of a key, or the default; raises ValueError if it is needed and not there."""
+        """The value of a key, or the default; raises ValueError if a required key is missing."""
         if key in self._left:
             return self._left.pop(key)
         if default is NEEDED:
@@ -59,18 +59,18 @@ class Node:
         return default
 
     def number(self, key: str, default: Any = NEEDED) -> float:
-        """A number."""
+        """Take a number."""
         value = self.take(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError(f"{self.place}.{key} must be a number: {value!r} came")
         return float(value)
 
     def node(self, key: str, default: Any = NEEDED) -> Node:
-        """A mapping below this one."""
+        """Take a nested mapping."""
         return Node(self.take(key, default), f"{self.place}.{key}")
 
     def at_rest(self, values: Mapping[str, Any]) -> None:
-        """Take keys that may be there at one value alone."""
+        """Take keys that are supported at a single value only."""
         for key, value in values.items():
             if (came := self.take(key, value)) != value:
                 raise ValueError(
@@ -78,12 +78,12 @@ class Node:
                 )
 
     def idle(self, *keys: str) -> None:
-        """Take keys that change nothing here."""
+        """Take keys that have no effect here."""
         for key in keys:
             self.take(key, None)
 
     def end(self) -> None:
-        """Raise ValueError for the keys that are left."""
+        """Raise ValueError for the remaining keys."""
         if self._left:
             raise ValueError(f"{self.place} has keys that are not supported: {sorted(self._left)}")
 
@@ -98,7 +98,7 @@ MATERIALS = {
 
 
 def field_of(node: Node, length: float, folder: Path, scale: float) -> MagneticFieldTable:
-    """The points in the file itself, or those of the file that it names, in m and T."""
+    """The magnetic field in m and T, from points in the file or in the file that it names."""
     name, z, B = node.take("file", ""), node.take("z", []), node.take("B", [])
     node.end()
     if len(z) and len(B):
@@ -116,7 +116,7 @@ def field_of(node: Node, length: float, folder: Path, scale: float) -> MagneticF
 
 
 def transport_of(node: Node, length: float, transition: float) -> Transport:
-    """Bohm-like models; positions are counted from the anode there, from the exit here."""
+    """Bohm-like models; their positions count from the anode, ours from the exit."""
     kind = node.take("type")
     if kind == "TwoZoneBohm":
         c = node.take("coeffs", None) or (
@@ -147,7 +147,7 @@ def transport_of(node: Node, length: float, transition: float) -> Transport:
 
 
 def wall_of(node: Node, *, transition: float, plume_power: float, ion_losses: bool) -> Wall:
-    """Their one loss_scale acts on electrons and, with ion_wall_losses, on ions."""
+    """The wall; its single loss_scale acts on electrons and, with ion_wall_losses, on ions."""
     kind = node.take("type")
     if kind == "NoWallLosses":
         node.end()
@@ -185,10 +185,11 @@ def wall_of(node: Node, *, transition: float, plume_power: float, ion_losses: bo
 
 
 def conduction_of(node: Node) -> tuple[float, float]:
-    """Factor and weight of Coulomb collisions of `Thruster`, which takes the gradient of T_e.
+    """Conduction factor and Coulomb weight of `Thruster`, which multiply the gradient of T_e.
 
     Mitchner & Kruger, Partially Ionized Gases (1973), p. 94: 2.4/(1 + nu_ei/(sqrt(2) nu));
-    Braginskii: 4.66 for one charge; both times 1.5, since theirs multiply the gradient of 1.5 T_e.
+    Braginskii: 4.66 for one charge. Both are multiplied by 1.5, since HallThruster.jl's
+    conductivities multiply the gradient of 1.5 T_e.
     """
     kind = node.take("type")
     node.end()
@@ -200,9 +201,9 @@ def conduction_of(node: Node) -> tuple[float, float]:
 
 GASES = {"Xenon": "xenon", "Krypton": "krypton", "Argon": "argon"}
 GASES |= {"Xe": "xenon", "Kr": "krypton", "Ar": "argon"}
-# What their stored runs ionise xenon by is not the finer table that later versions brought.
+# The stored runs of HallThruster.jl use a coarser xenon table than its later versions.
 RATES_OF = {"xenon": "xenon_5eV", "krypton": "krypton", "argon": "argon"}
-# Keys that are taken at this value alone; any other would change what is simulated.
+# Keys that are supported at this value only; any other would change the simulation.
 CONFIG_AT_REST: dict[str, Any] = {
     "background_pressure_Torr": 0.0,
     "solve_plume": False,
@@ -215,7 +216,7 @@ CONFIG_AT_REST: dict[str, Any] = {
     "propellant_config": "",
     "implicit_energy": 1.0,
 }
-# Keys that change nothing here: they act on what is not there, or on the other code's output.
+# Keys without effect here: they concern missing features, or the other code's output.
 CONFIG_IDLE = (
     "background_temperature_K", "neutral_ingestion_multiplier", "initial_condition",
     "apply_thrust_divergence_correction",
@@ -227,10 +228,10 @@ SIMULATION_IDLE = (
 
 @dataclass(frozen=True)
 class RunSettings:
-    """How the file would be run: what `simulate` takes, and numerics that it says besides.
+    """Run settings of the file: arguments of `simulate`, and further numerical settings.
 
-    reconstruct: second-order reconstruction at the faces, or none. coldest_T_e_eV: the floor
-    that HallThruster.jl holds T_e above (min_Te).
+    reconstruct: whether the faces have second-order reconstruction. coldest_T_e_eV: the lower bound
+    of T_e in HallThruster.jl (min_Te).
     """
 
     n_cells: int = 200
@@ -242,13 +243,13 @@ class RunSettings:
 
     @property
     def sample_s(self) -> float:
-        """Time between two of the frames that the file asks for."""
+        """Time between two output frames of the file."""
         return self.duration_s / max(self.n_samples - 1, 1)
 
 
 @dataclass(frozen=True)
 class HallThrusterInput:
-    """A file's thruster, operating point and run."""
+    """Thruster, operating point and run settings of a file."""
 
     thruster: Thruster
     operating_point: OperatingPoint
@@ -258,11 +259,11 @@ class HallThrusterInput:
 def read_hallthruster_input(path: str | Path) -> HallThrusterInput:
     """Read an input file of HallThruster.jl, or an output file, which holds its input.
 
-    What a file leaves out has HallThruster.jl's default. The file of the magnetic field is looked
-    for beside the JSON, then where one stands. Their one loss_scale of a wall sets both of
-    ours; their conductivity acts on the gradient of 1.5 T_e, so that our factor is 1.5 of theirs.
-    Raises ValueError for a key that is not known, and for one that is known but would ask for
-    physics that is not here (background gas, plume expansion, three charges, mixtures, a
+    Missing entries have HallThruster.jl's defaults. The file of the magnetic field is looked for
+    beside the JSON file, then in the current folder. The single loss_scale of a wall in
+    HallThruster.jl sets both of ours. Its conductivity multiplies the gradient of 1.5 T_e, so that
+    our factor is 1.5 times its own. Raises ValueError for an unknown key, and for one that asks for
+    physics that is missing here (background gas, plume expansion, three charges, mixtures, a
     shielded wall, LANDMARK), naming it.
     """
     path = Path(path)
@@ -360,7 +361,7 @@ def _anode(config: Node, cathode_T_e_eV: float) -> FixedAnode | AnodeSheath:
 
 
 def _flow(config: Node) -> dict[str, Any]:
-    """The one propellant: given in a list of one (from 0.19), or by keys of the config."""
+    """The propellant: in a list of one (from version 0.19), or by keys of the config."""
     flows = config.take("propellants", None)
     if flows is None:
         names = {
@@ -407,7 +408,7 @@ def _gas(flow: Node, coulomb: bool) -> PropellantTable:
 
 
 def _speed(flow: Node, gas: PropellantTable) -> float:
-    """Neutrals' speed: given, or a quarter of the mean thermal speed of their temperature."""
+    """Speed of the neutrals: given, or a quarter of the mean thermal speed at their temperature."""
     speed, temperature = flow.take("velocity_m_s", None), flow.take("temperature_K", None)
     for name, value in (("velocity_m_s", speed), ("temperature_K", temperature)):
         if isinstance(value, Mapping):
@@ -448,10 +449,10 @@ def simulate_hallthruster_input(
     n_cells: int | None = None,
     progress: Progress | bool = True,
 ) -> xr.Dataset:
-    """Run the thruster of an input file by this package's own simulator, or read the kept run.
+    """Run the thruster of an input file in this package's own simulator, or read the kept run.
 
-    What is None is as the file says: its duration, its frames, its cells.
-    Raises ValueError for what the file asks for and this simulator has not; see
+    Arguments that are None take the file's values for the duration, the frames and the cells.
+    Raises ValueError if the file asks for features that this simulator lacks; see
     `read_hallthruster_input`.
     """
     given = read_hallthruster_input(path)
@@ -468,7 +469,7 @@ def simulate_hallthruster_input(
         warm_up_s=warm_up_s,
         sample_s=given.run.sample_s if sample_s is None else sample_s,
         n_cells=given.run.n_cells if n_cells is None else n_cells,
-        stretch=1.0,  # their EvenGrid
+        stretch=1.0,  # EvenGrid of HallThruster.jl
         reconstruct=given.run.reconstruct,
         coldest_T_e_eV=given.run.coldest_T_e_eV,
         progress=progress,

@@ -1,4 +1,4 @@
-"""The ionization rate of a field that holds the electron temperature."""
+"""The ionization rate coefficient of a field that holds the electron temperature."""
 
 from __future__ import annotations
 
@@ -17,14 +17,13 @@ from ep2sindy.thruster.tables import number, read_cells
 def ionization_rate(
     field: xr.Dataset, *, gas: str = "xenon", table: str | Path | None = None
 ) -> xr.Dataset:
-    """Add R_ion in m^3/s, the ionization rate coefficient of a gas, from T_e_eV.
+    """Add R_ion in m^3/s, the ionization rate coefficient of a gas, computed from T_e_eV.
 
-    gas: xenon, by the fits of `ep2sindy.thruster.propellants`; krypton or argon, by the tables of
-    `ep2sindy.thruster.propellant`, linear between their rows.
-    table: CSV file of T_e in eV (increasing) and rate in m^3/s of any gas, instead, linear between
-    its rows; any further columns and lines of text are left out.
-    Raises ValueError if the field has R_ion already or no T_e_eV, or if T_e_eV leaves a table,
-    which is never extrapolated.
+    gas: xenon, from the fits of `ep2sindy.thruster.propellants`; krypton or argon, from the tables
+    of `ep2sindy.thruster.propellant`, linear between their rows. table: CSV file of T_e in eV
+    (increasing) and rate in m^3/s of any gas, used instead of `gas`, linear between its rows;
+    further columns and lines of text are ignored. Raises ValueError if the field has R_ion already
+    or no T_e_eV, or if T_e_eV leaves a table; tables are never extrapolated.
     """
     if "R_ion" in field:
         raise ValueError(
@@ -56,7 +55,7 @@ def _interpolate_table(
     T_e_eV: xr.DataArray,
     way_out: str,
 ) -> Callable:
-    """Linear between the rows of a table, which must cover all temperatures."""
+    """Interpolate linearly in a table, which must cover all temperatures."""
     low, high = float(T_e_eV.min()), float(T_e_eV.max())
     if low < T_eV[0] or high > T_eV[-1]:
         raise ValueError(

@@ -1,7 +1,7 @@
 """The radial magnetic field on the channel axis: a Gaussian, or a table from a file.
 
-Siblings with `at(distance)`, the field in T at a distance from the exit in m, negative inside,
-and `check_covers(first, last)`, which refuses a stretch that the field is not known on.
+The classes share two methods. `at(distance)` gives the field in T at a distance from the exit in
+m, negative inside. `check_covers(first, last)` refuses an interval that the field does not cover.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from ep2sindy.thruster.tables import number, numbers, read_cells
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 FIELDS = {"T": 1.0, "mT": 1e-3, "G": 1e-4}
 Points = Sequence[float] | Float[np.ndarray, " points"]
-HIGHEST_T = 1.0  # no Hall thruster comes near: a larger number is in another unit
+HIGHEST_T = 1.0  # above any Hall thruster: a larger number is in another unit
 
 
 @dataclass(frozen=True)
 class MagneticField:
-    """A Gaussian about the exit, wider in the plume."""
+    """A Gaussian field with its peak at the exit, wider in the plume."""
 
     peak: float = 15e-3  # T
     width_channel: float = 11e-3  # m, standard deviation
@@ -40,15 +40,15 @@ class MagneticField:
         return self.peak * np.exp(-0.5 * (distance / width) ** 2)
 
     def check_covers(self, first: float, last: float) -> None:
-        """A formula covers every stretch."""
+        """Accept any interval, since the formula holds everywhere."""
 
 
 @dataclass(frozen=True)
 class MagneticFieldTable:
-    """Field through given points by a cubic that keeps their shape (PCHIP): no overshoot.
+    """Field interpolated by a shape-preserving cubic (PCHIP), which does not overshoot.
 
-    distance: from the exit in m, increasing, negative inside; B: in T, its sign left out.
-    The ends may fall short of a domain by the table's widest step; there the end value is held.
+    distance: from the exit in m, increasing, negative inside. B: in T; its sign is ignored.
+    The table may end up to its widest step short of the domain; the end value is held there.
     """
 
     distance: Points
@@ -92,13 +92,13 @@ def read_magnetic_field(
     B_unit: str | None = None,
     scale: float = 1.0,
 ) -> MagneticFieldTable:
-    """A field from a CSV file of two columns, position and field.
+    """Read a field from a CSV file of two columns, position and field.
 
-    exit_m: the channel's exit in m on the file's own axis (0.025 if that begins at the anode of
-    a channel of 25 mm, 0 if at the exit). Units (m, cm, mm; T, mT, G) stand in the header, as in
-    `z_mm,B_mT` or `z (cm), Br [G]`, or are given; a file without any is taken as m and T, if
-    its numbers can be. scale: the field is multiplied by it. Lines that begin with # are left out.
-    Raises ValueError for a gap, an unknown unit, or a field above 1 T.
+    exit_m: position of the channel's exit in m on the file's own axis (0.025 if the axis begins at
+    the anode of a channel of 25 mm, 0 if it begins at the exit). Units (m, cm, mm; T, mT, G) stand
+    in the header, as in `z_mm,B_mT` or `z (cm), Br [G]`, or are given. A file without units is
+    taken as m and T, if its numbers are plausible. scale: factor on the field. Lines that begin
+    with # are ignored. Raises ValueError for a gap, an unknown unit, or a field above 1 T.
     """
     header, numbers = _two_columns(Path(path))
     lengths = _unit(LENGTHS, z_unit, header[0], f"{path}: position")
@@ -124,7 +124,7 @@ def read_magnetic_field(
 
 
 def _two_columns(path: Path) -> tuple[tuple[str, str], Float[np.ndarray, "rows 2"]]:
-    """Names of the columns, empty without a header, and their numbers."""
+    """Names of the two columns, empty without a header, and their numbers."""
     rows = read_cells(path, "file of a magnetic field")
     if len(rows[0]) != 2:
         raise ValueError(f"{path} must have two columns, position and field: it has {len(rows[0])}")
@@ -134,7 +134,7 @@ def _two_columns(path: Path) -> tuple[tuple[str, str], Float[np.ndarray, "rows 2
 
 
 def _unit(units: dict[str, float], given: str | None, header: str, place: str) -> float | None:
-    """Factor to SI: of the unit that is given, or of the header's last word of several."""
+    """Factor to SI of the unit that is given, or of the last of several words in the header."""
     word = given
     if word is None and (words := re.findall(r"[A-Za-z]+", header))[1:]:
         word = words[-1]

@@ -1,4 +1,4 @@
-"""What a simulation needs to know: the thruster, its operating point, the six points studied."""
+"""Parameters of a simulation: the thruster, its operating point, the six points studied."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ep2sindy.thruster.walls import Anode, FixedAnode, SheathWall, Wall
 
 @dataclass(frozen=True)
 class Thruster:
-    """Geometry, field, closures and boundary values of one thruster. Default: SPT-100-like.
+    """Geometry, field, closures and boundary values of one thruster; the default is SPT-100-like.
 
-    kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e: 4.66 and 0 are
-    Braginskii's for singly charged ions. charge_states: the ions' highest charge, 1 or 2.
-    cathode_potential: of the cathode plane above the cathode, its coupling voltage.
-    ions_born_at_rest: ionisation adds no momentum to the ions, as LANDMARK has it; otherwise it
-    adds the neutrals'.
+    kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e; 4.66 and 0 are
+    Braginskii's values for singly charged ions. charge_states: highest charge of the ions, 1 or 2.
+    cathode_potential: potential of the cathode plane relative to the cathode (coupling voltage).
+    ions_born_at_rest: if True, ionisation adds no momentum to the ions, as in LANDMARK; otherwise
+    it adds the neutrals' momentum.
     """
 
     channel_length: float = 0.025  # m
@@ -97,7 +97,7 @@ class Thruster:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """What the operator sets: supply voltage in V, anode flow in mg/s, and the neutrals' speed."""
+    """The operator's settings: supply voltage in V, anode flow in mg/s; and the neutrals' speed."""
 
     voltage: float  # V
     mass_flow_mg_s: float

@@ -1,4 +1,4 @@
-"""Propellants read from tables: the gases that come with the package, and a user's own."""
+"""Propellants read from tables: the package's own gases, and a user's."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
 def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     """A gas that comes with the package: xenon, krypton, argon, or xenon_5eV.
 
-    Xenon and krypton are the tables of HallThruster.jl, up to T_e of 170 and 100 eV, with a
-    second charge; argon follows from the cross sections of Phelps & Petrovic (1999), up to
-    100 eV. Each file in `gases/` names its sources. xenon_5eV ionises by the table that the stored
-    runs of HallThruster.jl v0.22 have, linear over 5 eV. The default `XenonFits` are formulas.
+    Xenon and krypton are the tables of HallThruster.jl, for T_e up to 170 and 100 eV, with a second
+    charge. Argon is computed from the cross sections of Phelps & Petrovic (1999), up to 100 eV.
+    Each file in `gases/` names its sources. xenon_5eV has the ionisation table of the stored runs
+    of HallThruster.jl v0.22, linear over 5 eV. The default `XenonFits` are formulas.
     """
     if name == "xenon_5eV":
         return _resample_ionization(propellant("xenon", coulomb_weight=coulomb_weight), name)
@@ -74,13 +74,13 @@ def read_propellant(
     second_ionization_eV: float | None = None,
     name: str | None = None,
 ) -> PropellantTable:
-    """A gas of one's own from a CSV file, its header naming the columns.
+    """Read a user's gas from a CSV file whose header names the columns.
 
     Columns: T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing; ionization, excitation and
     momentum, rate coefficients in m^3/s; for a second charge double_ionization (X -> X2+) and
-    second_ionization (X+ -> X2+). Lines that begin with # are left out. mass_u: of the atom, in
-    atomic mass units; energies: what one event costs an electron.
-    Raises ValueError for a file that is not there, a column that is missing or unknown, or a gap.
+    second_ionization (X+ -> X2+). Lines that begin with # are ignored. mass_u: mass of the atom in
+    atomic mass units. The energies are an electron's loss per event, in eV.
+    Raises ValueError for a missing file, a missing or unknown column, or a gap.
     """
     given = {
         "ionization_eV": ionization_eV,
@@ -116,7 +116,7 @@ def _table(
 
 
 def _columns(path: Path) -> dict[str, tuple[float, ...]]:
-    """Columns of a CSV file by name, every cell a number."""
+    """Columns of a CSV file by name; every cell must be a number."""
     header, *rows = read_cells(path, "table of a propellant")
     values = zip(*numbers(path, rows, len(header)), strict=True)
     return dict(zip(header, values, strict=True))

@@ -1,12 +1,13 @@
-"""Propellants: mass of the atom and rate coefficients against electrons, with their sources.
+"""Propellants: mass of the atom and rate coefficients of electron collisions, with sources.
 
-Siblings with the same methods on arrays of T_e in eV, so that a simulation takes any of them:
+All propellants have the same attributes and methods on arrays of T_e in eV, so that a simulation
+takes any of them:
 
 - `mass` (kg), `range_eV` (lowest and highest T_e that the coefficients cover, None for formulas),
-  `charge_states` (the highest charge there are coefficients for), energies in eV;
+  `charge_states` (the highest charge that has coefficients), energies in eV;
 - `ionization`, `energy_loss`, `events`, `momentum`, `coulomb` for X and X+;
 - `drift_events`: the inelastic events that take their energy from drift and heat together;
-- `double_ionization` (X -> X2+) and `second_ionization` (X+ -> X2+), where charge_states is 2.
+- `double_ionization` (X -> X2+) and `second_ionization` (X+ -> X2+), if charge_states is 2.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON, M_XENON
 E_IONIZATION_EV = 12.13  # eV, first ionisation of xenon (Goebel & Katz, appendix E)
 E_EXCITATION_EV = 8.32  # eV, lowest excited level (Goebel & Katz, appendix E)
 
-FloatArray = Float[np.ndarray, "..."] | np.float64  # NumPy makes scalars of arrays without axes
+FloatArray = Float[np.ndarray, "..."] | np.float64  # NumPy turns arrays without axes into scalars
 
 
 def thermal_speed(T_e_eV: FloatArray) -> FloatArray:
@@ -68,7 +69,7 @@ def momentum_transfer_rate(T_e_eV: FloatArray) -> FloatArray:
 
 
 def coulomb_rate(T_e_eV: FloatArray) -> FloatArray:
-    """2.9e-12 T^-1.5; times n and ln(Lambda) it is nu_ei in 1/s (Goebel & Katz, chapter 3)."""
+    """2.9e-12 T^-1.5; times n and ln(Lambda) it gives nu_ei in 1/s (Goebel & Katz, chapter 3)."""
     return 2.9e-12 * T_e_eV**-1.5
 
 
@@ -76,10 +77,10 @@ def coulomb_rate(T_e_eV: FloatArray) -> FloatArray:
 class XenonFits:
     """Xenon coefficients as published formulas (Goebel & Katz, appendix E and chapter 3).
 
-    Inelastic rates are taken at the electrons' whole mean energy 1.5 T_e + K, K the kinetic
-    energy of their drift, hence at T_e + 2 K/3; with `drift_weight` 0 at T_e. The heat pays
-    all of what an event costs: drag along the field turns into heat whatever it comes from, and
-    the energy of the drift, which follows the field at once, is not stored.
+    Inelastic rates are evaluated at the electrons' total mean energy 1.5 T_e + K, where K is the
+    kinetic energy of their drift, that is at T_e + 2 K/3; with `drift_weight` 0, at T_e. The whole
+    energy of an event is taken from the heat: drag along the field becomes heat whatever its cause,
+    and the drift energy, which follows the field at once, is not stored.
     """
 
     drift_weight: float = 1.0
@@ -105,7 +106,7 @@ class XenonFits:
         return ionization_rate(T_e_eV) + excitation_rate(T_e_eV)
 
     def drift_events(self, T_e_eV: FloatArray) -> FloatArray:
-        """None: the heat pays for every event."""
+        """Zero: the energy of every event is taken from the heat."""
         return np.zeros_like(T_e_eV)
 
     def momentum(self, T_e_eV: FloatArray) -> FloatArray:
@@ -113,18 +114,17 @@ class XenonFits:
         return momentum_transfer_rate(T_e_eV)
 
     def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
-        """nu_ei over n and ln(Lambda)."""
+        """nu_ei divided by n and ln(Lambda)."""
         return coulomb_rate(T_e_eV)
 
 
 @dataclass(frozen=True)
 class TabulatedRates:
-    """Coefficients from a user's table over the mean energy 1.5 T_e, as LANDMARK defines them.
+    """Coefficients from a user's table over the mean energy 1.5 T_e, as defined by LANDMARK.
 
-    mean_energy_eV: increasing. ionization_rate: m^3/s. energy_loss_rate: eV m^3/s.
-    elastic_rate: constant momentum transfer, m^3/s.
-    Coulomb collisions and the drift energy K are left out. Below the first row both
-    coefficients fall to zero linearly; beyond the last they stay.
+    mean_energy_eV: increasing. ionization_rate: m^3/s. energy_loss_rate: eV m^3/s. elastic_rate:
+    constant momentum transfer, m^3/s. Coulomb collisions and the drift energy K are left out. Below
+    the first row both coefficients fall to zero linearly; beyond the last row they are constant.
     """
 
     mean_energy_eV: tuple[float, ...]
@@ -134,7 +134,7 @@ class TabulatedRates:
     mass: ClassVar[float] = M_XENON
     ionization_eV: ClassVar[float] = E_IONIZATION_EV
     drift_weight: ClassVar[float] = 0.0
-    range_eV: ClassVar[tuple[float, float] | None] = None  # as the benchmark's authors take it
+    range_eV: ClassVar[tuple[float, float] | None] = None  # as the benchmark's authors use it
     charge_states: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
@@ -159,11 +159,11 @@ class TabulatedRates:
         return self._interpolate(T_e_eV, self.energy_loss_rate)
 
     def events(self, T_e_eV: FloatArray) -> FloatArray:
-        """LANDMARK's constant momentum transfer holds all collisions: none are added to it."""
+        """Zero: LANDMARK's constant momentum transfer includes all collisions."""
         return np.zeros_like(T_e_eV)
 
     def drift_events(self, T_e_eV: FloatArray) -> FloatArray:
-        """The drift energy is left out."""
+        """Zero: the drift energy is left out."""
         return np.zeros_like(T_e_eV)
 
     def momentum(self, T_e_eV: FloatArray) -> FloatArray:
@@ -171,7 +171,7 @@ class TabulatedRates:
         return np.full_like(T_e_eV, self.elastic_rate)
 
     def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
-        """No Coulomb collisions in this closure."""
+        """Zero: this closure has no Coulomb collisions."""
         return np.zeros_like(T_e_eV)
 
 
@@ -179,11 +179,11 @@ class TabulatedRates:
 class PropellantTable:
     """Any gas: rate coefficients in m^3/s over the electron temperature, linear between rows.
 
-    T_e_eV: increasing. An inelastic event is one of two kinds, ionisation and one lumped
-    excitation; with both columns of the second charge, X2+ is there too, from X and from X+.
-    coulomb_weight: 0 leaves electron-ion collisions out. drift_weight: as for `XenonFits`; of the
-    inelastic events only excitation takes part of its energy from the drift, as in
-    HallThruster.jl. Beyond the rows the end values are held, and a run that gets there says so.
+    T_e_eV: increasing. There are two kinds of inelastic events, ionisation and one lumped
+    excitation. If both columns of the second charge are given, X2+ is made from X and from X+.
+    coulomb_weight: 0 leaves electron-ion collisions out. drift_weight: as in `XenonFits`. Of the
+    inelastic events, only excitation takes part of its energy from the drift, as in
+    HallThruster.jl. Beyond the rows the end values are held, and a run that gets there reports it.
     """
 
     name: str
@@ -234,7 +234,7 @@ class PropellantTable:
 
     @property
     def charge_states(self) -> int:
-        """2 where there are rates of the second charge."""
+        """The highest charge: 2 if there are rates of the second charge, else 1."""
         return 2 if self.second_ionization_rate else 1
 
     def _interpolate(self, T_e_eV: FloatArray, values: tuple[float, ...]) -> FloatArray:
@@ -266,7 +266,7 @@ class PropellantTable:
         return self._interpolate(T_e_eV, self.momentum_rate)
 
     def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
-        """nu_ei over n and ln(Lambda)."""
+        """nu_ei divided by n and ln(Lambda)."""
         return self.coulomb_weight * coulomb_rate(T_e_eV)
 
     def double_ionization(self, T_e_eV: FloatArray) -> FloatArray:
@@ -284,12 +284,12 @@ Propellant = XenonFits | TabulatedRates | PropellantTable
 
 
 def gas_name(propellant: Propellant) -> str:
-    """Name of a gas for messages."""
+    """Name of a gas in messages."""
     return propellant.name if isinstance(propellant, PropellantTable) else type(propellant).__name__
 
 
 def describe_uncovered(propellant: Propellant, reached_eV: float) -> str | None:
-    """What to say of a run that got so hot; None where the rates cover it."""
+    """Message if a run reached a T_e that the rates do not cover; otherwise None."""
     if propellant.range_eV is None or reached_eV <= propellant.range_eV[1]:
         return None
     return (

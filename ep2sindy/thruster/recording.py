@@ -1,4 +1,4 @@
-"""How the simulators record: chunks of samples, each told to the progress, and their names."""
+"""Recording by the simulators: chunks of samples, progress reports, and variable names."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from ep2sindy.runtime.progress import Advance
 
-CHUNK_ROWS = 50  # samples between two words on the progress
+CHUNK_ROWS = 50  # samples between two progress reports
 
-# Records the samples of a slice of rows, and says how many it took: fewer where the run breaks.
+# Records the samples of a slice of rows; returns their number, which is smaller if the run breaks.
 March = Callable[[slice], int]
 
 
 def record_samples(march: March, n_rows: int, advance: Advance) -> int:
-    """March until n_rows samples are recorded or the run breaks; how many samples it took."""
+    """March until n_rows samples are recorded or the run breaks; returns the number of samples."""
     filled = 0
     while filled < n_rows:
         part = slice(filled, min(filled + CHUNK_ROWS, n_rows))
@@ -31,9 +31,9 @@ def record_samples(march: March, n_rows: int, advance: Advance) -> int:
 
 
 def warm_up(march: March, n_rows: int, advance: Advance) -> int | None:
-    """March by n_rows samples without keeping them: each chunk is recorded over the one before.
+    """March by n_rows samples without keeping them; each chunk overwrites the previous one.
 
-    Returns None, or where the run breaks how many samples there are of the last chunk.
+    Returns None, or if the run breaks, the number of samples in the last chunk.
     """
     while n_rows > 0:
         n = min(n_rows, CHUNK_ROWS)
@@ -44,7 +44,7 @@ def warm_up(march: March, n_rows: int, advance: Advance) -> int | None:
 
 
 def notes(unit: str, long_name: str) -> dict[str, str]:
-    """Unit and name as xarray keeps them."""
+    """Unit and long name in the form of xarray's attributes."""
     return {"units": unit, "long_name": long_name}
 
 
@@ -56,9 +56,9 @@ def as_dataset(
     z: Float[np.ndarray, " z"],
     r: Float[np.ndarray, " r"] | None = None,
 ) -> xr.Dataset:
-    """Recorded arrays, without copying them, over time, the axis and the radius where there is one.
+    """Recorded arrays, without copies, over time, z and, if there is one, r.
 
-    data: dimensions, values and notes of every variable.
+    data: dimensions, values and attributes of every variable.
     """
     coords: dict[str, Any] = {
         # "s" is a unit here, not a calendar: decode with decode_times=False

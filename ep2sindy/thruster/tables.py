@@ -1,4 +1,4 @@
-"""Cells of a small CSV file, and numbers of them, with the place of a gap."""
+"""Reading the cells of a small CSV file as text or numbers; errors name the row."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from ep2sindy.data.readers.source import damage_named
 
 
 def read_cells(path: Path, what: str, *, may_be_short: bool = False) -> list[list[str]]:
-    """Rows of a CSV file, but empty ones and those that begin with #; `what` it is, for errors."""
+    """Rows of a CSV file, without empty ones and those that begin with #.
+
+    what: name of the file's contents, for errors.
+    """
     if not path.is_file():
         raise ValueError(f"no such {what}: {path.absolute()}")
     with damage_named(path), path.open(newline="", encoding="utf-8-sig") as file:
@@ -23,7 +26,7 @@ def read_cells(path: Path, what: str, *, may_be_short: bool = False) -> list[lis
 
 
 def number(cell: str) -> float | None:
-    """A cell as a finite number; None if it is none."""
+    """A cell as a finite number, or None."""
     try:
         value = float(cell)
     except ValueError:
@@ -32,7 +35,7 @@ def number(cell: str) -> float | None:
 
 
 def numbers(path: Path, rows: Sequence[Sequence[str]], n_columns: int) -> list[list[float]]:
-    """Every cell as a number; raises ValueError with the row that has a gap."""
+    """Every cell as a number; raises ValueError that names the row of a gap."""
     found = []
     for k, row in enumerate(rows, start=1):
         values = [value for cell in row if (value := number(cell)) is not None]

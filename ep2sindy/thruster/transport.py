@@ -1,6 +1,6 @@
-"""Anomalous transport: collisions nu = c(z) omega_ce that no theory predicts.
+"""Anomalous transport: an effective collision frequency nu = c(z) omega_ce, not given by theory.
 
-Siblings with one method: `at(distance)`, the coefficient c at a distance from the exit in m,
+The classes share one method: `at(distance)`, the coefficient c at a distance from the exit in m,
 negative inside the channel. Their numbers are tuned, as in every 1-D code; see docs/thruster.md.
 """
 
@@ -24,7 +24,7 @@ Points = Sequence[float] | Float[np.ndarray, " points"]
 
 @dataclass(frozen=True)
 class AnomalousTransport:
-    """Two zones, with c linear across a layer about the exit."""
+    """Two zones, with c linear across a layer around the exit."""
 
     c_channel: float = 1 / 300
     c_plume: float = 1 / 145
@@ -47,7 +47,7 @@ class GaussianTransport:
     """One level with a trough: c = c_far (1 - (1 - trough) exp(-((d - center)/width)^2 / 2)).
 
     center: distance of the trough from the exit in m; width: its standard deviation in m;
-    trough: what is left of c_far at its middle. Source: GaussianBohm of HallThruster.jl,
+    trough: c at its middle, as a share of c_far. Source: GaussianBohm of HallThruster.jl,
     Marks et al., JOSS 8 (2023) 4672.
     """
 
@@ -71,10 +71,10 @@ class GaussianTransport:
 
 @dataclass(frozen=True)
 class MultiLogTransport:
-    """Through given points: log c is linear between them, and held beyond the first and last.
+    """Coefficients at given points: log c is linear between them, constant beyond the ends.
 
-    distance: of the points from the exit in m, increasing, negative inside; c: at them. As
-    Hall2De and HallThruster.jl (MultiLogBohm) have it.
+    distance: of the points from the exit in m, increasing, negative inside. c: values at the
+    points. Hall2De and HallThruster.jl (MultiLogBohm) use the same form.
     """
 
     distance: Points

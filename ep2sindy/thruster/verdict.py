@@ -1,4 +1,4 @@
-"""What became of a run: does it breathe, on which cycle, and do its balances close?"""
+"""Verdict on a run: whether it breathes, on which cycle, and whether its balances close."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.thruster.parameters import OperatingPoint
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, exact (CGPM 1901)
-TRANSIT_HZ = 60e3  # ions cross the domain in some microseconds; the breathing mode is slower
+TRANSIT_HZ = 60e3  # ions cross the domain in microseconds; the breathing mode is slower
 BREATHING = replace(SIMULATED, max_Hz=TRANSIT_HZ)
-STRONG_SHARE = 0.9  # of the mean: a larger standard deviation is that of the strong cycle
+STRONG_SHARE = 0.9  # of the mean: the strong cycle has a larger standard deviation
 
 
 def judge_status(current: Float[np.ndarray, " time"], sample_s: float) -> str:
-    """Say what the current does at the end of the record: oscillates, in one of two ways, or not.
+    """Status of the current at the end of the record: oscillating, transit, steady or decaying.
 
-    The second half is cut into four blocks: steady if the last one varies by less than 2 % of
-    its mean, decaying if it holds less than 0.7 of the first one's amplitude; transit if its
-    dominant frequency is above 60 kHz, where ions cross the acceleration zone and the breathing
-    mode does not go; else oscillating.
-    Some sets oscillate for 2 ms and die by 3 ms: a verdict needs 4 ms or more of simulated time.
+    The second half is cut into four blocks. The status is steady if the last block varies by less
+    than 2 % of its mean, and decaying if it holds less than 0.7 of the first block's amplitude. It
+    is transit if the dominant frequency is above 60 kHz, where ions cross the acceleration zone and
+    the breathing mode does not occur. Otherwise it is oscillating. Some parameter sets oscillate
+    for 2 ms and die by 3 ms: a verdict needs 4 ms or more of simulated time.
     """
     late = current[current.size // 2 :]
     return str(oscillation(sample_s * np.arange(late.size), late[:, None], BREATHING))
@@ -54,7 +54,7 @@ def diagnose(field: xr.Dataset, *, diverged: bool) -> dict[str, Any]:
 
 
 def outcome(field: xr.Dataset, point: OperatingPoint, *, diverged: bool) -> dict[str, Any]:
-    """What `diagnose` says, and `performance` of the mean thrust, current and voltage."""
+    """The results of `diagnose`, and `performance` at mean thrust, current and voltage."""
     found = diagnose(field, diverged=diverged)
     if field.sizes["time"]:
         mean = {name: float(field[name].mean()) for name in ("I_d", "V_d", "thrust")}

@@ -1,4 +1,4 @@
-"""Channel walls and the anode: what electrons and ions lose to them, with the published sources."""
+"""Channel walls and the anode: losses of electrons and ions to them, with published sources."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FloatArray = Float[np.ndarray, "..."] | np.float64
 def share(
     distance: Float[np.ndarray, " z"], channel: float, plume: float, transition: float
 ) -> Float[np.ndarray, " z"]:
-    """From `channel` to `plume` across the exit: at once, or linear over `transition` in m."""
+    """From `channel` to `plume` across the exit: a step, or linear over `transition` in m."""
     if transition == 0.0:
         return np.where(distance < 0.0, channel, plume)
     return channel + (plume - channel) * np.clip(distance / transition + 0.5, 0.0, 1.0)
@@ -40,12 +40,12 @@ def share(
 class SheathWall:
     """Dielectric channel wall behind a sheath, with linear secondary-electron emission.
 
-    gamma = min(gamma_max, yield_0 + (1 - yield_0) 1.5 T_e / crossover_eV), where
-    gamma_max = 1 - 8.3 sqrt(m_e/m) is the space-charge limit; wall collisions
-    nu_w = electron_scale 0.4965 sqrt(e T_e/m) / (gap (1 - gamma)); each costs
-    2 T_e + (1 - gamma) phi_w, phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e))). Of the
-    collisions the share `plume_collisions` acts beyond the exit, of the power `plume_power`; ions
-    are lost in the channel alone. transition: length in m over which they change at the exit.
+    gamma = min(gamma_max, yield_0 + (1 - yield_0) 1.5 T_e / crossover_eV), where gamma_max = 1 -
+    8.3 sqrt(m_e/m) is the space-charge limit. Electrons collide with the wall at nu_w =
+    electron_scale 0.4965 sqrt(e T_e/m) / (gap (1 - gamma)). Each collision costs 2 T_e + (1 -
+    gamma) phi_w, phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e))). Beyond the exit, the share
+    `plume_collisions` of the collisions and the share `plume_power` of the power remain; ions are
+    lost in the channel only. transition: length in m over which the shares change at the exit.
     Default: BN-SiO2. Sources: Marks et al., JOSS 8 (2023) 4672; Goebel & Katz, chapter 7.
     """
 
@@ -94,11 +94,11 @@ class SheathWall:
         return share(distance, 1.0, 0.0, self.transition)
 
     def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of the electrons' collisions at a distance from the exit."""
+        """Share of the electrons' wall collisions at a distance from the exit in m."""
         return share(distance, 1.0, self.plume_collisions, self.transition)
 
     def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of the power at a distance from the exit."""
+        """Share of the power loss at a distance from the exit in m."""
         return share(distance, 1.0, self.plume_power, self.transition)
 
 
@@ -160,11 +160,11 @@ class ExponentialWall:
         return self.frequency * energy * np.exp(-self.sheath_V / energy)
 
     def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of an ion loss that is zero."""
+        """1 in the channel and 0 in the plume, but the ion loss itself is zero."""
         return share(distance, 1.0, 0.0, self.transition)
 
     def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Electrons collide in the channel alone."""
+        """Share of the wall collisions: electrons collide in the channel only."""
         return share(distance, 1.0, 0.0, self.transition)
 
     def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
@@ -177,7 +177,7 @@ Wall = SheathWall | ExponentialWall
 
 @dataclass(frozen=True)
 class FixedAnode:
-    """Electrons have this temperature at the anode's face, whatever arrives; no sheath drop."""
+    """An anode with a fixed electron temperature at its face and no sheath drop."""
 
     T_e_eV: float = 3.0
 
@@ -187,22 +187,23 @@ class FixedAnode:
 
 @dataclass(frozen=True)
 class AnodeSheath:
-    """A sheath whose potential lets through just the electrons that the current needs.
+    """A sheath that transmits just the electrons that the current needs.
 
-    With n, T and j_i at the face and j_e = I_d/A - j_i, the electrons that fall on the anode by
-    themselves carry j_th = e n sqrt(8 e T/(pi m_e))/4; the sheath holds back the rest:
+    With n, T and j_i at the face and j_e = I_d/A - j_i, the thermal flux of electrons to the anode
+    would be j_th = e n sqrt(8 e T/(pi m_e))/4; the sheath repels the excess:
 
         V_s = -T ln(min(1, j_e/j_th)), and 0 where j_e <= 0.
 
-    The plasma at the face then stands V_s above the anode, V_0 + V_s. Of heat each electron takes
-    2 T + potential_weight V_s: 1 is what a Maxwellian pays that climbs the sheath (Goebel & Katz,
-    chapter 7; Hara, Plasma Sources Sci. Technol. 28 (2019) 044001); HallThruster.jl v0.22 takes 2.
-    The temperature has no gradient there, but where electrons leave the anode, which have T_e_eV.
-    Ions leave at sqrt((e T + k T_i)/m)/sqrt(1 + chi) or faster, T of the first cell,
-    chi = exp(-x)/(sqrt(pi x) (1 + erf(sqrt(x)))), x = V_s/T (Hara 2019).
+    The potential of the plasma at the face is then V_0 + V_s, that is V_s above the anode. Each
+    electron removes the heat 2 T + potential_weight V_s. The weight 1 is that of Maxwellian
+    electrons that climb the sheath (Goebel & Katz, chapter 7; Hara, Plasma Sources Sci. Technol. 28
+    (2019) 044001); HallThruster.jl v0.22 takes 2. The temperature has no gradient at the face,
+    unless electrons leave the anode; these have T_e_eV. Ions leave at sqrt((e T + k T_i)/m)/sqrt(1
+    + chi) or faster, with T of the first cell, chi = exp(-x)/(sqrt(pi x) (1 + erf(sqrt(x)))), x =
+    V_s/T (Hara 2019).
     """
 
-    T_e_eV: float = 2.0  # of electrons from the anode, and of the first guess
+    T_e_eV: float = 2.0  # temperature of electrons from the anode, and of the first guess
     potential_weight: float = 1.0
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The balance of ions and neutrals in a zone: what changes in it is what crosses its ends."""
+"""Balance of ions and neutrals in a zone: the change inside against the flux through its ends."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ NEEDED = ("dn_i_dt", "dn_n_dt", "face_flux_i", "face_flux_n", "ionization", "wal
 
 
 def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
-    """Terms of d<n>/dt in the cells whose centres lie in z = (from, to) in m, in m^-3/s, per time.
+    """Terms of d<n>/dt over the cells whose centres lie in z = (from, to) in m; in m^-3/s, by time.
 
-    field: a run of `simulate` with averages; the zone must end before the last cell. Returns, of
+    field: a run of `simulate` with averages; the zone must end before the last cell. Returns, for
     ions of all charges together, `change_i`, `change_n` (of the zone averages), `inflow_i`,
-    `inflow_n` (through its two ends, less what leaves), `ionization`, `wall_loss` and `residual`:
-    the change of ions and neutrals less their inflow, which is rounding.
-    Raises ValueError for a field without averages, or a zone without cells or at the last one.
+    `inflow_n` (net inflow through its two ends), `ionization`, `wall_loss` and `residual`: the
+    change of ions and neutrals less their inflow, which is zero but for rounding. Raises ValueError
+    for a field without averages, a zone without cells, or one with the last cell.
     """
     if missing := [name for name in NEEDED if name not in field]:
         raise ValueError(
@@ -33,7 +33,7 @@ def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
     dz = field["dz"].values[first:beyond].astype(float)
 
     def summed(name: str) -> np.ndarray:
-        """Over the charge states that the run has."""
+        """Sum over the charge states of the run."""
         found = [field[each].values for each in (name, f"{name}2") if each in field]
         return np.sum(found, axis=0, dtype=float)
 

@@ -1,4 +1,4 @@
-"""Compiled: what electrons do in collisions and at walls, from the table of closures."""
+"""Compiled collisions of electrons, with neutrals, ions and walls, from the table of closures."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 @compiled(**FAST)
 def table_rows(T, drift, weight, model, row, share):
-    """Row below T + 2 K/3 in the closure table and the share of the one above; False off it."""
+    """Row below T + 2 K/3 in the closure table, share of the row above; False off the table."""
     per_eV, top = 1.0 / model.table_step_eV, model.table.shape[0] - 2.0
     weight = weight * 2.0 / 3.0
     for i in range(T.size):
@@ -50,7 +50,7 @@ def lookup(table, row, share, column, out):
 
 @compiled(**FAST)
 def loss_with_slope(table, row, share, column, per_eV, loss, slope):
-    """A loss rate in eV m^3/s or eV/s and its slope by T_e, none where the loss falls."""
+    """A loss rate in eV m^3/s or eV/s and its slope in T_e; the slope is 0 where the loss falls."""
     for i in range(loss.size):
         below = table[row[i], column]
         rise = table[row[i] + ONE, column] - below
@@ -62,7 +62,8 @@ def loss_with_slope(table, row, share, column, per_eV, loss, slope):
 def collisions(state, model, rows, w):
     """Collision frequency w[0] and mobility w[1], losses w[3] and w[5] with slopes w[4] and w[6].
 
-    Losses: inelastic, to the walls, in eV/(m^3 s). rows: (n + 2,). False where the table ends.
+    w[3] is the inelastic loss and w[5] the loss to the walls, in eV/(m^3 s). rows: (n + 2,).
+    Returns False if the temperature leaves the table.
     """
     table, row, share, T, drift = model.table, rows, w[8], state.T_e_eV, state.drift_eV
     nu, mobility, value, n, nn = w[0], w[1], w[7], state.n_e, state.n_n
@@ -102,7 +103,7 @@ def collisions(state, model, rows, w):
 
 @compiled(**FAST)
 def weighted_loss(n, weight, model, row, share, column, loss, slope):
-    """n weight times a loss per electron and unit of weight, and its slope by T_e."""
+    """n weight times a loss per electron and unit weight, and its slope in T_e."""
     loss_with_slope(model.table, row, share, column, 1.0 / model.table_step_eV, loss, slope)
     for i in range(n.size):
         loss[i] *= n[i] * weight[i]
@@ -111,7 +112,7 @@ def weighted_loss(n, weight, model, row, share, column, loss, slope):
 
 @compiled(**FAST)
 def credit_drift(n, nn, drift, table, row, share, events, inelastic):
-    """What of the inelastic loss some propellants take from the drift instead of from the heat."""
+    """Subtract the inelastic loss that some propellants take from the drift, not the heat."""
     lookup(table, row, share, DRIFT_EVENTS, events)
     for i in range(n.size):
         inelastic[i] -= n[i] * nn[i] * events[i] * drift[i]
@@ -119,7 +120,7 @@ def credit_drift(n, nn, drift, table, row, share, events, inelastic):
 
 @compiled(**FAST)
 def second_charge(state, model, row, share, inelastic):
-    """Rates of the second charge state, and what they cost the electrons."""
+    """Rate coefficients of the second charge state, and their energy cost for the electrons."""
     double, second, first = state.rates[1], state.rates[2], state.n_i[0]
     E_double, E_second = model.second_thresholds_eV
     lookup(model.table, row, share, DOUBLE, double)

@@ -1,4 +1,4 @@
-"""Compiled: electrons, by Ohm's law and one implicit solve for their temperature a step."""
+"""Compiled electrons: Ohm's law, and one implicit solve for their temperature per step."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from ep2sindy.thruster.axial.state_kernels import (
 )
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
-COLDEST_EV = 1.0  # of the ghost cells: a steep end would otherwise turn them negative
+COLDEST_EV = 1.0  # least T_e of the ghost cells: a steep end could turn them negative
 
 
 @compiled(**FAST)
@@ -33,7 +33,7 @@ def fill_ghosts(values):
 
 @compiled(**FAST)
 def sum_charges(state):
-    """Density of electrons and charge flux of all ions, ghosts included."""
+    """Electron density and charge flux of all ions, including the ghost cells."""
     n, g, n_e, flux_q = state.n_i, state.flux_i, state.n_e, state.flux_q
     for k in range(n.shape[0]):
         fill_ghosts(n[k])
@@ -52,7 +52,7 @@ def sum_charges(state):
 
 @compiled(**FAST)
 def follow_log(state):
-    """ln n_e by its change since the last step: 2 (r - 1)/(r + 1) is ln r to third order."""
+    """Update ln n_e by its change in one step: 2 (r - 1)/(r + 1) is ln r to third order."""
     n_e, log_n, before = state.n_e, state.log_n[0], state.log_n[1]
     for i in range(n_e.size):
         log_n[i] += 2.0 * (n_e[i] - before[i]) / (n_e[i] + before[i])
@@ -62,7 +62,7 @@ def follow_log(state):
 
 @compiled(**ENTRY)
 def start_density(state):
-    """Density of electrons and its logarithm, afresh."""
+    """Compute the electron density and its logarithm anew."""
     sum_charges(state)
     for i in range(state.n_e.size):
         state.log_n[0, i] = np.log(state.n_e[i])
@@ -71,7 +71,7 @@ def start_density(state):
 
 @compiled(**FAST)
 def sheath_drop(state, model):
-    """Potential of the plasma above the anode in V, by the last step's current: see AnodeSheath."""
+    """Potential of the plasma above the anode in V, by the last current: see AnodeSheath."""
     T, n = max(state.T_e_eV[1], COLDEST_EV), state.n_e[1]
     electrons = state.instant[CURRENT] / (E_CHARGE * model.area) - state.flux_q[1]
     thermal = 0.25 * n * np.sqrt(8.0 * E_CHARGE * T / (np.pi * M_ELECTRON))
@@ -82,9 +82,9 @@ def sheath_drop(state, model):
 
 @compiled(**FAST)
 def ohm(state, model, drop, w):
-    """Field and drift energy; heating -n u_e E in w[2]; returns I_d/(e A).
+    """Electric field and drift energy; writes the heating -n u_e E to w[2]; returns I_d/(e A).
 
-    drop: of the anode's sheath, which the plasma has to itself, in V.
+    drop: voltage of the anode's sheath in V, which adds to the voltage over the plasma.
     """
     n, g, T, E, drift = state.n_e, state.flux_q, state.T_e_eV, state.E, state.drift_eV
     nu, mobility, heating, gradient = w[0], w[1], w[2], w[7]
@@ -114,12 +114,12 @@ def ohm(state, model, drop, w):
 
 @compiled(**FAST)
 def solve_from_both_ends(lower, diagonal, upper, known, T, c, d):
-    """Tridiagonal system for T[1:-1]; T[0] and T[-1] are given.
+    """Solve a tridiagonal system for T[1:-1]; T[0] and T[-1] are given.
 
-    Elimination runs from both ends to the middle: two chains of divisions side by side.
+    Elimination runs from both ends to the middle, so that two chains of divisions overlap in time.
     """
     size = diagonal.size
-    middle = (size - 1) // 2  # last row that is eliminated from the left
+    middle = (size - 1) // 2  # last row eliminated from the left
     c[0], d[0], c[size - 1], d[size - 1] = 0.0, T[0], 0.0, T[size - 1]
     j = size - 1
     for i in range(1, middle + 1):
@@ -146,9 +146,10 @@ def solve_from_both_ends(lower, diagonal, upper, known, T, c, d):
 
 @compiled(**FAST)
 def heat_through_faces(state, model, total, drop, kappa, down, up, w):
-    """Convection, upwind, and conduction: through face i goes down[i] T[i] + up[i] T[i + 1].
+    """Upwind convection and conduction: the flux through face i is down[i] T[i] + up[i] T[i + 1].
 
-    w: collision frequency, mobility, and in w[17] that of electrons with ions.
+    w holds the collision frequency, the mobility, and in w[17] the electron-ion collision
+    frequency.
     """
     n, g, T, mobility, between = state.n_e, state.flux_q, state.T_e_eV, w[1], model.between
     for i in range(n.size):
@@ -172,8 +173,8 @@ def heat_through_faces(state, model, total, drop, kappa, down, up, w):
 def heat(state, model, dt, total, drop, w):
     """New electron temperature: implicit upwind convection, conduction and linearised losses.
 
-    Leaves what flows through the ends, in eV/(m^2 s), towards the cathode, in w[0, 0] and w[0, 1],
-    and the losses at the new temperature in w[3] and w[5].
+    Writes the energy fluxes through the two ends, in eV/(m^2 s) towards the cathode, to w[0, 0] and
+    w[0, 1], and the losses at the new temperature to w[3] and w[5].
     """
     n, T, energy, inverse_dz = state.n_e, state.T_e_eV, state.energy, model.inverse_dz
     heating, inelastic, slope_in, wall, slope_wall = w[2], w[3], w[4], w[5], w[6]
@@ -210,7 +211,7 @@ def heat(state, model, dt, total, drop, w):
 
 @compiled(**FAST)
 def record_powers(state, model, total, w):
-    """Currents, thrust and where the power goes, as `SERIES_SUMS` names them."""
+    """Record currents, thrust and power terms, as named in `SERIES_SUMS`."""
     g, E, dz = state.flux_q, state.E, model.dz
     inelastic, wall, instant = w[3], w[5], state.instant
     n, last = state.n_e, g.size - 2
@@ -241,14 +242,14 @@ def record_powers(state, model, total, w):
 
 @compiled(**ENTRY)
 def electron_step(state, model, dt, rows, w):
-    """Collisions, discharge current, field and new temperature; False where the run breaks."""
+    """Collisions, discharge current, field and new temperature; returns False if the run breaks."""
     T = state.T_e_eV
     sum_charges(state)
     follow_log(state)
     fill_ghosts(state.n_n)
     # The ends of the domain, half a cell outside the last centres, are held at their temperature.
     T[0] = max(2.0 * model.anode_T_e_eV - T[1], COLDEST_EV)
-    if model.sheath:  # electrons that leave the anode have its temperature, all others T[1]
+    if model.sheath:  # electrons from the anode have its temperature; otherwise T[1] is taken
         T[0] = T[1] if state.instant[CURRENT] > 0.0 else model.anode_T_e_eV
     T[-1] = max(2.0 * model.cathode_T_e_eV - T[-2], COLDEST_EV)
     if not collisions(state, model, rows, w):

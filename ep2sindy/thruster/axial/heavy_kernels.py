@@ -1,4 +1,4 @@
-"""Compiled: ions and neutrals, by finite volumes with van Leer's slopes and Heun's steps."""
+"""Compiled ions and neutrals: finite volumes with van Leer's slopes and Heun's steps."""
 
 import math
 
@@ -23,20 +23,20 @@ from ep2sindy.thruster.axial.state_kernels import (
 )
 from ep2sindy.thruster.constants import E_CHARGE
 
-TINY = 1e-60  # against 0/0
+TINY = 1e-60  # avoids 0/0
 
 
 @compiled(**FAST)
 def half_slopes(values, model, s):
     """Half of van Leer's slope in every cell: a*b/(a + b) of the differences to both sides.
 
-    It is 0 at an extremum, and in the two outermost cells.
+    The slope is 0 at an extremum, and in the two outermost cells.
     """
     to_left, to_right = model.to_left, model.to_right
     for i in inside(values):
         a = (values[i] - values[i - ONE]) * to_left[i]
         b = (values[i + ONE] - values[i]) * to_right[i]
-        s[i] = max(a * b, 0.0) * (a + b) / ((a + b) ** 2 + TINY)  # a branch would cost the vectors
+        s[i] = max(a * b, 0.0) * (a + b) / ((a + b) ** 2 + TINY)  # a branch would not vectorise
     s[1] = s[-2] = 0.0
     if not model.reconstruct:
         s[:] = 0.0
@@ -69,9 +69,9 @@ def ion_fluxes(n, g, c2, bohm, model, w, f_n, f_g):
 
 @compiled(**FAST)
 def births(n, g, nn, state, model, gain, momentum, consumed):
-    """What collisions add to ions of every charge: density, momentum over mass; neutrals consumed.
+    """Gains of ions of every charge in density and momentum over mass, and the neutrals consumed.
 
-    Ions born of neutrals bring the neutrals' speed, or none; those born of ions their parents'.
+    Ions from neutrals start with the neutrals' speed or at rest; ions from ions keep their speed.
     """
     charges, size = n.shape
     single, double, second = state.rates[0], state.rates[1], state.rates[2]
@@ -97,7 +97,7 @@ def births(n, g, nn, state, model, gain, momentum, consumed):
 
 @compiled(**FAST)
 def neutral_fluxes(nn, model, at_anode, slopes, f_nn):
-    """Fluxes of neutrals; ions that reached the anode come back as neutrals."""
+    """Fluxes of neutrals; ions that reached the anode return as neutrals."""
     half_slopes(nn, model, slopes)
     f_nn[0] = model.neutral_inflow - at_anode
     for i in inside(nn):
@@ -106,7 +106,7 @@ def neutral_fluxes(nn, model, at_anode, slopes, f_nn):
 
 @compiled(**FAST)
 def leaving_speed(charge, state, model):
-    """Speed in m/s at which ions of a charge over mass leave into the anode: see AnodeSheath."""
+    """Speed in m/s at which ions leave into the anode, for a charge over mass; see AnodeSheath."""
     if not model.sheath:
         return np.sqrt(charge * model.anode_T_e_eV)
     T, drop = max(state.T_e_eV[1], COLDEST_EV), sheath_drop(state, model)
@@ -122,7 +122,7 @@ def leaving_speed(charge, state, model):
 def ion_rates(k, n, g, state, model, sums, weight, w, d_n, d_g):
     """Time derivatives of density and flux of ions of charge k + 1; returns their anode flux.
 
-    Adds what the walls neutralise to w[4].
+    The rate of ions neutralised at the walls is added to w[4].
     """
     f_n, f_g, neutralised, gain, momentum = w[0], w[1], w[4], w[6 + k], w[8 + k]
     z, through, walled = k + 1.0, sums.cells[FACE_I + PER_CHARGE * k], sums.cells[WALL_LOSS]
@@ -166,7 +166,7 @@ def heavy_rates(n, g, nn, state, model, sums, weight, w, d_n, d_g, d_nn):
 def heavy_step(state, model, dt, sums, w):
     """One SSP-RK2 (Heun) step of ions and neutrals in a frozen field.
 
-    w: (26, n + 2). What goes into `sums` is what this step did, to rounding.
+    w: (26, n + 2). The entries of `sums` match the changes of this step to rounding.
     """
     n, g, nn = state.n_i, state.flux_i, state.n_n
     n_1, g_1, nn_1 = w[16:18], w[18:20], w[20]

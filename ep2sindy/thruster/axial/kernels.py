@@ -1,4 +1,4 @@
-"""Compiled inner loop: one sample after the other, heavy species and electrons in turn."""
+"""Compiled inner loop: sample after sample, heavy species and electrons in turn."""
 
 import numpy as np
 
@@ -24,12 +24,12 @@ from ep2sindy.thruster.axial.state_kernels import (
     inside,
 )
 
-NO_NAN = {**FAST, "fastmath": {*FAST["fastmath"], "nnan"}}  # a maximum needs it for vectors
+NO_NAN = {**FAST, "fastmath": {*FAST["fastmath"], "nnan"}}  # needed to vectorise a maximum
 
 
 @compiled(**NO_NAN)
 def fastest(n, g, inverse_dz, c):
-    """Largest (|u| + c)/dz of a species, 1/s."""
+    """Largest (|u| + c)/dz of a species, in 1/s."""
     top = 0.0
     for i in inside(n):
         top = max(top, (abs(g[i] / n[i]) + c) * inverse_dz[i])
@@ -38,7 +38,7 @@ def fastest(n, g, inverse_dz, c):
 
 @compiled(**FAST)
 def time_step(state, model, left):
-    """Equal share of the time left to the next sample that keeps the CFL number."""
+    """Time step within the CFL number that divides the time left to the next sample equally."""
     c = np.sqrt(model.sound_speed_squared)
     top = 0.0
     for k in range(state.n_i.shape[0]):
@@ -48,7 +48,7 @@ def time_step(state, model, left):
 
 @compiled(**FAST)
 def add_instant(sums, state, weight, work):
-    """Adds weight times the present fields, but for what the heavy step adds itself."""
+    """Add weight times the present fields to the sums, except those that the heavy step adds."""
     cells = sums.cells
     add_scaled(cells[N_N], state.n_n, weight)
     add_scaled(cells[T_E], state.T_e_eV, weight)
@@ -67,7 +67,7 @@ def add_instant(sums, state, weight, work):
 
 @compiled(**FAST)
 def add_changes(sums, state, sign):
-    """With -1 before and 1 after a sample, what the densities gained in it."""
+    """Add the densities' gain over a sample; call with sign -1 before it and +1 after it."""
     add_scaled(sums.cells[CHANGE_N], state.n_n, sign)
     for k in range(state.n_i.shape[0]):
         add_scaled(sums.cells[CHANGE_I + PER_CHARGE * k], state.n_i[k], sign)
@@ -77,7 +77,8 @@ def add_changes(sums, state, sign):
 def advance(state, model, sample_s, averaged, fields, series):
     """Fill the rows of fields (cell sums, rows, cells) and series (rows, series); return how many.
 
-    Averages over each sample, or the values at its end. Rows before the one that breaks stay.
+    Rows hold averages over each sample, or the values at its end. If the run breaks, earlier rows
+    remain.
     """
     size = state.n_n.size
     work, rows = np.zeros((26, size)), np.zeros(size, np.uint64)
@@ -90,7 +91,7 @@ def advance(state, model, sample_s, averaged, fields, series):
         left, weight = sample_s, sample_s
         while left > 1e-9 * sample_s:
             dt = time_step(state, model, left)
-            if not averaged:  # what stays is the last step's
+            if not averaged:  # keep the last step only
                 sums.cells[:] = 0.0
                 sums.series[:] = 0.0
                 weight = dt

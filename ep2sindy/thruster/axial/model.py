@@ -1,6 +1,6 @@
-"""From parameters to cells along the axis and the arrays of the compiled loop.
+"""Cells along the axis and the compiled loop's arrays, from a thruster's parameters.
 
-Cells are all of one length, or longer in the plume, where ions are fast.
+Cells have equal lengths, or are longer in the plume, where ions are fast.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from ep2sindy.thruster.walls import AnodeSheath
 
 CFL = 0.8
 MIN_CELLS = 10
-CENTRE_M, WIDTH_M = 12e-3, 4e-3  # beyond the exit; of the passage from short to long cells
+CENTRE_M, WIDTH_M = 12e-3, 4e-3  # beyond the exit; from short to long cells
 
 
 def cell_faces(thruster: Thruster, n_cells: int, stretch: float) -> Float[np.ndarray, " faces"]:
-    """Places of the faces in m, from the anode to the cathode plane.
+    """Positions of the faces in m, from the anode to the cathode plane.
 
-    stretch: length of the plume's cells over that of the channel's; 1 makes all alike. The time
-    step is that of the ions' fastest passage through a cell, so that longer cells in the plume
-    take fewer steps for as many cells in all.
+    stretch: length of the plume's cells relative to the channel's; 1 makes all equal. The time step
+    is limited by the ions' fastest passage through a cell. Longer cells in the plume therefore need
+    fewer steps for the same number of cells.
     Raises ValueError for fewer than ten cells, or a stretch below 1.
     """
     if n_cells < MIN_CELLS:
@@ -52,7 +52,7 @@ def build_model(
     reconstruct: bool = True,
     coldest_eV: float = 0.0,
 ) -> AxialModel:
-    """Gather every constant of one run; arrays hold one ghost cell at each end."""
+    """Gather all constants of one run; arrays hold one ghost cell at each end."""
     distance = lengths_and_centres(faces)[1] - thruster.channel_length
     omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
     mass, anode, wall = thruster.propellant.mass, thruster.anode, thruster.wall
@@ -91,7 +91,7 @@ def build_model(
 
 
 def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Float[np.ndarray, " cells"]]:
-    """Lengths of a model, of its cells and between their centres."""
+    """The length arrays of a model: of its cells and between their centres."""
     dz, z = lengths_and_centres(faces)
     between = np.diff(z)
     return {
@@ -106,7 +106,7 @@ def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Float[np.ndarray, 
 def lengths_and_centres(
     faces: Float[np.ndarray, " faces"],
 ) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
-    """Of all cells with their ghosts, which mirror the outermost cells."""
+    """Lengths and centres of all cells; ghost cells mirror the outermost cells."""
     dz = np.diff(faces)
     dz = np.concatenate([dz[:1], dz, dz[-1:]])
     ends = [faces[0] - dz[0], *faces, faces[-1] + dz[-1]]
@@ -117,6 +117,6 @@ def _second_thresholds(thruster: Thruster) -> tuple[float, float]:
     if thruster.charge_states == 1:
         return 0.0, 0.0
     propellant = thruster.propellant
-    assert isinstance(propellant, PropellantTable)  # the thruster has seen to it
+    assert isinstance(propellant, PropellantTable)  # the thruster checks this
     energies = propellant.double_ionization_eV, propellant.second_ionization_eV
     return energies[0] or 0.0, energies[1] or 0.0

@@ -1,4 +1,4 @@
-"""What a run of the axial model recorded, as an xarray.Dataset with names and units."""
+"""Record of a run of the axial model, as an xarray.Dataset with names and units."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ep2sindy.thruster.axial.state_kernels import AxialModel
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.thruster.recording import as_dataset, notes
 
-FIELDS = {  # variable -> place among the cell sums, unit, long name
+FIELDS = {  # variable -> index among the cell sums, unit, long name
     "n_i": (recorded.N_I, "m^-3", "ion density"),
     "u_iz": (recorded.U_IZ, "m/s", "axial ion velocity"),
     "n_n": (recorded.N_N, "m^-3", "neutral density"),
@@ -22,7 +22,7 @@ FIELDS = {  # variable -> place among the cell sums, unit, long name
     "R_ion": (recorded.R_ION, "m^3/s", "ionisation rate coefficient"),
     "E_z": (recorded.E_Z, "V/m", "axial electric field"),
 }
-# Averages of products, and what closes the balance of a sample; only averages have them.
+# Averages of products, and the terms that close a sample's balance; recorded with averages only.
 AVERAGES = {
     "ionization": (recorded.IONIZATION, "m^-3/s", "neutrals ionised per volume and time"),
     "flux_i": (recorded.FLUX_I, "m^-2/s", "ion flux"),
@@ -34,7 +34,7 @@ AVERAGES = {
     "dn_n_dt": (recorded.CHANGE_N, "m^-3/s", "change of n_n over the sample"),
 }
 OF_CHARGE = ("n_i", "u_iz", "flux_i", "face_flux_i", "dn_i_dt")
-# Products whose averages they are; a second charge state is ionised by rates of its own.
+# Variable -> the product it averages; a second charge state has its own ionisation rates.
 PRODUCTS = {"ionization": "n_i*n_n*R_ion", "flux_i": "n_i*u_iz"}
 
 SERIES = {  # variable -> unit, long name
@@ -57,7 +57,7 @@ POWERS = ("P_in", "P_ions", "P_inelastic", "P_wall", "P_anode", "P_cathode")
 
 
 def field_columns(*, charges: int, averaged: bool) -> dict[str, tuple[int, str, str]]:
-    """Variables of a run: place among the cell sums, unit and long name."""
+    """Variables of a run: index among the cell sums, unit and long name."""
     first = FIELDS | (AVERAGES if averaged else {})
     columns = dict(first)
     for k in range(1, charges):
@@ -72,7 +72,7 @@ def field_columns(*, charges: int, averaged: bool) -> dict[str, tuple[int, str, 
 def series_of(
     sums: Float[np.ndarray, "samples series"], model: AxialModel, *, voltage: float, sample_s: float
 ) -> dict[str, Float[np.ndarray, " samples"]]:
-    """The named series of a run; voltage: of the supply, in V."""
+    """The named time series of a run. voltage: supply voltage in V."""
     current = sums[:, recorded.CURRENT]
     particles = model.ion_mass * model.area
     flow_i, flow_n = sums[:, recorded.IONS_OUT], sums[:, recorded.NEUTRALS_OUT]

@@ -1,4 +1,4 @@
-"""How a run of the axial model is solved and recorded."""
+"""Numerical and recording settings of a run of the axial model."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from ep2sindy.thruster.axial.model import CFL
 from ep2sindy.trust.memory import check_memory
 
-MIN_STEPS = 16  # fewer samples leave nothing to judge an oscillation by
+MIN_STEPS = 16  # fewer samples cannot show an oscillation
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a run is solved and recorded: see `simulate`."""
+    """Numerical and recording settings of a run; see `simulate`."""
 
     duration_s: float = 18e-3
     warm_up_s: float = 2e-3
@@ -29,7 +29,7 @@ class Settings:
     coldest_T_e_eV: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise ValueError where a run could not start or could not be sampled."""
+        """Raise ValueError if a run could not start or could not be sampled."""
         if not (np.isfinite(self.sample_s) and self.sample_s > 0.0):
             raise ValueError(f"sample_s must be finite and positive, got {self.sample_s!r} s")
         if not (np.isfinite(self.warm_up_s) and self.warm_up_s >= 0.0):
@@ -41,7 +41,7 @@ class Settings:
             )
         n_samples = self.duration_s / self.sample_s
         check_memory(
-            32.0 * self.n_cells * (n_samples + MIN_STEPS),  # four profiles at least
+            32.0 * self.n_cells * (n_samples + MIN_STEPS),  # at least four profiles
             f"duration_s / sample_s = {n_samples:.3g} samples of n_cells = {self.n_cells}",
             way_out="simulate less of each",
         )
@@ -54,7 +54,7 @@ class Settings:
 
 
 def to_json(parameters: dict[str, Any]) -> str:
-    """Nested dataclasses as JSON, each with the name of its class, keys sorted."""
+    """Nested dataclasses as JSON with sorted keys; each holds the name of its class."""
 
     def plain(value: Any) -> Any:
         if is_dataclass(value) and not isinstance(value, type):

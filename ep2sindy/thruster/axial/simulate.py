@@ -1,4 +1,4 @@
-"""Run the axial fluid model and return what it did as an xarray.Dataset."""
+"""Run the axial fluid model and return its record as an xarray.Dataset."""
 
 from __future__ import annotations
 
@@ -64,22 +64,23 @@ def simulate(
 ) -> xr.Dataset:
     """Simulate one operating point and record it at equal steps after a warm-up.
 
-    averaged: record averages over each sampling step, as probes and most codes' output are, with
-    the products and fluxes that close its balance; False takes the values at its end, which alias
-    what is faster. stretch: length of the plume's cells over the channel's; with 1 all are alike.
-    reconstruct: van Leer's slopes, or first-order fluxes. coldest_T_e_eV: T_e is held above it,
-    as HallThruster.jl does at 1.5 eV; the energy balance then misses what that adds. initial:
-    `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of another run: its Dataset or
-    NetCDF file. cache: a folder that this simulation is read from, or run once and kept in. The
-    name of its file holds a hash of all parameters and of this package's source text, so a
-    changed formula is never answered from an old file; both ways return the same values.
+    averaged: record averages over each sampling step, like probes and the output of most codes,
+    with the products and fluxes that close its balance; False records the values at its end, which
+    alias faster oscillations. stretch: length of the plume's cells relative to the channel's; 1
+    makes all equal. reconstruct: use van Leer's slopes; False takes first-order fluxes.
+    coldest_T_e_eV: lower bound of T_e, like the 1.5 eV of HallThruster.jl; the energy balance then
+    lacks the added heat. initial: `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of
+    another run, given as its Dataset or NetCDF file. cache: folder in which this simulation is
+    kept, or from which it is read if it is there. Its file name holds a hash of all parameters and
+    of this package's source text, so that a changed formula never returns an old result. Both ways
+    return the same values.
 
     Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
     (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the
     parameters as JSON, `initial`, `status` (oscillating, transit, steady, decaying or diverged;
     see `judge_status`), `cycle`, `f_kHz`, mean and standard deviation of I_d, thrust, specific
     impulse and efficiency, and `mass_balance` and `energy_balance` (out plus stored over in).
-    A diverged run ends at its last finite sample and says so; it is not an error.
+    A diverged run ends at its last finite sample and has that status; it is not an error.
     Raises ValueError for settings that cannot be run, OSError for a cache that cannot be written.
 
     >>> point = ep.thruster.OPERATING_POINTS[3]
@@ -109,7 +110,7 @@ def simulate_as(
     *,
     progress: Progress | bool,
 ) -> xr.Dataset:
-    """`simulate`, with its settings as one value."""
+    """Run `simulate` with its settings as one value."""
     parameters = to_json(_parameters(settings, thruster, point))
     faces = cell_faces(thruster, settings.n_cells, settings.stretch)
     model = build_model(
@@ -131,7 +132,7 @@ def simulate_as(
 
 
 def as_start(initial: Start | xr.Dataset | str | Path | None) -> Start:
-    """A start by itself, or the end of the run that was named instead."""
+    """The start itself; a Dataset or path becomes a `Restart`, None a `GuessedStart`."""
     if initial is None:
         return GuessedStart()
     if isinstance(initial, xr.Dataset | str | Path):
@@ -141,7 +142,7 @@ def as_start(initial: Start | xr.Dataset | str | Path | None) -> Start:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What a run recorded, where it ended, and the heat it held at the record's two ends, in J."""
+    """The samples of a run, its final state, and the heat stored at the record's two ends, in J."""
 
     fields: Float[np.ndarray, "sums samples cells"]
     series: Float[np.ndarray, "samples series"]
@@ -151,7 +152,7 @@ class Record:
 
 
 def sample_counts(beginning: Beginning, settings: Settings) -> tuple[int, int, int]:
-    """Samples that a run is held for, warms up for and records."""
+    """Numbers of samples of the hold, the warm-up and the record."""
     step = settings.sample_s
     seconds = (beginning.hold_s, settings.warm_up_s, settings.duration_s)
     n_hold, n_warm_up, n_recorded = (round(each / step) for each in seconds)
@@ -159,7 +160,7 @@ def sample_counts(beginning: Beginning, settings: Settings) -> tuple[int, int, i
 
 
 def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Advance) -> Record:
-    """Hold, warm up and record; a run that breaks ends with its last whole sample."""
+    """Hold, warm up and record; a run that breaks ends with its last complete sample."""
     state = beginning.state
     n_fields = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1)
     quiet = model
@@ -183,7 +184,7 @@ def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Ad
 
 
 def first_fields(state: AxialState, model: AxialModel) -> bool:
-    """Field, rates and current of profiles, for the first step to see; False where it breaks."""
+    """Field, rates and current from the profiles, for the first step; False if that breaks."""
     start_density(state)
     rows, work = np.zeros(state.n_n.size, np.uint64), np.zeros((26, state.n_n.size))
     return electron_step(state, model, 0.0, rows, work)
@@ -192,7 +193,7 @@ def first_fields(state: AxialState, model: AxialModel) -> bool:
 def _march(
     model: AxialModel, state: AxialState, settings: Settings, fields: np.ndarray, series: np.ndarray
 ) -> March:
-    """How samples of a run get into the rows of these arrays."""
+    """A function that records samples of a run into a slice of rows of these arrays."""
 
     def march(rows: slice) -> int:
         sample_s, averaged = settings.sample_s, settings.averaged
@@ -204,7 +205,7 @@ def _march(
 def _room(
     n_fields: int, n_rows: int, state: AxialState
 ) -> tuple[Float[np.ndarray, "sums samples cells"], Float[np.ndarray, "samples series"]]:
-    """Arrays for the fields and series of so many samples."""
+    """Arrays for the fields and series of n_rows samples."""
     fields = np.empty((n_fields, n_rows, state.n_n.size - 2), np.float32)
     return fields, np.empty((n_rows, len(SERIES_SUMS)))
 
@@ -233,7 +234,7 @@ def _attributes(
     thruster: Thruster,
     sample_s: float,
 ) -> dict[str, Any]:
-    """Verdict, performance, balances, and what a restart needs beside the profiles."""
+    """Verdict, performance, balances, and data that a restart needs besides the profiles."""
     attributes = outcome(field, point, diverged=record.diverged)
     if field.sizes["time"]:
         attributes["I_wall_mean"] = float(field["I_wall"].mean())
@@ -259,7 +260,7 @@ def mass_balance(field: xr.Dataset, model: AxialModel, seconds: float) -> float:
 
 
 def energy_balance(field: xr.Dataset, record: Record, seconds: float) -> float:
-    """What field, collisions, walls and ends took plus what the electrons stored, over P_in."""
+    """Energy taken by field, collisions, walls and ends, plus the electrons' gain, over P_in."""
     out = sum(float(field[name].mean()) for name in POWERS[1:])
     stored = (record.stored_J[1] - record.stored_J[0]) / seconds
     return (out + stored) / float(field[POWERS[0]].mean())

@@ -1,4 +1,4 @@
-"""Where a simulation starts: a guess, an ignition, a quiet discharge, or the end of another run."""
+"""Starts of a simulation: a guess, an ignition, a quiet discharge, or the end of another run."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.trust.guard import look_through_first
 
 Profile = Float[np.ndarray, " cells"]
-# What a run leaves for another to go on from: arrays of its cells, at its last instant.
+# Arrays of a run's cells at its last instant, from which another run can continue.
 END = "end_"
-SPECIES = ("n_i", "flux_i")  # of every charge
+SPECIES = ("n_i", "flux_i")  # one array for every charge
 CELLS = ("n_n", "T_e_eV", "energy_e", "drift_eV", "E_z", "wall_loss_rate")
 RATES = ("R_ion", "R_double", "R_second")
 UNITS = {
@@ -31,7 +31,7 @@ UNITS = {
     "drift_eV": "eV", "E_z": "V/m", "wall_loss_rate": "1/s",
     **dict.fromkeys(RATES, "m^3/s"),
 }  # fmt: skip
-# A discharge goes on in another one only where these are the same.
+# A run can continue another one only if these are equal.
 FIXED = (
     "channel_length", "domain_length", "inner_radius", "outer_radius", "propellant",
     "charge_states",
@@ -39,10 +39,11 @@ FIXED = (
 
 
 class Beginning(NamedTuple):
-    """A first state, and how a run goes on from it.
+    """A first state, and how a run continues from it.
 
-    whole: it is complete, as another run left it. resistance: in ohm, that is in series for the
-    first hold_s, before the run begins; None has the thruster's. note: what became of a start.
+    whole: whether the state is complete, as left by another run. resistance: series resistance in
+    ohm during the first hold_s, before the run begins; None takes the thruster's. note: remark on
+    the start.
     """
 
     state: AxialState
@@ -54,9 +55,9 @@ class Beginning(NamedTuple):
 
 @runtime_checkable
 class Start(Protocol):
-    """What the alternatives share: a name that no other start has, and the first state.
+    """The protocol of starts: a unique name, and the first state.
 
-    z: centres of all cells, ghosts included, in m; parameters: of the run, as JSON.
+    z: centres of all cells, including ghosts, in m. parameters: those of the run, as JSON.
     """
 
     @property
@@ -67,7 +68,7 @@ class Start(Protocol):
 
 @dataclass(frozen=True)
 class GuessedStart:
-    """A plasma that looks like a discharge: a hump of T_e at the exit, neutrals used up there."""
+    """A discharge-like plasma: T_e peaks at the exit, where the neutrals are depleted."""
 
     @property
     def label(self) -> str:
@@ -85,7 +86,7 @@ class GuessedStart:
 
 @dataclass(frozen=True)
 class ColdStart:
-    """A hard start: a thin, cold, uniform plasma in a channel full of gas, which ignites.
+    """A hard start: a thin, cold, uniform plasma in a channel full of gas, which then ignites.
 
     n_i: m^-3. u_i: m/s. T_e_eV: eV.
     """
@@ -109,9 +110,9 @@ class ColdStart:
 
 @dataclass(frozen=True)
 class SoftStart:
-    """A soft start: a discharge kept quiet by a high resistance in series, then let go.
+    """A soft start: a discharge kept quiet by a high series resistance, which is then removed.
 
-    resistance: ohm. hold_s: how long it is kept, in s.
+    resistance: ohm. hold_s: duration of the quiet phase, in s.
     """
 
     resistance: float = 40.0
@@ -131,11 +132,11 @@ class SoftStart:
 
 @dataclass(frozen=True, eq=False)
 class Restart:
-    """The end of another run, which this one goes on from: `Restart(run)` or `Restart(path)`.
+    """The end of another run, from which this one continues: `Restart(run)` or `Restart(path)`.
 
     run: a Dataset of `simulate`, or the path of a NetCDF file of one. The operating point, the
     transport and the circuit may differ; on another grid the profiles are interpolated.
-    Raises ValueError where it is no such run, it diverged, or was another thruster's.
+    Raises ValueError if it is not such a run, if it diverged, or if its thruster differs.
     """
 
     run: xr.Dataset | str | Path
@@ -179,12 +180,12 @@ class Restart:
 
 
 def _of(name: str, k: int) -> str:
-    """`n_i` of the first charge, `n_i2` of the second."""
+    """Variable name by charge: `n_i` of the first charge, `n_i2` of the second."""
     return name if k == 0 else f"{name}{k + 1}"
 
 
 def end_of(state: AxialState) -> dict[str, tuple[Profile, str]]:
-    """What `Restart` takes up, with units, by the names of a Dataset's variables."""
+    """The arrays that `Restart` reads, with units, by the names of a Dataset's variables."""
     charges = len(state.n_i)
     cells = (state.n_n, state.T_e_eV, state.energy, state.drift_eV, state.E, state.wall_loss)
     kept = dict(zip(CELLS, cells, strict=True))
@@ -201,10 +202,10 @@ def _state(
     n_n: Profile,
     T_e_eV: Profile,
 ) -> AxialState:
-    """A state of these profiles; one profile of ions stands for singly charged ones."""
+    """A state with these profiles; a single ion profile means singly charged ions."""
     size, charges = n_n.size, json.loads(parameters)["thruster"]["charge_states"]
     n, g = np.array(n_i), np.array(flux_i)
-    if len(n) < charges:  # a hundredth of the electrons belongs to ions that lost two
+    if len(n) < charges:  # one per cent of the electrons come from doubly charged ions
         n = np.concatenate([0.99 * n, 0.005 * n])
         g = np.concatenate([0.99 * g, 0.005 * np.sqrt(2.0) * g])
     n_e = n.T @ np.arange(1.0, charges + 1.0)
@@ -218,7 +219,7 @@ def _state(
 
 
 def stored_energy(state: AxialState, model: AxialModel) -> float:
-    """Heat of the electrons in J."""
+    """Thermal energy of the electrons in J."""
     return E_CHARGE * model.area * float(state.energy[1:-1] @ model.dz[1:-1])
 
 

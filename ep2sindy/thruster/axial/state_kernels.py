@@ -1,11 +1,11 @@
-"""What the compiled loop works on: constants of a run, its state, and what it sums up.
+"""Data of the compiled loop: constants of a run, its state, and its sums.
 
 Cell arrays hold one ghost cell at each end: index 0 lies behind the anode, index -1 beyond the
 cathode plane; cells 1 .. n are the domain. Face i lies between cells i and i + 1. Species arrays
 have one row per charge state.
 
-The loops of these kernels are short and touch few arrays each: so the compiler turns them into
-vector instructions.
+The loops of these kernels are short and touch few arrays each, so that the compiler can vectorise
+them.
 """
 
 from typing import Any, NamedTuple
@@ -14,10 +14,10 @@ import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
 
-# Sums may be reordered; infinities and NaNs must stay what they are: they end a run.
+# Sums may be reordered, but infinities and NaNs must be preserved: they end a run.
 ENTRY: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp", "nsz"}}
-# For what only kernels call: without the wrappers for Python, which would double the time to
-# compile, and inlined, since a call costs as much as a loop over the cells.
+# For functions that only kernels call. Wrappers for Python would double the time to compile.
+# They are inlined, since a call costs as much as a loop over the cells.
 FAST: dict[str, Any] = {
     **ENTRY,
     "no_cpython_wrapper": True,
@@ -25,38 +25,38 @@ FAST: dict[str, Any] = {
     "forceinline": True,
 }
 
-SHORTEST_STEP = 1e-5  # of a sample: what needs shorter steps has diverged
+SHORTEST_STEP = 1e-5  # of a sample: a run that needs shorter steps has diverged
 
-# What a run records, in the order of `Sums.cells`: averages over a sample, or its last values.
+# Quantities recorded, in the order of `Sums.cells`: averages over a sample, or its last values.
 CELL_SUMS = (
     N_N, T_E, R_ION, E_Z, IONIZATION, WALL_LOSS, ENERGY, FACE_N, CHANGE_N,
     N_I, U_IZ, FLUX_I, FACE_I, CHANGE_I,
 ) = range(14)  # fmt: skip
-PER_CHARGE = 5  # the last five, once more for every further charge state
+PER_CHARGE = 5  # the last five repeat for every further charge state
 SERIES_SUMS = (
     CURRENT, THRUST, WALL_CURRENT, BEAM, IONS_OUT, NEUTRALS_OUT,
     POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE,
 ) = range(12)  # fmt: skip
 
 
-# Unsigned indices: numba lets negative ones count from the end, which costs the vectors.
+# Unsigned indices: numba wraps negative ones around, which prevents vectorisation.
 ONE = np.uint64(1)
 
 
 @compiled(**FAST)
 def inside(values):
-    """Indices of all cells but the ghosts."""
+    """Indices of all cells except the ghosts."""
     return range(ONE, np.uint64(values.size) - ONE)
 
 
 @compiled(**FAST)
 def faces(values):
-    """Indices of all faces, each that of the cell on its anode side."""
+    """Indices of all faces; each is that of the cell on its anode side."""
     return range(np.uint64(0), np.uint64(values.size) - ONE)
 
 
 class AxialModel(NamedTuple):
-    """Everything the compiled loop needs that does not change in time."""
+    """Everything that the compiled loop needs and that is constant in time."""
 
     dz: np.ndarray  # (n + 2,), m: lengths of the cells
     inverse_dz: np.ndarray  # (n + 2,), 1/m
@@ -75,13 +75,13 @@ class AxialModel(NamedTuple):
     pressure_factor: float  # p_e = pressure_factor * n * T_e
     conduction_factor: float  # kappa = factor / (1 + coulomb * nu_ei / nu) * mu * n * T_e
     conduction_coulomb: float
-    drift_weight: float  # 1: rates see the electrons' drift energy; 0: they do not
-    drift_credit: bool  # some inelastic events are paid from it, not from the heat
-    sheath: bool  # at the anode, or a temperature that is held there
+    drift_weight: float  # 1: rates include the electrons' drift energy; 0: they do not
+    drift_credit: bool  # some inelastic events take their energy from it, not from the heat
+    sheath: bool  # whether the anode has a sheath; else its temperature is fixed
     sheath_weight: float  # share of its drop that electrons pay with heat
     anode_T_e_eV: float  # eV
     cathode_T_e_eV: float  # eV
-    coldest_eV: float  # T_e is held above: no energy balance then
+    coldest_eV: float  # lower bound of T_e; with one, the energy balance does not close
     cfl: float
     omega_ce: np.ndarray  # (n + 2,), rad/s
     anomalous: np.ndarray  # (n + 2,), 1/s

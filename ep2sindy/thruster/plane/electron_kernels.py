@@ -16,13 +16,13 @@ from ep2sindy.thruster.plane.state_kernels import (
     WALL_ENERGY,
 )
 
-SIDE_ENERGY = 2.5  # of T_e, that electrons take along with an ion that leaves sideways: enthalpy
-SQRT_HALF_BITS = 0x3FE6A09E667F3BCD  # of the double 1/sqrt(2)
+SIDE_ENERGY = 2.5  # enthalpy in T_e that an electron carries along with an ion leaving sideways
+SQRT_HALF_BITS = 0x3FE6A09E667F3BCD  # bits of the double 1/sqrt(2)
 
 
 @compiled(inline="always")
 def logarithm(x):
-    """ln(x) of a positive normal double to 1e-15 of 1 + |ln x|, without a call: it vectorises.
+    """ln(x) of a positive normal double to 1e-15 of 1 + |ln x|, without a call, so it vectorises.
 
     x = m 2^e with m in sqrt(1/2) to sqrt(2), and ln(m) = 2 artanh((m - 1)/(m + 1)).
     """
@@ -40,7 +40,7 @@ def logarithm(x):
 def sum_columns(state, model, columns):
     """Sums over r, and the logarithm of the density."""
     gas = state.gas
-    carried = 0.0  # by ions that left sideways: their electrons come from outside
+    carried = 0.0  # ions per s that left sideways; their electrons come from outside
     for i in range(columns.n.size):
         n_a = flux = n_neutrals = n_n = n_log = 0.0
         for j in range(model.lower[i], model.upper[i]):
@@ -70,7 +70,7 @@ def lookup(table, row, share, column):
 
 @compiled(**FAST)
 def collisions(state, model, columns):
-    """Collision frequency, conductance and losses; False where a table ends."""
+    """Collision frequency, conductance and losses; returns False if a table ends."""
     table, per_eV, top = model.table, 1.0 / model.table_step_eV, model.table.shape[0] - 1.0
     for i in range(columns.n.size):
         n = columns.n[i]
@@ -105,7 +105,7 @@ def collisions(state, model, columns):
 
 @compiled(inline="always")
 def ghost(T, boundary):
-    """Temperature half a cell outside a boundary of fixed temperature."""
+    """Temperature half a cell outside a boundary with fixed temperature."""
     return max(2.0 * boundary - T, 0.3 * boundary)
 
 
@@ -113,8 +113,8 @@ def ghost(T, boundary):
 def ohm(state, model, columns):
     """Discharge current, field along z, drift energy and heating; returns I_d/e.
 
-    n u_e = mu n (dphi*/dz - dT/dz - T d(ln n_ref)/dz), summed over r: phi* is the potential
-    where n = n_ref, and heats the electrons as they climb it.
+    n u_e = mu n (dphi*/dz - dT/dz - T d(ln n_ref)/dz), summed over r. phi* is the potential where
+    n = n_ref; electrons gain heat as they climb it.
     """
     T, log_ref, last = state.T_e_eV, columns.log_ref, columns.n.size - 1
     drive, load, half = model.voltage, model.resistance, 0.5 / model.dz
@@ -122,7 +122,7 @@ def ohm(state, model, columns):
         low = T[i - 1] if i > 0 else ghost(T[0], model.boundary_T_e_eV)
         high = T[i + 1] if i < last else ghost(T[last], model.boundary_T_e_eV)
         steep = log_ref[min(i + 1, last)] - log_ref[max(i - 1, 0)]
-        columns.heating[i] = half * (high - low + T[i] * steep)  # of the pressure, per density
+        columns.heating[i] = half * (high - low + T[i] * steep)  # pressure gradient over density
         drive += model.dz * (columns.flux[i] / columns.conductance[i] + columns.heating[i])
         load += model.dz / (E_CHARGE * columns.conductance[i])
     state.current[0] = drive / load
@@ -142,8 +142,10 @@ def ohm(state, model, columns):
 
 @compiled(**FAST)
 def spread_field(state, model, columns):
-    """E(z, r) = -dphi*/dz - d/dz [T ln(n/n_ref)]: field lines along r are equipotentials but
-    for the electrons' pressure."""
+    """E(z, r) = -dphi*/dz - d/dz [T ln(n/n_ref)].
+
+    Field lines along r are equipotentials except for the electrons' pressure.
+    """
     T, log_n, last = state.T_e_eV, state.log_n, columns.n.size - 1
     half = 0.5 / model.dz
     for i in range(last + 1):
@@ -159,10 +161,10 @@ def spread_field(state, model, columns):
 
 @compiled(inline="always")
 def exponential_weights(conduction, convection):
-    """Weights of the temperatures before and behind a face: exact between two fixed values.
+    """Weights of the temperatures on both sides of a face: exact between two fixed values.
 
-    The flux is conduction * (B(-p) T_before - B(p) T_behind), p = convection/conduction,
-    B(p) = p/(exp(p) - 1): central where conduction wins, upwind where convection does.
+    The flux is conduction * (B(-p) T_before - B(p) T_behind), p = convection/conduction, B(p) =
+    p/(exp(p) - 1). The scheme is central if conduction dominates, and upwind if convection does.
     Source: Scharfetter & Gummel, IEEE Trans. Electron Devices 16 (1969) 64.
     """
     p = convection / conduction
@@ -180,7 +182,7 @@ def heat(state, model, dt, columns):
     c, d = 0.0, 0.0
     for i in range(last + 1):
         diagonal = 1.5 * n[i] + dt * columns.loss_slope[i] + s * behind
-        lower = -s * before  # times the temperature before
+        lower = -s * before  # coefficient of the temperature before
         kept = columns.loss_slope[i] * T[i] + columns.heating[i] - columns.loss[i]
         right = state.energy[i] + dt * kept
         if i == 0:
@@ -206,7 +208,7 @@ def heat(state, model, dt, columns):
 
 @compiled(**FAST)
 def electron_step(state, model, dt, columns):
-    """Sums, collisions, current, field and new temperature; False where the run breaks."""
+    """Sums, collisions, current, field and new temperature; returns False if the run breaks."""
     sum_columns(state, model, columns)
     if not collisions(state, model, columns):
         return False

@@ -1,4 +1,4 @@
-"""The masked (z, r) grid: a channel between two walls, and a plume that is wider."""
+"""The masked (z, r) grid: a channel between two walls, and a wider plume."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.thruster.parameters import Thruster
 
-CHANNEL_SHARE = 25 / 49  # of the rows
+CHANNEL_SHARE = 25 / 49  # share of the rows in the channel
 MIN_CELLS = 10
 
 
 @dataclass(frozen=True)
 class MaskedGrid:
-    """Equal cells in z and r; beyond the channel's walls only those of the plume hold plasma.
+    """Equal cells in z and r; rows beyond the channel's walls hold plasma in the plume only.
 
-    About half of the rows (25 of 49) lie in the channel, the others equally on both sides.
-    plane: all radial faces as large as at mid radius, for what must be symmetric about it.
+    About half of the rows (25 of 49) lie in the channel, the others equally on both sides. plane:
+    makes all radial faces as large as at mid radius, for cases that must be symmetric about it.
     Cells whose centre lies beyond the exit belong to the plume.
     """
 
@@ -48,7 +48,7 @@ class MaskedGrid:
 
     @property
     def n_side(self) -> int:
-        """Rows of the plume on either side of the channel's."""
+        """Rows of the plume on either side of the channel's rows."""
         return round(self.n_r * (1.0 - CHANNEL_SHARE) / 2.0)
 
     @property
@@ -62,7 +62,7 @@ class MaskedGrid:
 
     @property
     def z(self) -> Float[np.ndarray, " z"]:
-        """Centres in m, from the anode."""
+        """Axial centres of the cells in m, from the anode."""
         return (np.arange(self.n_z) + 0.5) * self.dz
 
     @property
@@ -73,7 +73,7 @@ class MaskedGrid:
 
     @property
     def r(self) -> Float[np.ndarray, " r"]:
-        """Centres in m."""
+        """Radial centres of the cells in m."""
         return 0.5 * (self.r_faces[1:] + self.r_faces[:-1])
 
     @property
@@ -95,7 +95,7 @@ class MaskedGrid:
 
     @property
     def upper(self) -> Int[np.ndarray, " z"]:
-        """First row behind the plasma in every column."""
+        """One past the last row of the plasma in every column."""
         return self.n_r - self.lower
 
     @property

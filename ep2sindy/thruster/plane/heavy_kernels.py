@@ -1,6 +1,6 @@
 """Ions and neutrals: one SSP-RK2 step in a frozen field, column by column.
 
-Inner loops run along r, write one array each and call nothing: so they vectorise.
+Inner loops run along r, write one array each and make no calls, so that they vectorise.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.thruster.plane.state_kernels import FAST, ONE
 
-SIDE_SPEED = 0.5  # of the neutrals' speed: what leaves into vacuum by diffusion (Marshak)
+SIDE_SPEED = 0.5  # of the neutrals' speed: diffusive loss into vacuum (Marshak)
 
 
 @compiled(inline="always")
@@ -37,7 +37,7 @@ def momentum_flux(n_l, u_l, n_r, u_r, c):
 
 @compiled(**FAST)
 def velocities(gas, model):
-    """u = flux/n everywhere; masked cells beside the exit repeat the plume's, for zero slopes."""
+    """u = flux/n everywhere; masked cells beside the exit repeat the plume's u, for zero slopes."""
     for i in range(gas.n.shape[0]):
         for j in range(model.lower[i], model.upper[i]):
             per_n = 1.0 / gas.n[i, j]
@@ -101,7 +101,7 @@ def axial_fluxes(gas, model, slopes, fluxes):
 
 @compiled(**FAST)
 def anode_fluxes(gas, model, fluxes):
-    """Ions leave at the Bohm speed or faster and return as neutrals, which are fed here too."""
+    """Ions leave at the Bohm speed or faster and return as neutrals, also injected here."""
     c = np.sqrt(model.ion_sound_squared)
     bohm = np.sqrt(model.electron_sound_squared * model.boundary_T_e_eV)
     for j in range(model.lower[0], model.upper[0]):
@@ -116,7 +116,7 @@ def anode_fluxes(gas, model, fluxes):
 
 @compiled(**FAST)
 def cathode_fluxes(gas, model, fluxes):
-    """Everything leaves freely, no ion enters; returns atoms and ions per second."""
+    """Neutrals and ions leave freely, no ion enters; returns atoms and ions lost per second."""
     total, end = 0.0, gas.n.shape[0]
     for j in range(model.lower[end - 1], model.upper[end - 1]):
         n, u = gas.n[end - 1, j], max(gas.u_z[end - 1, j], 0.0)
@@ -130,7 +130,7 @@ def cathode_fluxes(gas, model, fluxes):
 
 @compiled(**FAST)
 def front_fluxes(gas, model, fluxes, wall):
-    """The thruster's front face, beside the exit: ions that reach it return as neutrals."""
+    """The thruster's front face beside the exit: ions that reach it return as neutrals."""
     i = model.exit_column
     for j in range(model.lower[i], model.upper[i]):
         if model.lower[i - 1] <= j < model.upper[i - 1]:
@@ -176,8 +176,11 @@ def radial_fluxes(gas, model, T_e, slopes, fluxes):
 
 @compiled(**FAST)
 def wall_fluxes(gas, model, T_e, fluxes, wall):
-    """Channel: the ions reach the speed of sound at the wall, by the exact rarefaction into it,
-    and return as neutrals."""
+    """Fluxes to the channel walls.
+
+    By the exact rarefaction into the wall, ions reach it at the speed of sound. They return as
+    neutrals.
+    """
     for i in range(model.exit_column):
         c = np.sqrt(model.electron_sound_squared * T_e[i] + model.ion_sound_squared)
         for outward in (-1.0, 1.0):
@@ -196,8 +199,10 @@ def wall_fluxes(gas, model, T_e, fluxes, wall):
 
 @compiled(**FAST)
 def side_fluxes(gas, model, T_e, fluxes, side):
-    """Plume: ions leave freely, neutrals by diffusion into vacuum; returns the atoms per m and
-    second, summed over the columns."""
+    """Fluxes through the sides of the plume: ions leave freely, neutrals diffuse into vacuum.
+
+    Returns the atoms lost per m and second, summed over the columns.
+    """
     atoms = 0.0
     for i in range(model.exit_column, gas.n.shape[0]):
         c2 = model.electron_sound_squared * T_e[i] + model.ion_sound_squared
@@ -218,7 +223,7 @@ def side_fluxes(gas, model, T_e, fluxes, side):
 
 @compiled(**FAST)
 def divergence(axial, radial, model, out):
-    """Net inflow per volume, from both directions."""
+    """Net inflow per volume in both directions."""
     per_dz, per_area = 1.0 / model.dz, model.per_area
     for i in range(out.shape[0]):
         for j in range(model.lower[i], model.upper[i]):
@@ -253,7 +258,7 @@ def update(gas, new, state, model, rates, born, old, dt):
 
 @compiled(**FAST)
 def heavy_stage(gas, new, state, model, work, old, dt):
-    """One Euler step of `gas` over dt, mixed into `new` with the weight 1 - old."""
+    """One Euler step of `gas` over dt, mixed into `new` with weight 1 - old."""
     lower, upper, slopes, T_e = model.lower, model.upper, work.slopes, state.T_e_eV
     axial, radial, rates = work.axial, work.radial, work.rates
     axial_slopes(gas.n, slopes.n, lower, upper)

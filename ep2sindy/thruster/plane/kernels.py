@@ -1,4 +1,4 @@
-"""The march in time: steps within the CFL number, and the samples that they fill."""
+"""Time integration: steps within the CFL number, and the samples that they fill."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ from ep2sindy.thruster.plane.state_kernels import FAST, ONE, Columns, Fluxes, Ga
 
 @compiled
 def fluxes(n_z, n_r):
-    """Room for the fluxes of one direction."""
+    """Empty flux arrays of one direction."""
     shape = (n_z, n_r)
     return Fluxes(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
 
 @compiled
 def scratch(n_z, n_r):
-    """Working memory of the two steps."""
+    """Working memory of the heavy step and the electron step."""
     grid = (n_z, n_r)
     slopes = Gas(
         np.zeros(grid), np.zeros(grid), np.zeros(grid), np.zeros(grid), np.zeros(grid),
@@ -75,7 +75,7 @@ def count_heavy(state, model):
 
 @compiled(**FAST)
 def add_grid(values, total, model, share):
-    """total += share * values, in the plasma."""
+    """Add share * values to total, in the cells with plasma."""
     for i in range(values.shape[0]):
         for j in range(model.lower[i], model.upper[i]):
             total[i, j] += share * values[i, j]
@@ -108,7 +108,7 @@ def store(sample, rows, row, model):
 def advance(state, model, sample_s, averaged, n_i, n_n, u_iz, u_ir, profiles, series):
     """Fill the rows of the outputs, one every `sample_s`; return (rows filled, steps).
 
-    averaged: rows are means over the steps of a sample, else the state at its end.
+    averaged: if True, rows are means over the steps of a sample, else the state at its end.
     n_i .. u_ir: (rows, n_z, n_r), written in the plasma only. profiles: (rows, 3, n_z) for T_e,
     ionization and field. series: (rows, 4) for current, thrust, mass out and mass held.
     """

@@ -35,7 +35,7 @@ from ep2sindy.thruster.transport import AnomalousTransport
 from ep2sindy.thruster.verdict import outcome
 from ep2sindy.thruster.walls import SHEATH_DENSITY_RATIO, FixedAnode, SheathWall
 
-PLANES = {  # variable -> unit, long name, in the order the compiled loop fills them
+PLANES = {  # variable -> unit, long name; in the order of the compiled loop
     "n_i": ("m^-3", "ion density"),
     "n_n": ("m^-3", "neutral density"),
     "u_iz": ("m/s", "axial ion velocity"),
@@ -79,15 +79,15 @@ def simulate_2d(
 ) -> xr.Dataset:
     """Simulate one operating point in (z, r) and sample it at equal steps after a warm-up.
 
-    averaged: a sample is the mean over the sampling step that ends at its time; otherwise the
-    state at that time, which aliases oscillations faster than half the sampling rate. cache: as
-    for `simulate`; the defaults' file takes some 300 MB.
+    averaged: if True, a sample is the mean over the sampling step that ends at its time; otherwise
+    it is the state at that time, which aliases oscillations faster than half the sampling rate.
+    cache: as in `simulate`; with the default settings the file takes some 300 MB.
 
     Returns a Dataset on ("time", "z", "r"), time in s from the end of the warm-up: PLANES on all
-    three (float32, NaN in the thruster's body), PROFILES in time and z, SERIES in time
-    (float64). The electrons are quasi-one-dimensional, so T_e_eV and R_ion do not depend on r.
-    Attributes as those of `simulate`. A diverged run ends at its last finite sample and says so.
-    Raises ValueError for settings that cannot be run, OSError for a cache that cannot be written.
+    three (float32, NaN in the thruster's body), PROFILES in time and z, SERIES in time (float64).
+    The electrons are quasi-one-dimensional, so T_e_eV and R_ion do not depend on r. Attributes are
+    as in `simulate`. A diverged run ends at its last finite sample and has that status. Raises
+    ValueError for settings that cannot be run, OSError for a cache that cannot be written.
     """
     settings: dict[str, Any] = {
         "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
@@ -105,10 +105,10 @@ def simulate_as(
     *,
     progress: Progress | bool,
 ) -> xr.Dataset:
-    """`simulate_2d`, with its settings as one value."""
+    """Run `simulate_2d` with its settings as one value."""
     sample_s, averaged = settings["sample_s"], settings["averaged"]
     duration_s, warm_up_s = settings["duration_s"], settings["warm_up_s"]
-    Settings(duration_s, warm_up_s, sample_s)  # checks them
+    Settings(duration_s, warm_up_s, sample_s)  # raises ValueError for invalid ones
     check_thruster(thruster)
     grid = MaskedGrid(thruster, settings["n_z"], settings["n_r"])
     model = build_model(thruster, operating_point, grid)
@@ -139,7 +139,7 @@ class Rows:
 
     @staticmethod
     def room(n_rows: int, grid: MaskedGrid) -> Rows:
-        """Arrays for so many samples; planes are NaN in the thruster's body."""
+        """Arrays for n_rows samples; planes are NaN in the thruster's body."""
         return Rows(
             [np.full((n_rows, grid.n_z, grid.n_r), np.nan, np.float32) for _ in PLANES],
             np.empty((n_rows, len(PROFILES), grid.n_z), np.float32),
@@ -152,7 +152,7 @@ class Rows:
         return Rows(planes, self.profiles[:n_rows], self.series[:n_rows])
 
     def march(self, state: PlaneState, model: PlaneModel, sample_s: float, averaged: bool) -> March:
-        """How samples of a run get into these rows."""
+        """A function that records samples of a run into these rows."""
 
         def march(rows: slice) -> int:
             planes = [plane[rows] for plane in self.planes]
@@ -171,7 +171,7 @@ def warmed_up_run(
     averaged: bool,
     told: Advance,
 ) -> Rows:
-    """The samples after the warm-up; of a warm-up that diverges, its last finite ones."""
+    """The samples after the warm-up; if the warm-up diverges, its last finite samples."""
     state = initial_state(grid, model)
     rows = Rows.room(min(n_warm_up, CHUNK_ROWS), grid)
     broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, told)
@@ -210,7 +210,7 @@ def mass_balance(field: xr.Dataset, point: OperatingPoint) -> float:
     return (left + accumulated) / entered
 
 
-# From parameters and grid to the compiled loops' constants and first state.
+# Constants and first state of the compiled loops, from parameters and grid.
 
 
 CFL = 0.8
@@ -218,7 +218,7 @@ NEUTRAL_DIFFUSION = 1.1  # m^2/s, radial: a mean speed of some 200 m/s over the 
 
 
 def check_thruster(thruster: Thruster) -> None:
-    """Raise ValueError for closures that have no meaning here."""
+    """Raise ValueError for closures that the (z, r) model does not support."""
     if not isinstance(thruster.wall, SheathWall):
         raise ValueError(
             "the (z, r) model computes the flux to the walls and needs their sheath: wall must be "
@@ -245,10 +245,10 @@ def check_thruster(thruster: Thruster) -> None:
 
 
 def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
-    """The closures over T_e, wall losses per ion that reaches the wall; columns as in `kernels`.
+    """The closures over T_e, with wall losses per ion reaching the wall; columns as in `kernels`.
 
-    The axial model has electrons arrive at scale * ratio * sqrt(e T_e/m) n / gap, times
-    1/(1 - gamma); here the flux of ions to the wall, which is computed, stands for the factor
+    In the axial model, electrons reach the wall at scale * ratio * sqrt(e T_e/m) n / gap, times
+    1/(1 - gamma). Here the computed flux of ions to the wall replaces the factor
     ratio * sqrt(e T_e/m) n / gap.
     """
     axial_table = closure_table(thruster)
@@ -265,7 +265,7 @@ def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 8"]:
 
 
 def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> kernels.PlaneModel:
-    """Gather every constant of one run."""
+    """Gather all constants of one run."""
     distance = grid.z - thruster.channel_length
     omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
     mass = thruster.propellant.mass
@@ -298,7 +298,7 @@ def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> 
 
 
 def initial_state(grid: MaskedGrid, model: kernels.PlaneModel) -> kernels.PlaneState:
-    """A gentle guess, uniform in r but for a thin plasma beside the beam."""
+    """A smooth first guess, uniform in r except for a thin plasma beside the beam."""
     shape = (grid.n_z, grid.n_r)
     z = grid.z / grid.thruster.channel_length  # 1 at the exit
     beam = np.zeros(grid.n_r, dtype=bool)
@@ -318,7 +318,7 @@ def state_of(
     n_n: Float[np.ndarray, "z r"],
     T_e_eV: Float[np.ndarray, " z"],
 ) -> kernels.PlaneState:
-    """State of given densities, axial ion flux and temperature, without radial motion."""
+    """A state with given densities, axial ion flux and temperature, without radial motion."""
     shape = (grid.n_z, grid.n_r)
     inside = (n_i * grid.area).sum(axis=1, where=grid.plasma)
 

@@ -1,16 +1,16 @@
-"""What the compiled loops share: the constants of a run, and the arrays that they advance.
+"""Data shared by the compiled loops: the constants of a run, and the arrays that they advance.
 
 Arrays on the grid are (n_z, n_r), indexed [i, j]; column i is active for lower[i] <= j < upper[i].
 Axial face i lies between columns i - 1 and i, radial face j between rows j - 1 and j. The bounds
-are unsigned: a loop that might begin below zero would pick an index at every access, and not
-vectorise. So neighbours in a row are j - ONE and j + ONE.
+are unsigned: a loop that might begin below zero would check the index at every access, and would
+not vectorise. So neighbours in a row are j - ONE and j + ONE.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-# No "nnan" or "ninf": a run that diverges is told by numbers that are not finite.
+# No "nnan" or "ninf": a diverged run is recognised by numbers that are not finite.
 FAST: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "arcp", "nsz"},
@@ -26,13 +26,13 @@ ONE = np.uint64(1)
     MOMENTUM,
     COULOMB,
     COULOMB_LOG,
-    WALL_COLLISIONS,  # of electrons, per ion that reaches the wall
-    WALL_ENERGY,  # lost by electrons, per ion that reaches the wall
+    WALL_COLLISIONS,  # electron collisions, per ion that reaches the wall
+    WALL_ENERGY,  # energy lost by electrons, per ion that reaches the wall
 ) = range(8)
 
 
 class PlaneModel(NamedTuple):
-    """Everything the compiled loops need that does not change in time."""
+    """Everything that the compiled loops need and that is constant in time."""
 
     dz: float  # m
     dr: float  # m
@@ -51,7 +51,7 @@ class PlaneModel(NamedTuple):
     voltage: float  # V_0 - V_c, V
     resistance: float  # ohm
     conduction_factor: float  # kappa = conduction_factor * mu * n * T_e
-    drift_weight: float  # 1: rates see the electrons' drift energy; 0: they do not
+    drift_weight: float  # 1: rates include the electrons' drift energy; 0: they do not
     boundary_T_e_eV: float  # eV
     cfl: float
     omega_ce: np.ndarray  # (n_z,), rad/s
@@ -61,7 +61,7 @@ class PlaneModel(NamedTuple):
 
 
 class Gas(NamedTuple):
-    """Conserved quantities of ions and neutrals, and the velocities that follow; (n_z, n_r)."""
+    """Conserved quantities of ions and neutrals, and the derived velocities; (n_z, n_r)."""
 
     n: np.ndarray  # n_i, m^-3
     flux_z: np.ndarray  # n_i u_iz, 1/(m^2 s)
@@ -75,7 +75,7 @@ class PlaneState(NamedTuple):
     """Arrays that the loops advance in place."""
 
     gas: Gas
-    stage: Gas  # of the Runge-Kutta step
+    stage: Gas  # stage of the Runge-Kutta step
     E: np.ndarray  # (n_z, n_r), axial field, V/m
     log_n: np.ndarray  # (n_z, n_r), ln(n_i m^3)
     T_e_eV: np.ndarray  # (n_z,)
@@ -90,7 +90,7 @@ class PlaneState(NamedTuple):
 
 
 class Fluxes(NamedTuple):
-    """Of ion density, ion momentum along z and along r, and neutrals; one row more than cells."""
+    """Fluxes of ion density, ion momentum along z and r, and neutrals; one more row than cells."""
 
     n: np.ndarray
     z: np.ndarray
@@ -109,7 +109,7 @@ class Work(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Sums over r, (n_z,) each: of densities times row areas."""
+    """Sums over r of densities times row areas; (n_z,) each."""
 
     n: np.ndarray  # 1/m
     flux: np.ndarray  # 1/s, with what the sides of the plume carry
