@@ -285,7 +285,7 @@ def _side_by_side(data: Cycle, other: Cycle) -> tuple[np.ndarray, np.ndarray, np
 def distribution_distances(
     data: Float[np.ndarray, "samples n_states"], other: Float[np.ndarray, "_ n_states"]
 ) -> Float[np.ndarray, " n_states"]:
-    """Wasserstein distance of each state's distribution to the data's, in standard deviations."""
+    """Wasserstein distance of each state's distribution from the data's, in standard deviations."""
     levels = (np.arange(N_QUANTILES) + 0.5) / N_QUANTILES
     apart = np.quantile(other, levels, axis=0) - np.quantile(data, levels, axis=0)
     return np.abs(apart).mean(axis=0) / zero_to_one(data.std(axis=0))
