@@ -1,4 +1,4 @@
-"""How like a record a run is: by its cycle, or by its statistics where nothing repeats."""
+"""Comparison of a model run with a record: by the cycle, or by statistics if nothing repeats."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from ep2sindy.signals.attractor import (
 from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
 from ep2sindy.signals.stationarity import quarter_distances
 
-LONG = 8.0  # periods of a record whose first half may be left out as a transient
-REPEATS = 0.9  # of the variance, that the waveform of a cycle explains; of chaos 0.5 to 0.75
-# Times what the spectra of quarters are apart: they lack the slow bands, in which a record that
-# does not repeat itself wanders most.
+LONG = 8.0  # least periods in a record for its first half to be left out as a transient
+REPEATS = 0.9  # least share of the variance that the waveform of a cycle explains; chaos: 0.5-0.75
+# Factor on the distance between the spectra of quarters: quarters lack the slow bands, in which a
+# record that does not repeat itself varies most.
 SPECTRUM_WANDERS = 2.0
 
 
 class Verdict(StrEnum):
-    """How a free run ends, the best first."""
+    """Verdict on a free run, the best first."""
 
     LIVES = "lives"
     SLIPS = "slips"
@@ -41,13 +41,15 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class FreeRunBounds:
-    """How close a model that lives stays to the data.
+    """Largest deviations from the data at which the verdict on a run is still `lives`.
 
     frequency, amplitude: relative error of the frequency and of each state's standard deviation.
-    waveform: RMS difference of the waveforms, in standard deviations. For records that do not
-    repeat themselves, distribution: Wasserstein distance of each state's distribution, in standard
-    deviations, and spectrum: share of the power in other bands; or as far as quarters of the
-    record are apart, twice that of the spectrum, where that is more.
+    waveform: RMS difference of the waveforms, in standard deviations.
+
+    Two bounds apply to records that do not repeat themselves. distribution: Wasserstein distance
+    of each state's distribution, in standard deviations. spectrum: share of the power that lies in
+    different bands. If quarters of the record are farther apart than this, their distance is the
+    bound instead; for the spectrum, twice their distance.
     """
 
     frequency: float = 0.01
@@ -64,7 +66,7 @@ class FreeRunBounds:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """How one run compares to a record; the fields are those of `FreeRun`."""
+    """Comparison of one run with a record; the fields are those of `FreeRun`."""
 
     verdict: Verdict
     f_error: float
@@ -78,7 +80,7 @@ def deviation(
     waveform_error: Float[np.ndarray, " n_states"],
     bounds: FreeRunBounds,
 ) -> float:
-    """The largest from the data's cycle, in units of its bound; NaN where there is none."""
+    """Largest deviation from the data's cycle, in units of its bound; NaN without a cycle."""
     return float(
         max(
             abs(f_error) / bounds.frequency,
@@ -102,9 +104,9 @@ def compare_cycles(
 
 @dataclass(frozen=True, eq=False)
 class ComparedRecord:
-    """What runs are compared to: samples, and what they repeat.
+    """A record that runs are compared with: samples, and their cycle.
 
-    cycle: of the samples, or of a longer record that they are a part of; None without a period.
+    cycle: cycle of the samples, or of a longer record that contains them; None without a period.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -122,7 +124,7 @@ class ComparedRecord:
     def likeness(
         self, states: Float[np.ndarray, "_ n_states"], bounds: FreeRunBounds
     ) -> Comparison:
-        """Of a run at the times t; one with fewer samples has diverged."""
+        """Compare a run at the times t with this record; a run with fewer samples has diverged."""
         nothing = np.full(states.shape[1], np.nan)
         by_state = dict.fromkeys(("amplitude_ratio", "waveform_error", "distribution"), nothing)
         if len(states) < len(self.t) or not np.isfinite(states).all():
@@ -148,12 +150,12 @@ class ComparedRecord:
 
     @property
     def _repeats(self) -> bool:
-        """Whether it is one cycle over and over; what is not is alike by its statistics alone."""
+        """True if the record repeats one cycle; otherwise runs are compared by statistics first."""
         return self.cycle is not None and self.cycle.share >= REPEATS
 
     @property
     def _is_long(self) -> bool:
-        """Whether half of it holds enough periods to compare."""
+        """True if half of the record holds enough periods to compare."""
         return self._repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
     def _with_period(
@@ -164,7 +166,7 @@ class ComparedRecord:
         return Verdict.LIVES if abs(f_error) <= bounds.frequency else Verdict.SLIPS
 
     def _is_alike(self, distribution: np.ndarray, spectrum: float, bounds: FreeRunBounds) -> bool:
-        """Whether a run is about as near to the record as its quarters are to each other."""
+        """True if the run is about as close to the record as its quarters are to each other."""
         apart, apart_spectrum = quarter_distances(self.t, self.states)
         near = (distribution <= np.maximum(bounds.distribution, apart)).all()
         alike = spectrum <= max(bounds.spectrum, SPECTRUM_WANDERS * apart_spectrum)
@@ -172,6 +174,6 @@ class ComparedRecord:
 
 
 def record_of(run: Trajectory, states: Sequence[str]) -> ComparedRecord:
-    """A trajectory as what runs are compared to."""
+    """Record of a trajectory, with its cycle, that runs are compared with."""
     values = run.columns(states)
     return ComparedRecord(run.t, values, find_cycle(run.t, values))

@@ -1,4 +1,4 @@
-"""How a model shows itself: equations with units and intervals, on a screen or in a notebook."""
+"""Display of a model: equations with units and intervals, on a screen or in a notebook."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.model.rollout import Equations
 from ep2sindy.runtime.screen import N_LINES, cut, wrap
 
-MAX_TERMS = 40  # of one equation in a notebook
+MAX_TERMS = 40  # most terms shown of one equation in a notebook
 
 
 @runtime_checkable
 class Readable(Equations, Protocol):
-    """What is shown, a SparseModel."""
+    """Interface of a model that can be displayed, such as a SparseModel."""
 
     @property
     def covariance(self) -> np.ndarray | None: ...
@@ -37,7 +37,7 @@ def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
         states, tail = model.states[: room - 1], [f"... {left} more equations", foot]
     else:
         states, tail = model.states, [foot]
-    # Every equation gets one line, and an even share of those that the others leave.
+    # Every equation gets one line, and an even share of the lines that are left over.
     spare = n_lines - len(tail) - len(states)
     lines: list[str] = []
     for k, state in enumerate(states):
@@ -51,7 +51,7 @@ def model_lines(model: Readable, *, n_lines: int = N_LINES) -> list[str]:
 
 
 def model_html(model: Readable) -> str:
-    """The same for a notebook."""
+    """Equations with their units and the units of the variables, as HTML for a notebook."""
     lines = []
     for state in model.states:
         terms = dict(list(model.terms(state).items())[:MAX_TERMS])
@@ -63,7 +63,7 @@ def model_html(model: Readable) -> str:
 
 
 def half_widths(model: Readable, state: str) -> Mapping[str, float]:
-    """Half of the 95 % interval of each coefficient, where a covariance is known."""
+    """Half-width of each coefficient's 95 % interval; empty without a covariance."""
     if model.covariance is None:
         return {}
     return {name: (high - low) / 2.0 for name, (low, high) in model.intervals(state).items()}

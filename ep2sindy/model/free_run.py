@@ -1,4 +1,4 @@
-"""A model run freely from one sample of a record: does it stay on the data's attractor?"""
+"""Free run of a model from one sample of a record, compared with the data's attractor."""
 
 from __future__ import annotations
 
@@ -23,13 +23,17 @@ from ep2sindy.signals.spectrum import dominant_frequency
 class FreeRun:
     """A model run from one sample over a record, driven by its inputs if it has any.
 
-    Compared are the second halves, where transients are over; all of a record that has no period,
-    or less than eight. f_error: relative, of the frequency. amplitude_ratio, waveform_error (in
-    standard deviations), distribution (the same): by state. NaN where they are not known: all of a
-    run that diverged, frequency and waveform where the record or the run has no period. periods:
-    until the model's phase has slipped by a quarter, or those of the record. excursion: largest
-    distance from the data's mean, in standard deviations. frequency_Hz: by state; nrmse: root mean
-    square error over all samples in standard deviations. NaN where it diverged, or died out.
+    Only the second halves are compared, after transients. If the record does not repeat one
+    waveform, or has fewer than eight periods, all of it is compared.
+
+    f_error: relative error of the frequency. amplitude_ratio, waveform_error, distribution: by
+    state, the last two in standard deviations. They are NaN for a run that diverged; frequency and
+    waveform errors are also NaN if the record or the run has no period.
+    periods: number of periods until the model's phase has slipped by a quarter of a period, or
+    those of the record if it does not.
+    excursion: largest distance from the data's mean, in standard deviations.
+    frequency_Hz: by state, NaN if the run diverged or the state died out.
+    nrmse: root mean square error over all samples, in standard deviations; NaN if it diverged.
     """
 
     model: SparseModel
@@ -47,7 +51,7 @@ class FreeRun:
 
     @property
     def text(self) -> str:
-        """The verdict, and how long after its start it diverged."""
+        """Verdict, with the time from start to divergence if the run diverged."""
         of = f" of {self.rollout.outside}" if self.rollout.outside else ""
         lasted = self.rollout.lasted_text if self.rollout.diverged else ""
         return f"{self.verdict}{of} after {lasted}" if lasted else str(self.verdict)
@@ -64,8 +68,8 @@ def free_run(
 ) -> FreeRun:
     """Run a model over a record, or its first samples, and compare the attractors.
 
-    initial: the state to start from, in SI; None takes the data's. judged: states that the verdict
-    and f_error are by, such as the one that was measured; None takes all.
+    initial: the state to start from, in SI; None takes the data's. judged: states that determine
+    the verdict and f_error, such as the measured one; None takes all.
     Raises ValueError for a judged state that the model does not have.
     """
     n_samples = run.n_samples if n_samples is None else min(n_samples, run.n_samples)
@@ -96,7 +100,7 @@ def free_run(
 
 
 def columns_of(states: Sequence[str], judged: Sequence[str] | None) -> list[int]:
-    """Places of the states that are judged, None meaning all; ValueError for one not there."""
+    """Column indices of the judged states, None meaning all; ValueError for an unknown state."""
     names = list(states if judged is None else judged)
     if not names or not set(names) <= set(states):
         raise ValueError(f"judged must name some of the states {list(states)}: {names} came")
@@ -104,7 +108,7 @@ def columns_of(states: Sequence[str], judged: Sequence[str] | None) -> list[int]
 
 
 def samples_in(run: Trajectory, duration_s: float) -> int:
-    """Number of samples in the first `duration_s`, or in all where the data end before.
+    """Number of samples in the first `duration_s`, or of all samples if the data end earlier.
 
     Raises ValueError for a duration that holds fewer than two samples.
     """
@@ -117,7 +121,7 @@ def samples_in(run: Trajectory, duration_s: float) -> int:
 
 
 def _periods_kept(record: ComparedRecord, states: np.ndarray) -> float:
-    """Periods of the data until the run's phase is a quarter off; NaN for data without any."""
+    """Periods of the data until the run's phase is a quarter off; NaN for data without a period."""
     if record.cycle is None:
         return float("nan")
     frequency_Hz, n = record.cycle.frequency_Hz, len(states)

@@ -1,4 +1,4 @@
-"""Inputs that a user hands to a model: arrays, or by name arrays and functions of time."""
+"""Inputs that a user passes to a model: one array, or arrays and functions of time by name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Drive = Callable[[float], np.ndarray]
 def inputs_at_samples(
     names: Sequence[str], inputs: ArrayLike | Mapping[str, Any] | None, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "... n_inputs"]:
-    """Inputs at samples, (*shape, n_inputs), from such an array or from arrays by name.
+    """Inputs at samples, (*shape, n_inputs), from an array of that shape or arrays by name.
 
     Raises ValueError for inputs that are missing, unknown, of another shape or not finite.
     """
@@ -42,10 +42,10 @@ def driven(
     inputs: ArrayLike | Mapping[str, Any] | None,
     t: Float[np.ndarray, " samples"],
 ) -> tuple[Drive | None, Float[np.ndarray, "samples n_inputs"]]:
-    """Inputs as one function of time, None where there are none, and their samples at t.
+    """Inputs as one function of time, or None without inputs, and their samples at t.
 
-    Functions given by name are called at every time that the solver asks for, with t in s;
-    samples are joined by cubic splines.
+    Functions given by name are called at every time that the solver needs, with t in s.
+    Samples are interpolated by cubic splines.
     """
     given = dict(inputs) if isinstance(inputs, Mapping) else {}
     functions = {name: value for name, value in given.items() if callable(value)}
@@ -69,8 +69,8 @@ def driven(
 def spline(
     t: Float[np.ndarray, " samples"], inputs: Float[np.ndarray, "samples n_inputs"]
 ) -> Drive:
-    """Inputs between their samples, by cubics."""
-    from scipy.interpolate import make_interp_spline  # for those alone who have inputs
+    """Cubic spline through the samples of the inputs."""
+    from scipy.interpolate import make_interp_spline  # imported only for models with inputs
 
     return make_interp_spline(t, inputs, k=min(3, len(inputs) - 1))
 
@@ -78,9 +78,10 @@ def spline(
 def spline_pieces(
     drive: Drive | None, n_inputs: int
 ) -> tuple[Float[np.ndarray, " breaks"], Float[np.ndarray, "order spans n_inputs"]] | None:
-    """Breaks of such a spline, and powers of the time since the last one, the highest first.
+    """Breaks of a spline of inputs, and its polynomial coefficients, the highest power first.
 
-    Both are empty where nothing is driven. None for inputs that are functions of one's own.
+    The polynomials are in the time since the last break. Both arrays are empty for a model
+    without inputs. Returns None for inputs that are user functions.
     """
     if drive is None:
         return np.zeros(0), np.zeros((0, 0, n_inputs))

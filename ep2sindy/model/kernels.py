@@ -1,30 +1,30 @@
 """Compiled integration of one free run: the Dormand-Prince scheme of eighth order.
 
-The equations are sums of products: a tuple (table, coef, scale, breaks, pieces). Row k of `table`
-names the columns that term k multiplies, of the states, the inputs and a one; coef: (terms, n),
-already divided by the scale of the state; scale: (n,), what turns the solver's states into SI.
-breaks: (m + 1,), pieces: (order, m, inputs): the inputs as cubics in the time since the last break;
-no inputs make pieces of shape (0, 0, 0).
+The equations are sums of products, given as a tuple (table, coef, scale, breaks, pieces). The
+columns are the states, the inputs and a one; row k of `table` lists the columns whose product is
+term k. coef: (terms, n), already divided by the scale of the state. scale: (n,), factors from the
+solver's states to SI. breaks: (m + 1,), pieces: (order, m, inputs): the inputs as cubics in the
+time since the last break; without inputs, pieces has shape (0, 0, 0).
 
 The scheme is a tuple of its coefficients (a, b, c, e3, e5, a_dense, c_dense, dense), as published:
 Hairer, Norsett & Wanner 1993, Solving Ordinary Differential Equations I, II.5, II.6 and II.10;
-`solve.SCHEME` has them. Steps, errors and dense output are those of SciPy's `DOP853`, so that a
-run differs from one of SciPy's by rounding alone.
+`solve.scheme` returns them. Steps, errors and dense output are those of SciPy's `DOP853`, so that
+a run differs from SciPy's by rounding only.
 """
 
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
 
-FINISHED, LOOK, CROSSED, FAILED = 0, 1, 2, 3  # why `advance` returns
+FINISHED, LOOK, CROSSED, FAILED = 0, 1, 2, 3  # reasons for which `advance` returns
 
-SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0  # of a step from the one before
-EXPONENT = -1.0 / 8.0  # of the error that chooses a step; its estimate is of seventh order
+SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0  # limits on the ratio of successive steps
+EXPONENT = -1.0 / 8.0  # power of the error in the step size; the error estimate is of order seven
 
 
 @compiled(error_model="numpy")
 def _add_terms(table, coef, columns, slope):
-    """Slopes of all states, from zero: each term, the product of its columns, times its coef."""
+    """Write the slopes of all states: the sum over terms of coef times the product of columns."""
     for i in range(len(slope)):
         slope[i] = 0.0
     for k in range(len(table)):
@@ -37,14 +37,14 @@ def _add_terms(table, coef, columns, slope):
 
 @compiled(error_model="numpy")
 def rates(equations, t, y, columns, slope):
-    """The right-hand side at one state, into `slope`; columns is room for values in SI."""
+    """Write the right-hand side at one state into `slope`; `columns` is workspace, in SI."""
     table, coef, scale, breaks, pieces = equations
     n, n_inputs = len(y), pieces.shape[2]
     for i in range(n):
         columns[i] = y[i] * scale[i]
     if n_inputs:
         place, above = 0, pieces.shape[1]
-        while above - place > 1:  # by halves: the span that t is in
+        while above - place > 1:  # bisection for the span that contains t
             middle = (place + above) // 2
             if breaks[middle] <= t:
                 place = middle
@@ -61,7 +61,7 @@ def rates(equations, t, y, columns, slope):
 
 @compiled(error_model="numpy")
 def _stage(equations, t, y, h, weights, n_before, slopes, at, columns):
-    """Slope number `n_before` of a step of length h from y, from those before it."""
+    """Compute stage slope number `n_before` of a step of length h from y."""
     for i in range(len(y)):
         value = 0.0
         for s in range(n_before):
@@ -72,7 +72,7 @@ def _stage(equations, t, y, h, weights, n_before, slopes, at, columns):
 
 @compiled(error_model="numpy")
 def _error(e3, e5, slopes, h, y, at, rtol):
-    """Size of a step's error, one where it is as large as the tolerance."""
+    """Norm of a step's error, one if it equals the tolerance."""
     fifth, third = 0.0, 0.0
     for i in range(len(y)):
         allowed = rtol + max(abs(y[i]), abs(at[i])) * rtol
@@ -89,7 +89,7 @@ def _error(e3, e5, slopes, h, y, at, rtol):
 
 @compiled(error_model="numpy")
 def _polynomial(equations, scheme, t, h, start, end, slopes, at, columns, shape):
-    """Dense output of a step: rows of `shape`, for `_between`. Takes three evaluations."""
+    """Write the dense output of a step into `shape`, for `_between`. Takes three evaluations."""
     a_dense, c_dense, dense = scheme[5], scheme[6], scheme[7]
     for k in range(3):
         _stage(equations, t + c_dense[k] * h, start, h, a_dense[k], 13 + k, slopes, at, columns)
@@ -107,7 +107,7 @@ def _polynomial(equations, scheme, t, h, start, end, slopes, at, columns, shape)
 
 @compiled(error_model="numpy")
 def _between(shape, start, share, out):
-    """The state at a share of a step, into `out`."""
+    """Write the state at a given fraction of a step into `out`."""
     for i in range(len(start)):
         value = 0.0
         for k in range(7):
@@ -117,7 +117,7 @@ def _between(shape, start, share, out):
 
 @compiled(error_model="numpy")
 def _room(y, blow_up):
-    """How far the largest state is from `blow_up`; negative beyond it."""
+    """`blow_up` minus the largest absolute state; negative beyond it."""
     largest = 0.0
     for i in range(len(y)):
         largest = max(largest, abs(y[i]))
@@ -126,10 +126,10 @@ def _room(y, blow_up):
 
 @compiled(error_model="numpy")
 def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
-    """One step that keeps the tolerance: from y to `at`, whose slope is row 12 of `slopes`.
+    """One step within the tolerance, from y to `at`; the slope at `at` is row 12 of `slopes`.
 
-    Returns the time reached, that step's length, the length to try next and how many evaluations
-    it took; the time is where it began if the step became too small.
+    Returns the time reached, the length of the step, the length to try next and the number of
+    evaluations. If the step became too small, the time returned is the start of the step.
     """
     a, b, c, e3, e5 = scheme[0], scheme[1], scheme[2], scheme[3], scheme[4]
     least = 10.0 * (np.nextafter(t, np.inf) - t)
@@ -154,7 +154,7 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
             if again:
                 factor = min(1.0, factor)
             return ahead, h, h * factor, calls
-        # What is not finite shortens the step as far as a step may be shortened.
+        # An error that is not finite shortens the step by the smallest factor allowed.
         factor = SAFETY * error**EXPONENT
         h *= factor if factor > MIN_FACTOR else MIN_FACTOR
         again = True
@@ -163,12 +163,12 @@ def _step(equations, scheme, t, h, end_t, y, at, slopes, columns, rtol):
 
 @compiled(error_model="numpy")
 def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, blow_up, rtol):
-    """Integrate to the last of `times`, filling rows of `out` from `place` on; y and slope move.
+    """Integrate to the last of `times`, filling rows of `out` from `place` on.
 
-    h: the step to try. Returns why it ended, the time, the step to try next, the next place and
-    the number of evaluations. LOOK: `limit` evaluations have been passed. CROSSED: the largest
-    state crossed `blow_up` in the last step, whose samples are filled up to there. FAILED: the
-    step became too small.
+    y and slope are updated in place. h: the step to try. Returns the reason for stopping, the
+    time, the step to try next, the next place and the number of evaluations. Reasons: FINISHED;
+    LOOK: `limit` evaluations have been exceeded; CROSSED: the largest state crossed `blow_up` in
+    the last step, and samples are filled up to the crossing; FAILED: the step became too small.
     """
     n = len(y)
     slopes, shape = np.empty((16, n)), np.empty((7, n))
@@ -183,7 +183,7 @@ def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, 
         calls += n_calls
         if ahead == t:
             return FAILED, t, h, place, calls
-        over = calls > limit  # before the evaluations of dense output, as SciPy's events see it
+        over = calls > limit  # checked before the evaluations for dense output, as in SciPy
         crossed = (_room(at, blow_up) >= 0.0) != inside
         if times[place] <= ahead:
             _polynomial(equations, scheme, t, length, y, at, slopes, room, columns, shape)
@@ -207,8 +207,9 @@ def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, 
 
 @compiled(error_model="numpy")
 def _runge_kutta(table, coef, drive, h, x, total, slope, columns):
-    """One classical step of length h, x in place. drive: (inputs, 3), start, middle and end.
+    """One classical Runge-Kutta step of length h; updates x in place.
 
+    drive: (inputs, 3), at the start, middle and end of the step.
     Source: Hairer, Norsett & Wanner 1993, II.1.
     """
     n = len(x)
@@ -230,12 +231,12 @@ def _runge_kutta(table, coef, drive, h, x, total, slope, columns):
 
 @compiled(error_model="numpy")
 def run_many(table, coefs, start, steps_s, drive, n_substeps, centre, reach):
-    """Many models from many starts, by classical Runge-Kutta steps: states and what is bounded.
+    """Integrate many models from many starts by classical Runge-Kutta steps.
 
     coefs: (models, terms, states); start: (windows, states); steps_s: (windows, steps); drive:
-    (windows, steps, inputs, 3). Returns states (samples, states, models, windows) after every
-    n_substeps steps, and (samples, models, windows), whether all have kept within reach (states,)
-    of the centre; a run that has not stays where it last was.
+    (windows, steps, inputs, 3). Returns the states (samples, states, models, windows) after every
+    n_substeps steps, and flags (samples, models, windows), true while all states have stayed
+    within reach (states,) of the centre. A run that left this range stays at its last state inside.
     """
     n_windows, n = start.shape
     n_models, n_samples = len(coefs), steps_s.shape[1] // n_substeps

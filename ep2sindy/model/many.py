@@ -1,4 +1,4 @@
-"""Many models of the same states, integrated together over the same windows by Runge-Kutta."""
+"""Runge-Kutta integration of many models with the same states over the same windows at once."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model import kernels
 
-# Steps of the integration per sample. One would do for the truth of every noise-free system of
-# `systems`: its error stays below 1e-9 variances; the second is for sparser samples.
+# Integration steps per sample. One step suffices for the true model of every noise-free system of
+# `systems`: its error stays below 1e-9 variances. The second step is for sparser samples.
 N_SUBSTEPS = 2
 
-# A state this many standard deviations from its mean has diverged.
+# A state that is farther from its mean than this many standard deviations has diverged.
 BLOW_UP = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class DrivenWindows:
-    """Windows of one trajectory: where they start, what drives them, and for how long.
+    """Windows of one trajectory: initial states, inputs and time steps.
 
-    steps_s: (steps, windows), of the integration, N_SUBSTEPS from one sample to the next. drive:
-    inputs at the start, middle and end of every step. start: smoothed.
+    steps_s: (steps, windows), integration steps, N_SUBSTEPS from one sample to the next. drive:
+    inputs at the start, middle and end of every step. start: smoothed initial states.
     """
 
     steps_s: Float[np.ndarray, "steps windows"]
@@ -48,7 +48,7 @@ class DrivenWindows:
         nodes = begins[:, None] + np.array([0.0, 0.5, 1.0])[:, None] * steps_s[:, None]
         drive = np.empty((0, *nodes.shape))
         if inputs:
-            from scipy.interpolate import make_interp_spline  # for those alone who have inputs
+            from scipy.interpolate import make_interp_spline  # imported only for driven models
 
             spline = make_interp_spline(run.t, run.columns(inputs), k=min(3, run.n_samples - 1))
             drive = np.moveaxis(spline(nodes), -1, 0)
@@ -58,7 +58,7 @@ class DrivenWindows:
     def free(
         start: Float[np.ndarray, "n_states windows"], *, step_s: float, n_samples: int
     ) -> DrivenWindows:
-        """Equal steps from any starts, with nothing driven."""
+        """Windows with equal steps from given starts, without inputs."""
         n_steps = N_SUBSTEPS * (n_samples - 1)
         return DrivenWindows(
             np.full((n_steps, start.shape[1]), step_s / N_SUBSTEPS),
@@ -85,13 +85,13 @@ class Ensemble:
 
     @cached_property
     def _gather(self) -> np.ndarray:
-        """Where each variable of the library stands among states, then inputs."""
+        """Position of each variable of the library in the list of states, then inputs."""
         known = [*self.states, *self.inputs]
         return np.array([known.index(v) for v in self.library.variables], dtype=np.int64)
 
     @cached_property
     def _used(self) -> tuple[Library, np.ndarray]:
-        """The terms that any model uses, and their coefficients."""
+        """Terms that at least one model uses, and their coefficients."""
         used = np.abs(self.coef).max(axis=(1, 2)) > 0.0
         used[0] |= not used.any()  # a library needs a term
         return self.library.take(used), self.coef[used]
@@ -99,10 +99,10 @@ class Ensemble:
     def paths(
         self, windows: DrivenWindows, *, centre: np.ndarray, spread: np.ndarray
     ) -> Float[np.ndarray, "models windows samples n_states"]:
-        """Where every model runs from every start, the start included; NaN once it diverged.
+        """States of every model from every start, the start included; NaN after divergence.
 
-        Runge-Kutta of fourth order, over as many samples as the steps of the windows reach. A run
-        whose state leaves centre by BLOW_UP times spread has diverged, and stops.
+        Fourth-order Runge-Kutta, over all samples that the steps of the windows cover. A run
+        has diverged, and stops, once a state is farther than BLOW_UP times spread from centre.
         """
         start = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)
         found = [start]
@@ -113,13 +113,13 @@ class Ensemble:
     def _run(
         self, windows: DrivenWindows, centre: np.ndarray, spread: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """States (states, models, windows) at every sample after the start, and which are bounded.
+        """States (states, models, windows) at every sample after the start, and bounded runs.
 
-        A run that left its bounds stays where it last was inside.
+        A run that left its bounds stays at its last state inside.
         """
         library, coef = self._used
         if not library.functions:
-            # Copied in one order: of other orders, kernels would be compiled anew.
+            # Copied in C order: kernels would be compiled again for each other memory order.
             copied = partial(np.array, order="C")
             paths, inside = kernels.run_many(
                 library.columns_of([*self.states, *self.inputs]),
@@ -133,12 +133,12 @@ class Ensemble:
             )
             yield from zip(paths, inside, strict=True)
             return
-        # States first: each operation then runs along models and windows, in one stretch.
+        # States are the first axis, so each operation runs along models and windows contiguously.
         x = np.repeat(windows.start[:, None], self.coef.shape[2], axis=1)
         bounded = np.ones(x.shape[1:], dtype=np.bool_)
         for k in range(len(windows.steps_s) // N_SUBSTEPS):
             moved = x
-            # What overflows has left the bounds.
+            # A state that overflows has left the bounds.
             with np.errstate(over="ignore", invalid="ignore"):
                 for step in range(k * N_SUBSTEPS, (k + 1) * N_SUBSTEPS):
                     drive = windows.drive[:, step]
@@ -168,9 +168,10 @@ def rk4_step(
     inputs: tuple[np.ndarray, np.ndarray, np.ndarray],
     step_s: float | np.ndarray,
 ) -> np.ndarray:
-    """One step of fourth order of x' = slope(x, inputs).
+    """One fourth-order Runge-Kutta step of x' = slope(x, inputs).
 
-    inputs: at the start, middle and end of the step. step_s: one, or of a shape that broadcasts.
+    inputs: at the start, middle and end of the step. step_s: one number, or an array that
+    broadcasts.
     Source: Hairer, Norsett & Wanner 1993, Solving Ordinary Differential Equations I, II.1.
     """
     start, middle, end = inputs

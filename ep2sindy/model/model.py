@@ -1,4 +1,4 @@
-"""A sparse model: a few terms per equation, readable, runnable and storable."""
+"""SparseModel: equations with few terms that can be read, integrated, scored and stored."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class SparseModel:
     """Equations x' = library(states, inputs) coef, in SI units.
 
     coef: (terms, equations), zero outside the support. states: one name per equation.
-    units: of the states and of the library's variables. provenance: where it came from.
-    covariance: (coefs, coefs) of the coefficients that are not zero, equation by equation and
-    within one in the order of the library, in SI; None where it is not known.
+    units: of the states and of the library's variables. provenance: origin of the model.
+    covariance: (coefs, coefs) of the nonzero coefficients, in SI, ordered by equation and within
+    each equation in the order of the library; None if it is not known.
 
     >>> library = ep.polynomial(["x", "v"], degree=1)
     >>> spring = ep.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
@@ -85,7 +85,7 @@ class SparseModel:
         return tuple(v for v in self.library.variables if v not in self.states)
 
     def terms(self, state: str) -> dict[str, float]:
-        """Term name -> SI coefficient, of one equation, in the order of the library."""
+        """Term name -> SI coefficient of one equation, in the order of the library."""
         column = self.coef[:, self._equation(state)]
         return {n: float(c) for n, c in zip(self.library.names, column, strict=True) if c != 0.0}
 
@@ -114,7 +114,7 @@ class SparseModel:
         states: Float[np.ndarray, "... n_states"],
         inputs: Float[np.ndarray, "... n_inputs"],
     ) -> Float[np.ndarray, "... n_states"]:
-        """Right-hand side at any number of samples; inputs in the order of `inputs`.
+        """Right-hand side at any number of samples; inputs are in the order of `inputs`.
 
         NaN outside the domain of a function of the model.
         """
@@ -134,12 +134,12 @@ class SparseModel:
     ) -> Rollout:
         """Integrate from one sample of a trajectory, driven by its inputs (cubic splines).
 
-        trajectory: or a table or arrays (t, x), as `discover` takes them.
+        trajectory: a Trajectory, a table or arrays (t, x), as `discover` takes them.
         initial: the state at that sample, in SI; None takes the data's.
         The states are scaled by their largest value in the window, so that one tolerance fits
-        all. A state that exceeds `blow_up` times that value ends the run as diverged. Stiff
-        equations go on implicitly; the run ends after some hundred evaluations per sample, or
-        `limit_s` of work, marked and with a message.
+        all. A state that exceeds `blow_up` times that value ends the run as diverged. If the
+        equations are stiff, the solver switches to an implicit method. The run also ends, marked
+        and with a message, after some hundred evaluations per sample or `limit_s` of work.
         Raises ValueError for a window outside the trajectory or a missing variable.
         """
         return rollout(
@@ -163,14 +163,15 @@ class SparseModel:
         rtol: float = 1e-8,
         limit_s: float = 300.0,
     ) -> Rollout:
-        """Integrate freely from the state x0 at t[0], and give the states at the times t.
+        """Integrate freely from the state x0 at t[0]; returns the states at the times t.
 
         t: (samples,) in s, increasing. x0: (n_states,), in SI. inputs: (samples, n_inputs) at t,
-        joined by cubic splines, or by name such samples, a number, or a function of t in s.
-        Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges is one
-        too: marked `diverged`, with a message, it ends where a state exceeds `blow_up` times its
-        start (or, where that is zero, what its first rate makes of it), or where the
-        solver gave up: see `rollout`.
+        interpolated by cubic splines; or a mapping from name to samples, a number, or a function
+        of t in s.
+        Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges also
+        returns one, marked `diverged` and with a message. It ends when a state exceeds `blow_up`
+        times its scale, or when the solver gives up (see `rollout`). The scale of a state is its
+        initial value; if that is zero, its initial rate times the duration.
         Raises ValueError for a missing or unknown input and for wrong shapes.
         """
         return simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol, limit_s=limit_s)
@@ -181,7 +182,7 @@ class SparseModel:
         """Right-hand side at many samples at once, in SI per second.
 
         x: (samples, n_states), or one sample (n_states,), or a Trajectory (or a table with a time
-        column), which brings its own inputs. inputs: of the same number of samples, in the order
+        column), which contains its own inputs. inputs: the same number of samples, in the order
         of `inputs`, or by name.
         Raises ValueError for a missing or unknown variable and for wrong shapes.
         """
@@ -206,12 +207,13 @@ class SparseModel:
         x_dot: Float[np.ndarray, "samples n_states"] | None = None,
         smoother: Smoother | None = None,
     ) -> float:
-        """R2 of the derivative over a trajectory, the mean over the states; one is perfect.
+        """R2 of the derivative over a trajectory, averaged over the states; one is perfect.
 
         run: as `discover` takes it.
-        The derivative and the samples at which the right-hand side is taken come from `smoother`,
-        by default SavitzkyGolay(), as in `Differential`; with x_dot, (samples, n_states) in SI
-        and in the order of the model's states, that is the truth, and samples are taken raw.
+        x_dot: (samples, n_states), the true derivative in SI, in the order of the model's states;
+        the right-hand side is then evaluated at the raw samples. With None, the derivative and
+        the samples for the right-hand side come from `smoother`, by default SavitzkyGolay(), as
+        in `Differential`.
         Raises ValueError for a missing variable, a wrong shape, a derivative that is constant, or
         a sample outside the domain of a function of the model.
         """
@@ -248,7 +250,7 @@ class SparseModel:
         return f"$${self.latex()}$$"
 
     def to_json(self) -> str:
-        """Everything in the model; floats in their shortest exact form."""
+        """JSON text of the whole model; floats in their shortest exact form."""
         return model_text(
             self.library,
             {state: self.terms(state) for state in self.states},
@@ -276,7 +278,7 @@ class SparseModel:
 
     @cached_property
     def _gather(self) -> np.ndarray:
-        """Where each variable of the library stands among states, then inputs."""
+        """Position of each variable of the library in the list of states, then inputs."""
         known = (*self.states, *self.inputs)
         return np.array(list(map(known.index, self.library.variables)), dtype=np.int64)
 
@@ -284,7 +286,7 @@ class SparseModel:
 def coef_matrix(
     library: Library, equations: Sequence[Mapping[str, float]]
 ) -> Float[np.ndarray, "terms equations"]:
-    """Coefficients by term name, as a matrix over the library."""
+    """Matrix of coefficients over the library, from coefficients by term name."""
     coef = np.zeros((len(library), len(equations)))
     for k, terms in enumerate(equations):
         coef[[library.index(name) for name in terms], k] = list(terms.values())
@@ -294,6 +296,6 @@ def coef_matrix(
 def model_of(
     library: Library, equations: Mapping[str, Mapping[str, float]], **rest: Any
 ) -> SparseModel:
-    """A model from its coefficients by state and term; rest: its other fields."""
+    """Model from coefficients by state and term; rest: the other fields of SparseModel."""
     values = list(equations.values())
     return SparseModel(library, list(equations), coef_matrix(library, values), **rest)

@@ -1,4 +1,4 @@
-"""Models integrated over time, along the data or freely; right-hand sides of the terms in use."""
+"""Integration of models in time, along data or freely; right-hand sides of the terms in use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ep2sindy.model.solve import Border, Products, Rates, edges_of, solve_stages
 
 @runtime_checkable
 class Equations(Protocol):
-    """What is integrated, a SparseModel: x' = library(states, inputs) coef."""
+    """Interface of equations x' = library(states, inputs) coef, such as a SparseModel."""
 
     @property
     def library(self) -> Library: ...
@@ -39,11 +39,12 @@ class Equations(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A model integrated along data or freely, and how that ended.
+    """Result of integrating a model along data or freely.
 
     t: (samples,) in s, states: (samples, n_states), inputs: (samples, n_inputs), all cut where
-    a diverged run stopped. units: by name, of states and inputs. clock: how people read t.
-    outside: the function of the model whose domain the run has left; it counts as diverged.
+    a diverged run stopped. units: by name, of states and inputs. clock: display format of t.
+    outside: the function of the model whose domain the run has left, or an empty text; such a
+    run counts as diverged.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -63,13 +64,13 @@ class Rollout:
 
     @property
     def lasted_text(self) -> str:
-        """`182 µs`; empty where nothing was integrated."""
+        """Duration of the run, such as `182 µs`; empty if nothing was integrated."""
         return self.clock.duration_text(self.lasted_s) if self.lasted_s else ""
 
     def trajectory(self, *, label: str = "") -> Trajectory:
-        """The samples as data, as far as they go.
+        """The samples of the run as a Trajectory, up to where it ended.
 
-        Raises ValueError where there are fewer than two, or where a state never changed.
+        Raises ValueError for fewer than two samples, or a state that never changed.
         """
         return Trajectory(
             t=self.t,
@@ -94,7 +95,7 @@ def rollout(
     rtol: float,
     limit_s: float,
 ) -> Rollout:
-    """Integrate along a trajectory: see `SparseModel.rollout`."""
+    """Integrate a model along a trajectory; see `SparseModel.rollout`."""
     stop = trajectory.n_samples if n_samples is None else start + n_samples
     window = trajectory.window(start, stop)
     data = window.columns(model.states)
@@ -124,7 +125,7 @@ def simulate(
     rtol: float,
     limit_s: float,
 ) -> Rollout:
-    """Integrate freely from one state: see `SparseModel.simulate`."""
+    """Integrate a model freely from one state; see `SparseModel.simulate`."""
     times, start = np.asarray(t, dtype=np.float64), np.asarray(x0, dtype=np.float64)
     if start.shape != (len(model.states),) or not np.isfinite(start).all():
         came = f"shape {start.shape}" if start.size > 8 else f"{start.tolist()}"
@@ -137,7 +138,7 @@ def simulate(
     library, coef = terms_in_use(model.library, model.coef)
     values, terms = library.at_points([*model.states, *model.inputs])
     values[:] = np.append(start, samples[0])
-    # What starts at zero is as large as its first rate makes it; what stays there, one.
+    # The scale of a state that starts at zero is its initial rate times the duration, or else one.
     with np.errstate(over="ignore", invalid="ignore"):
         moved = np.abs(terms() @ coef) * (times[-1] - times[0])
     reach = np.where((start == 0.0) & np.isfinite(moved), moved, np.abs(start))
@@ -168,7 +169,7 @@ def _integrate(
     rtol: float,
     limit_s: float,
 ) -> Rollout:
-    """From x0 over t, in units of `scale`, until a state exceeds `blow_up` of them."""
+    """Integrate from x0 over t in units of `scale`, until a scaled state exceeds `blow_up`."""
     border = _border(model, np.append(x0, samples[0]), drive, scale)
     if edge := border.beyond(t[0], x0 / scale):
         message = f"the start, at t = {t[0]:.6g} s, is outside {edge.text}"
@@ -218,7 +219,7 @@ def _rollout_of(
 
 
 def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.ndarray) -> Border:
-    """Of the functions that the model uses."""
+    """Border of the domain of the functions that the model uses."""
 
     def values(t: float, y: np.ndarray) -> np.ndarray:
         return y * scale if drive is None else np.append(y * scale, drive(t))
@@ -228,7 +229,7 @@ def _border(model: Equations, start: np.ndarray, drive: Drive | None, scale: np.
 
 
 def _scaled_rhs(model: Equations, drive: Drive | None, scale: np.ndarray) -> Rates:
-    """The right-hand side for scaled states, with the absent terms left out."""
+    """Right-hand side for scaled states, without the terms whose coefficients are all zero."""
     present = np.flatnonzero(model.coef.any(axis=1))
     coef, known = model.coef[present] / scale, [*model.states, *model.inputs]
     curves = spline_pieces(drive, len(model.inputs))
@@ -247,7 +248,7 @@ def _scaled_rhs(model: Equations, drive: Drive | None, scale: np.ndarray) -> Rat
     return rhs
 
 
-# Right-hand sides from the terms that a model has, where its library has more.
+# Right-hand sides evaluated only for the terms that a model uses; its library may have more.
 
 
 def rates(
@@ -255,7 +256,7 @@ def rates(
     coef: Float[np.ndarray, "terms n_states"],
     values: Float[np.ndarray, "... variables"],
 ) -> Float[np.ndarray, "... n_states"]:
-    """library(values) coef; NaN outside the domain of a function that has a coefficient."""
+    """Rates library(values) coef; NaN outside the domain of a function with a coefficient."""
     used, coef = terms_in_use(library, coef)
     return used.evaluate(values) @ coef
 
@@ -263,7 +264,10 @@ def rates(
 def terms_in_use(
     library: Library, coef: Float[np.ndarray, "terms n_states"]
 ) -> tuple[Library, Float[np.ndarray, "_ n_states"]]:
-    """Terms with a coefficient, where there are functions: others may have no value there."""
+    """Terms with a nonzero coefficient, and the coefficients; all terms if there are no functions.
+
+    Functions of unused terms are dropped because they may be undefined at the states of the model.
+    """
     used = np.flatnonzero(coef.any(axis=1))
     if not library.functions or len(used) == len(coef):
         return library, coef

@@ -1,4 +1,4 @@
-"""A free model in variables of order one, with its Jacobian: what solvers are given."""
+"""A model without inputs in variables of order one, with its Jacobian, for use in solvers."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from ep2sindy.model.model import SparseModel
 
 @dataclass(frozen=True, eq=False)
 class ScaledModel:
-    """y' = f(y) of states in units of `scale`, over time in units of `time_s`; used terms only.
+    """Scaled equations y' = f(y) with the Jacobian of f; contains only the terms in use.
 
-    terms, coef: (terms, n_states), of f. products, weights: (products, (1 + n_states) n_states),
-    of f, then of its derivatives by the first state, by the second, and so on.
+    States are in units of `scale`, time in units of `time_s`.
+    terms, coef: (terms, n_states), represent f. products, weights: (products, (1 + n_states)
+    n_states), represent f, then its derivatives by the first state, by the second, and so on.
     """
 
     terms: Library
@@ -27,7 +28,7 @@ class ScaledModel:
 
     @staticmethod
     def of(model: SparseModel, scale: Float[np.ndarray, " n_states"], time_s: float) -> ScaledModel:
-        """Of a model without inputs."""
+        """Scale a model that has no inputs."""
         used = np.flatnonzero(model.coef.any(axis=1))
         if not len(used):
             used = np.array([0])  # a library needs a term
@@ -42,7 +43,7 @@ class ScaledModel:
         return self.coef.shape[1]
 
     def with_departures(self) -> Callable[[float, np.ndarray], np.ndarray]:
-        """Slope of a state and, behind it, of n_states small departures from it, one per row."""
+        """Right-hand side of the state followed by n_states linearised departures, one per row."""
         n = self.n_states
         values, products = self.products.at_points(self.products.variables)
         weights = self.weights
@@ -58,7 +59,7 @@ class ScaledModel:
     def slope(
         self, y: Float[np.ndarray, "n_states points"]
     ) -> Float[np.ndarray, "n_states points"]:
-        """f at many states."""
+        """Evaluate f at many states."""
         return self.coef.T @ _evaluate(self.terms, y)
 
     def rate(self, y: Float[np.ndarray, "states points"]) -> Float[np.ndarray, " points"]:
@@ -68,7 +69,7 @@ class ScaledModel:
 
 
 def _evaluate(library: Library, y: np.ndarray) -> np.ndarray:
-    """(products, points): along points in one stretch, unlike `Library.evaluate`."""
+    """Library at many points, (products, points); contiguous in points, unlike Library.evaluate."""
     columns = np.ones((len(y) + 1, y.shape[1]))
     columns[:-1] = y
     columns = library.with_functions(columns, axis=0)

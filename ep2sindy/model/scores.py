@@ -1,4 +1,4 @@
-"""How well predictions explain data."""
+"""Scores of predictions against data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ep2sindy.signals.smoothers import Smoother
 def r2(
     *, truth: Float[np.ndarray, " rows"], prediction: Float[np.ndarray, "models rows"]
 ) -> Float[np.ndarray, " models"]:
-    """Coefficient of determination, 1 - SS_res/SS_tot, the total about the truth's mean."""
+    """Coefficient of determination, 1 - SS_res/SS_tot, with SS_tot about the mean of the truth."""
     total = np.square(truth - truth.mean()).sum()
     if total == 0.0:
         raise ValueError(
@@ -31,7 +31,7 @@ def derivative_r2(
     x_dot: Float[np.ndarray, "_ _"] | None,
     smoother: Smoother,
 ) -> float:
-    """Mean over the states of the R2 of their derivatives: see `SparseModel.score`."""
+    """Mean over the states of the R2 of their derivatives; see `SparseModel.score`."""
     library, _ = terms_in_use(model.library, model.coef)
     check_domain([run], library)
     values, data = run.columns(model.library.variables), run.columns(model.states)

@@ -1,6 +1,8 @@
-"""Integration in time with a budget: compiled, by SciPy for functions, implicit where stiff.
+"""Time integration with a budget of evaluations.
 
-A run ends at the border of the domain of its model's functions, which `Border` finds.
+Equations of products are integrated by compiled code, equations with functions by SciPy, and stiff
+equations by an implicit method. A run ends at the border of the domain of its model's functions,
+which `Border` finds.
 """
 
 from __future__ import annotations
@@ -15,26 +17,29 @@ from jaxtyping import Float, Int
 
 from ep2sindy.library.functions import Function, Interval
 
-# Evaluations of the right-hand side that a run may take: a hundred times what an oscillation
-# takes that its samples resolve. A model that blows up in steps ever smaller stops there.
+# Largest number of evaluations of the right-hand side in a run: a hundred times what an oscillation
+# needs that its samples resolve. A model that blows up in ever smaller steps stops there.
 CALLS, CALLS_PER_SAMPLE = 20_000, 200
 EXPLICIT, IMPLICIT = "DOP853", "Radau"
-# Whether a run is stiff is asked after so many evaluations, and each time that they have doubled.
+# Stiffness is tested after FIRST_LOOK evaluations, and each time that their number has doubled.
 FIRST_LOOK, CALLS_PER_STEP = 5_000, 12
-STABLE = 2.0  # the fastest rate times a step, which accuracy keeps well below and stability below 6
-# Evaluations of compiled equations after which the clock is looked at: a tenth of a second.
+# Fastest decay rate times step above which a run counts as stiff. Accuracy keeps this product well
+# below the bound, stability below 6.
+STABLE = 2.0
+# Evaluations of compiled equations between readings of the clock: about a tenth of a second.
 CALLS_PER_LOOK = 100_000
 
 Rates = Callable[[float, np.ndarray], np.ndarray]
-Clock = Callable[[], float]  # seconds that have passed since whenever
+Clock = Callable[[], float]  # seconds since an arbitrary origin
 
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """A right-hand side of products of scaled states and of inputs, which can be compiled.
+    """Right-hand side made of products of states and inputs, which compiled code can evaluate.
 
-    table: which columns each term multiplies, of the states, the inputs and a one. coef: in units
-    of the scale. breaks, pieces: the inputs as cubics in the time since the last break.
+    table: indices of the columns that each term multiplies; columns are the states, the inputs
+    and a one. coef: in units of the scale. breaks, pieces: the inputs as cubics in the time since
+    the last break.
     """
 
     table: Int[np.ndarray, "terms degree"]
@@ -47,20 +52,20 @@ class Products:
         from ep2sindy.model import kernels
 
         slope, columns = np.empty(len(y)), np.ones(len(y) + self.pieces.shape[2] + 1)
-        # Copied: of a column or of what is read only, kernels would be compiled anew.
+        # Copied: kernels would be compiled again for a strided or read-only array.
         kernels.rates(self.parts, float(t), np.array(y), columns, slope)
         return slope
 
     @cached_property
     def parts(self) -> tuple[np.ndarray, ...]:
-        """What compiled functions take: see `model.kernels`."""
+        """Arguments of the compiled functions; see `model.kernels`."""
         parts = self.table, self.coef, self.scale, self.breaks, self.pieces
         return tuple(np.array(part, order="C") for part in parts)
 
 
 @cache
 def scheme() -> tuple[np.ndarray, ...]:
-    """Coefficients of the explicit method, from SciPy's table of them: see `model.kernels`."""
+    """Coefficients of the explicit method, from SciPy's tables; see `model.kernels`."""
     from scipy.integrate import DOP853
 
     tables = (
@@ -74,7 +79,7 @@ def scheme() -> tuple[np.ndarray, ...]:
 class Solved:
     """States at the times that were reached, and how the run ended.
 
-    edge: of the domain that it left, if it did.
+    edge: the edge of the domain that the run left; None if it left none.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -86,7 +91,7 @@ class Solved:
 
 @dataclass
 class Counted:
-    """A right-hand side that may be evaluated so many times, and that knows its border."""
+    """Right-hand side with a budget of evaluations and time, and with its domain's border."""
 
     rates: Rates
     border: Border
@@ -105,12 +110,12 @@ class Counted:
         self.calls += 1
         if edge := self.border.beyond(t, y):
             self.beyond, self.beyond_s = edge, t
-        elif t > self.beyond_s and np.isfinite(y).all():  # a step too long has been mended
+        elif t > self.beyond_s and np.isfinite(y).all():  # a shorter step stayed in the domain
             self.beyond = None
         return self.rates(t, y)
 
     def left_s(self, t: float, y: np.ndarray) -> float:
-        """Time until the run is given up, which is when it is first asked with nothing left."""
+        """Integration time until the run is given up: when first called with no budget left."""
         if self.given_up_s == np.inf:
             if self.calls > self.look_at:
                 self.look_at *= 2
@@ -120,7 +125,7 @@ class Counted:
         return self.given_up_s - t
 
     def _is_stiff(self, t: float, y: np.ndarray) -> bool:
-        """Whether steps are short because the fastest part decays, and not to follow the run."""
+        """True if a fast decaying mode limits the steps by stability, rather than accuracy."""
         fastest = fastest_rate(self.rates, t, y)
         step_s = CALLS_PER_STEP * (t - self.began_s) / self.calls
         return bool(fastest.real < -abs(fastest.imag) and abs(fastest) * step_s > STABLE)
@@ -128,11 +133,11 @@ class Counted:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What one method made of a run: states at the times reached, and why it stopped there.
+    """Part of a run integrated by one method: states at the times reached, and why it stopped.
 
-    status: of SciPy's `solve_ivp`, 0 at the end, 1 at an event and -1 where steps became too
-    small. last_s, last: the time and state of the event, if there was one. crossed: whether that
-    was a border of the equations' domain.
+    status: as in SciPy's `solve_ivp`, 0 at the end, 1 at an event and -1 if steps became too
+    small. last_s, last: time and state of the event, if there was one. crossed: true if the event
+    was the border of the equations' domain.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -156,11 +161,12 @@ def solve_stages(
     limit_s: float,
     clock: Clock = monotonic,
 ) -> Solved:
-    """From y over t, until a state exceeds `blow_up`, a domain is left or the budget is spent.
+    """Integrate from y over t, first explicitly, then implicitly if the equations are stiff.
 
-    `Products` are integrated by compiled functions. A run whose steps stability keeps short goes
-    on from there by an implicit method, with as many evaluations again. bound: what `blow_up` is
-    a multiple of, in words. clock: what `limit_s` is measured by.
+    The run ends early if a state exceeds `blow_up`, leaves the domain or exhausts the budget.
+    `Products` are integrated by compiled functions. If stability limits the steps, an implicit
+    method continues the run, with the same number of evaluations again.
+    bound: the quantity that `blow_up` is a multiple of, in words. clock: measures `limit_s`.
     """
     began = clock()
     budget = CALLS + CALLS_PER_SAMPLE * len(t)
@@ -179,10 +185,10 @@ def solve_stages(
 def _implicit(
     before: Stage, rhs: Counted, t: np.ndarray, blow_up: float, bound: str, rtol: float
 ) -> Solved:
-    """The rest of a run that was stiff, behind what had been reached."""
+    """Continue a stiff run by the implicit method, and join both parts."""
     began, at, state = rhs.clock(), before.last_s, before.last
     assert state is not None, "a run that is found to be stiff has been stopped there"
-    # Never stiff itself: it does not say when it began.
+    # began_s is left at infinity, so that this part is never taken for stiff.
     rest = Counted(rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline)
     try:
         found = _scipy_stage(rest, IMPLICIT, np.append(at, t[t > at]), state, blow_up, rtol)
@@ -205,7 +211,7 @@ def _explicit_stage(
 def _scipy_stage(
     rhs: Counted, method: str, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
 ) -> Stage:
-    """Of one method; the first event is a blow-up or the end of the budget."""
+    """Integrate by one method of SciPy; the first event is a blow-up or the end of the budget."""
     from scipy.integrate import solve_ivp
 
     def ends(t: float, y: np.ndarray) -> float:
@@ -222,7 +228,7 @@ def _scipy_stage(
     met = [k for k, at in enumerate(found.t_events) if at.size] if found.status == 1 else []
     if not met:
         return Stage(times, states, found.status, found.message)
-    first = met[-1]  # a border comes before a budget that ends in the same step
+    first = met[-1]  # a border takes precedence over a budget that ends in the same step
     last_s, last = float(found.t_events[first][0]), found.y_events[first][0]
     return Stage(times, states, found.status, found.message, last_s, last, crossed=first == 1)
 
@@ -230,7 +236,7 @@ def _scipy_stage(
 def _compiled_stage(
     rhs: Counted, t: np.ndarray, y: np.ndarray, blow_up: float, rtol: float
 ) -> Stage:
-    """The explicit method, compiled: step by step what SciPy's does."""
+    """Integrate by the compiled explicit method, which takes the same steps as SciPy's."""
     from ep2sindy.model import kernels
 
     assert isinstance(rhs.rates, Products)
@@ -257,7 +263,7 @@ def _compiled_stage(
 def _first_step(
     rates: Rates, t: float, span: float, y: np.ndarray, slope: np.ndarray, rtol: float
 ) -> float:
-    """By the size of the first two derivatives: Hairer, Norsett & Wanner 1993, II.4."""
+    """First step size from the first two derivatives: Hairer, Norsett & Wanner 1993, II.4."""
     allowed = rtol + np.abs(y) * rtol
     size, fast = (float(np.sqrt(np.mean(np.square(v / allowed)))) for v in (y, slope))
     h = min(1e-6 if size < 1e-5 or fast < 1e-5 else 0.01 * size / fast, span)
@@ -270,7 +276,7 @@ def _first_step(
 
 
 def fastest_rate(rates: Rates, t: float, y: np.ndarray) -> complex:
-    """Eigenvalue of the largest size of the linearization, in 1/s; zero where there is none."""
+    """Eigenvalue of largest modulus of the Jacobian, in 1/s; zero if it is not finite."""
     steps = 1e-7 * np.maximum(np.abs(y), 1e-3)
     with np.errstate(all="ignore"):
         ahead, behind = ([rates(t, y + s * step) for step in np.diag(steps)] for s in (1.0, -1.0))
@@ -291,7 +297,7 @@ def _outcome(found: Stage, rhs: Counted, blow_up: float, bound: str, took_s: flo
 
 
 def _left(found: Stage, rhs: Counted) -> Edge | None:
-    """The edge that a run ended at, if it did: crossed, or too steep for a solver to cross."""
+    """Edge at which a run ended, if any: crossed, or too steep for the solver to cross."""
     if found.crossed and found.last is not None:
         return rhs.border.nearest(found.last_s, found.last)
     return rhs.beyond if found.status == -1 else None
@@ -313,14 +319,15 @@ def _text(found: Stage, rhs: Counted, blow_up: float, bound: str, took_s: float)
     return f"the solver stopped at t = {last:.6g} s: {found.message}"
 
 
-# Where a run leaves the domain of its model's functions, such as log(x) at x = 0.
+# Edges at which a run leaves the domain of its model's functions, such as x = 0 for log(x).
 
 
 @dataclass(frozen=True)
 class Edge:
-    """A function, the place of its variable among values, and the interval its argument is in.
+    """A function and the interval of its domain in which a run starts.
 
-    interval: None where the start is in none.
+    place: index of the function's variable among the values. interval: None if the start is
+    outside the domain.
     """
 
     function: Function
@@ -328,7 +335,7 @@ class Edge:
     interval: Interval | None
 
     def margin(self, values: Float[np.ndarray, " known"]) -> float:
-        """How far the argument is inside; zero or less where it has left."""
+        """Distance of the argument to the nearer end of its interval; zero or less outside."""
         argument = self.function.scale * values[self.place] + self.function.shift
         low, high = self.interval or (np.inf, -np.inf)
         return float(min(argument - low, high - argument))
@@ -341,7 +348,7 @@ class Edge:
 def edges_of(
     functions: Sequence[Function], known: Sequence[str], start: Float[np.ndarray, " known"]
 ) -> tuple[Edge, ...]:
-    """Where functions end, on either side of where a run starts; sin(x) has no end."""
+    """Edges of the domains of functions around the start of a run; sin(x) has none."""
     edges = []
     for function in functions:
         place = list(known).index(function.variable)
@@ -353,9 +360,9 @@ def edges_of(
 
 @dataclass(frozen=True)
 class Border:
-    """All edges of a model along one run: an event for a solver, which ends there.
+    """All edges of a model along one run, as a terminal event for a solver.
 
-    values: time in s and scaled states -> states and inputs in SI.
+    values: function of time in s and scaled states; returns states and inputs in SI.
     """
 
     edges: tuple[Edge, ...]
@@ -371,7 +378,7 @@ class Border:
         return min(self.edges, key=lambda edge: edge.margin(at))
 
     def beyond(self, t: float, y: np.ndarray) -> Edge | None:
-        """An edge that a state lies beyond, if any."""
+        """First edge that the state lies beyond; None if there is none."""
         if not self.edges:
             return None
         at = self.values(t, y)

@@ -1,4 +1,4 @@
-"""The limit cycle of a free model: closed orbit, Floquet multipliers, starts that reach it."""
+"""Limit cycle of a model without inputs: closed orbit, Floquet multipliers, basin of attraction."""
 
 from __future__ import annotations
 
@@ -15,27 +15,29 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scaled import ScaledModel
 from ep2sindy.runtime.arrays import read_only
 
-# A modulus this close to one is neutral: a departure takes a thousand periods or more to change
-# e-fold, longer than any record. The multipliers themselves are exact to 1e-6 or better.
+# A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
+# a thousand periods to change e-fold, longer than any record. The multipliers themselves are exact
+# to 1e-6 or better.
 NEUTRAL_WITHIN = 1e-3
 
-# Where no orbit is closed from the start, Newton's method begins again this many periods on.
+# If no orbit is found near the start, Newton's method begins again this many periods later.
 N_SETTLING = 10
 
-# A start has reached the cycle if, over its last periods, it stays this close to the curve.
+# A start has reached the cycle if it stays within REACHED_WITHIN of the curve over the last N_LATE
+# periods.
 REACHED_WITHIN, N_LATE = 0.1, 3.0
 
-# Steps to a period, at least; and the longest step times the norm of the Jacobian, well inside
-# what the scheme of fourth order is stable for (2.8).
+# Least number of steps per period, and the largest step times the norm of the Jacobian, well inside
+# the stability limit of the fourth-order scheme (2.8).
 MIN_STEPS, STEP_TIMES_RATE = 64, 1.0
 
-# Given up as diverged: this many times as far from the cycle's mean as the farthest start; as
-# stuck: after this many times the steps that the cycle itself takes.
+# A run is given up as diverged when it is BLOW_UP times as far from the cycle's mean as the
+# farthest start, and as stuck after PATIENCE times the steps that the cycle itself takes.
 BLOW_UP, PATIENCE = 30.0, 4.0
 
 
 class CycleStability(StrEnum):
-    """What becomes of a small departure from a cycle: it dies out, stays, or grows."""
+    """Stability of a cycle: a small departure from it decays, persists, or grows."""
 
     ATTRACTING = "attracting"
     NEUTRAL = "neutral"
@@ -44,11 +46,11 @@ class CycleStability(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class LimitCycle:
-    """A periodic orbit of an autonomous model, and what a small departure from it becomes.
+    """A periodic orbit of an autonomous model, with its Floquet multipliers.
 
-    states: over one period, evenly spaced, the first not repeated, in SI. multipliers: Floquet's,
-    that of the flow itself (1) first, the others by falling modulus: a departure is multiplied by
-    them in every period.
+    states: over one period, evenly spaced, the first not repeated, in SI. multipliers: Floquet
+    multipliers, by which a small departure grows in every period; that of the flow itself (1)
+    first, the others by decreasing modulus.
     """
 
     period_s: float
@@ -70,7 +72,10 @@ class LimitCycle:
 
     @property
     def stability(self) -> CycleStability:
-        """By the largest modulus of the multipliers but the flow's: neutral within 1e-3 of one."""
+        """Stability by the largest modulus of the multipliers other than that of the flow.
+
+        Neutral if it is within 1e-3 of one.
+        """
         largest = float(np.abs(self.multipliers[1:]).max(initial=0.0))
         if abs(largest - 1.0) <= NEUTRAL_WITHIN:
             return CycleStability.NEUTRAL
@@ -84,16 +89,16 @@ def limit_cycle(
     period_s: float,
     n_samples: int = 128,
 ) -> LimitCycle | None:
-    """The closed orbit next to a state, by Newton's method on the return after one period.
+    """Closed orbit near a state, by Newton's method on the return after one period.
 
     start: near the cycle, in SI. period_s: a guess, within 30 %.
     Unknowns are the state, which moves across the flow, and the period. Steps are of least norm:
-    where closed orbits come in families (predator and prey), the neighbouring one is found.
-    Where none is found, it begins again ten periods on, nearer to a cycle that attracts, and at
-    last backwards in time, where one that repels attracts.
-    Returns None where the states diverge, Newton's method closes no orbit with a period of half
-    to twice the guess, or it ends on a fixed point. Where the guess is several periods, the least
-    one is returned.
+    if closed orbits form a family (predator and prey), a neighbouring one is found.
+    If no orbit is found, the search begins again ten periods later, nearer to an attracting cycle,
+    and finally backwards in time, where a repelling cycle attracts.
+    Returns None if the states diverge, Newton's method finds no closed orbit with a period of half
+    to twice the guess, or it ends on a fixed point. If the guess is several periods, the orbit
+    with the least period is returned.
     Raises ValueError for a model with inputs, or a wrong start, period or number of samples.
     Source: Seydel 2010, Practical Bifurcation and Stability Analysis, chapter 7.
     """
@@ -109,7 +114,7 @@ def limit_cycle(
         return _backwards(model, start, period_s=period_s, n_samples=n_samples)
     if cycle.stability is not CycleStability.REPELLING:
         return cycle
-    # Forwards, such an orbit magnifies the solver's errors: backwards, it forgets them.
+    # Near a repelling orbit the solver's errors grow forwards in time and decay backwards.
     start, period_s = cycle.states[0], cycle.period_s
     return _backwards(model, start, period_s=period_s, n_samples=n_samples) or cycle
 
@@ -117,7 +122,7 @@ def limit_cycle(
 def _cycle(
     model: SparseModel, run: np.ndarray | None, *, period_s: float, n_samples: int
 ) -> LimitCycle | None:
-    """By Newton's method from where a run begins; None, too, where that diverged."""
+    """Cycle by Newton's method from the first state of a run; None also if the run diverged."""
     if run is None:
         return None
     orbit = find_closed_orbit(model, run, period_s=period_s, n_samples=n_samples)
@@ -129,7 +134,7 @@ def _cycle(
 def _backwards(
     model: SparseModel, start: np.ndarray, *, period_s: float, n_samples: int
 ) -> LimitCycle | None:
-    """The cycle of the model in reversed time, told in forward time."""
+    """Cycle found in reversed time, converted to forward time."""
     reverse = replace(model, coef=-model.coef, covariance=None)
     run = free_run(reverse, start, period_s=period_s, n_periods=RETURNS[1])
     cycle = _cycle(reverse, run, period_s=period_s, n_samples=n_samples)
@@ -148,16 +153,16 @@ def share_reaching(
     n_periods: float = 40.0,
     spread: tuple[float, float] = (0.3, 3.0),
 ) -> float:
-    """Share of starts that end on a cycle, staying within 0.1 of it over three last periods.
+    """Share of starts that end on a cycle: within 0.1 of it over their last three periods.
 
-    Distances are to the cycle's curve, states in units of their standard deviation on it; the
-    last periods must pass all its quarters, too.
-    Starts fill a box (Halton's points: nothing random). A state that keeps one sign on the cycle
-    takes values from spread[0] to spread[1] times its mean, evenly in the logarithm; one that
-    does not, its mean plus or minus spread[1] times half its range, evenly.
-    Every start takes its own steps: a 64th of the period, or where that is less, one over the
-    norm of the Jacobian. It is given up 30 times as far from the cycle's mean as the farthest
-    start, or once it has taken four times the steps that the cycle takes.
+    Distances are to the cycle's curve, with states in units of their standard deviation on it.
+    In the last periods a run must also pass through all quarters of the cycle.
+    Starts fill a box (Halton points, so nothing is random). A state that keeps one sign on the
+    cycle takes values from spread[0] to spread[1] times its mean, evenly in the logarithm. Any
+    other state takes values within spread[1] times half its range of its mean, evenly.
+    Every start has its own time step: a 64th of the period, or one over the norm of the Jacobian
+    if that is less. A run is given up when it is 30 times as far from the cycle's mean as the
+    farthest start, or after four times the steps that the cycle takes.
     Raises ValueError for a model with inputs, a cycle of another model or a wrong setting.
     """
     _check_reach(model, cycle, n_starts=n_starts, n_periods=n_periods, spread=spread)
@@ -173,7 +178,7 @@ def share_reaching(
 def _on_cycle(
     scaled: ScaledModel, y: np.ndarray, curve: np.ndarray, n_periods: float, n_steps: int
 ) -> int:
-    """How many of the starts (n_states, starts) follow the curve for the last periods."""
+    """Number of starts (n_states, starts) that follow the curve over the last periods."""
     from scipy.spatial import KDTree
 
     nearest = KDTree(_interpolate(curve))
@@ -184,7 +189,7 @@ def _on_cycle(
         running = t < n_periods
         if not running.any():
             break
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is dropped
+        with np.errstate(over="ignore", invalid="ignore"):  # runs that overflow are dropped
             step = np.where(running, _steps(scaled, y), 0.0)
             y = rk4_step(lambda x, _: scaled.slope(x), y, (t, t, t), step)
             t = t + step
@@ -200,13 +205,13 @@ def _on_cycle(
 
 
 def _steps(scaled: ScaledModel, y: np.ndarray) -> np.ndarray:
-    """The step at every state (n_states, points), in periods."""
+    """Time step at every state (n_states, points), in periods."""
     return STEP_TIMES_RATE / np.maximum(scaled.rate(y), STEP_TIMES_RATE * MIN_STEPS)
 
 
 def _interpolate(curve: np.ndarray) -> np.ndarray:
-    """The closed curve through the samples, at sixteen points to each."""
-    from scipy.interpolate import CubicSpline  # a quarter of a second that most do not need
+    """Closed curve through the samples, with sixteen points per sample."""
+    from scipy.interpolate import CubicSpline  # import takes 0.25 s, and is seldom needed
 
     n = len(curve)
     spline = CubicSpline(np.arange(n + 1), np.append(curve, curve[:1], axis=0), bc_type="periodic")
@@ -214,7 +219,7 @@ def _interpolate(curve: np.ndarray) -> np.ndarray:
 
 
 def _starts(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:
-    """(starts, n_states), see `share_reaching`."""
+    """Starts (starts, n_states); see `share_reaching`."""
     share = _halton(n_starts, states.shape[1])
     mean = states.mean(axis=0)
     reach = spread[1] * 0.5 * np.ptp(states, axis=0)
@@ -225,9 +230,9 @@ def _starts(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> n
 
 
 def _halton(n: int, n_dimensions: int) -> np.ndarray:
-    """(n, n_dimensions): the first points of Halton's sequence but the one at zero.
+    """First points of Halton's sequence, without the one at zero, (n, n_dimensions).
 
-    To the last digit those of `scipy.stats.qmc`, which takes half a second to import.
+    They equal those of `scipy.stats.qmc` to the last digit; its import takes half a second.
     Source: Halton 1960, doi:10.1007/BF01386213.
     """
     points = np.zeros((n, n_dimensions))
@@ -290,41 +295,45 @@ def _check_reach(
 # Closed orbits of a free model: Newton's method on the return after one period.
 
 
-# Of the integrations: from the start, while Newton's method runs, and once the orbit is closed.
+# Relative tolerances of the integrations: from the start, during Newton's method, and for the
+# closed orbit.
 START_RTOL, RTOL, FINAL_RTOL = 1e-6, 1e-9, 1e-11
 
-# A period takes 30 to 300 steps; a run that takes this many, stiff on its way to infinity, is lost.
+# A period takes 30 to 300 steps. A run that takes this many is stiff while it diverges, and is
+# given up.
 MAX_STEPS = 1000
 
-# A state this many standard deviations (of the first run: times its first size) away is lost, too.
+# A run is also given up when a state has moved this far: in standard deviations, or for the first
+# run in units of its initial size.
 ORBIT_BLOW_UP, START_BLOW_UP = 1e3, 1e4
 
-# A return this close, times what the orbit amplifies, is closed to within what RTOL resolves.
+# An orbit counts as closed if its gap is below this value times the amplification over one period,
+# which is the accuracy that RTOL allows.
 CLOSED_WITHIN = 1e-7
 
-# Steps of Newton's method, shortened ones included; the longest, in standard deviations, and a
-# fifth of it for the period, in guessed ones.
+# Largest number of Newton steps, shortened ones included; and the longest step of the state, in
+# standard deviations. The longest step of the period is a fifth of LONGEST, in guessed periods.
 N_NEWTON, LONGEST = 25, 1.0
 
-# Singular values below this share of the largest are zero: along a family of closed orbits.
+# Singular values below this share of the largest count as zero: the direction of an orbit family.
 RCOND = 1e-7
 
-# Where the first return is looked for, and where the period must lie, in guessed ones.
+# Search range of the first return, and allowed range of the period, in guessed periods.
 RETURNS, PERIODS = (0.7, 1.3), (0.5, 2.0)
 
-# What oscillates less than this share of the first run's standard deviation is a fixed point.
+# An orbit that varies less than this share of the first run's standard deviation is a fixed point.
 STILL = 1e-3
 
-# Samples of a run to a guessed period.
+# Samples of a run per guessed period.
 N_SAMPLES = 200
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedOrbit:
-    """An orbit of least period, in units of `scale` and of the guessed period.
+    """A closed orbit over its least period, in units of `scale` and of the guessed period.
 
-    states: evenly spaced, the first not repeated. monodromy: derivatives of the state after a
-    period by the first one. flow: the slope there.
+    states: evenly spaced, the first not repeated. monodromy: derivatives of the state after one
+    period by the initial state. flow: right-hand side at the initial state.
     """
 
     period: float
@@ -335,10 +344,10 @@ class ClosedOrbit:
 
     @property
     def multipliers(self) -> Complex[np.ndarray, " n_states"]:
-        """One for the flow, then those of departures across it, by falling modulus.
+        """Floquet multipliers: 1 for the flow, then those across it by decreasing modulus.
 
-        The flow is an eigenvector of 1; in a basis that begins with it the rest is a block of
-        its own, so that a second multiplier of 1 is not split by rounding.
+        The flow is an eigenvector for the multiplier 1. In a basis that begins with it the other
+        multipliers belong to a separate block, so rounding does not split a second multiplier of 1.
         """
         basis = np.linalg.qr(self.flow[:, None], mode="complete")[0]
         others = np.linalg.eigvals((basis.T @ self.monodromy @ basis)[1:, 1:])
@@ -347,7 +356,7 @@ class ClosedOrbit:
 
 @dataclass(frozen=True, eq=False)
 class _Path:
-    """A state and, behind it, departures from it, integrated; `at` works where it was kept."""
+    """Integrated state followed by its departures; `at` needs the dense output to be kept."""
 
     end: np.ndarray
     times: list[float]
@@ -360,8 +369,8 @@ class _Path:
 def free_run(
     model: SparseModel, start: Float[np.ndarray, " n_states"], *, period_s: float, n_periods: float
 ) -> Float[np.ndarray, "samples n_states"] | None:
-    """States from a start on, N_SAMPLES to a period; None where they diverge."""
-    # What starts near zero is as large as its first rate makes it; what stays there, one.
+    """States of a free run from a start, N_SAMPLES per period; None if they diverge."""
+    # The size of a state that starts near zero is its initial rate times the period, or else one.
     size = np.maximum(np.abs(start), np.abs(model.derivative(start, np.empty(0))) * period_s)
     size = np.where(size > 0.0, size, 1.0)
     scaled = ScaledModel.of(model, size, period_s)
@@ -380,9 +389,9 @@ def find_closed_orbit(
     period_s: float,
     n_samples: int,
 ) -> ClosedOrbit | None:
-    """The orbit next to where a `free_run` begins; its closest return begins the search.
+    """Closed orbit near the first state of a `free_run`; its closest return starts the search.
 
-    None where Newton's method does not close it, or ends on a fixed point.
+    None if Newton's method does not close the orbit, or ends on a fixed point.
     """
     scale = deviations(run)
     scaled = ScaledModel.of(model, scale, period_s)
@@ -396,7 +405,7 @@ def find_closed_orbit(
     path = _path(scaled, np.append(y, np.eye(n)), period, rtol=FINAL_RTOL, keep=True)
     if path is None:
         return None
-    # A guess of several periods is met by several turns.
+    # If the guess was several periods, the orbit found is traversed several times.
     turns = (k for k in range(6, 1, -1) if np.abs(path.at(period / k)[:n] - y).max() < 1e-4)
     period /= next(turns, 1)
     states = path.at(np.arange(n_samples) * (period / n_samples))[:n].T
@@ -409,7 +418,7 @@ def find_closed_orbit(
 
 
 def deviations(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarray, " n_states"]:
-    """Standard deviations; of a state that stands still its size, at zero one."""
+    """Standard deviations of the states; the size of a constant state, or one if it is zero."""
     std, size = states.std(axis=0), np.abs(states).max(axis=0)
     return np.where(std > 1e-9 * size, std, np.where(size > 0.0, size, 1.0))
 
@@ -417,7 +426,7 @@ def deviations(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarra
 def _close_orbit(
     scaled: ScaledModel, y: np.ndarray, period: float
 ) -> tuple[np.ndarray, float] | None:
-    """State and period of a closed orbit, by Newton steps of least norm, halved where they fail."""
+    """State and period of a closed orbit, by Newton steps of least norm, halved if they fail."""
     n = len(y)
     base, step, best = np.append(y, period), np.zeros(n + 1), np.inf
     for _ in range(N_NEWTON):
@@ -435,7 +444,7 @@ def _close_orbit(
         monodromy = path.end[n:].reshape(n, n).T
         step = _newton_step(scaled, base[:n], path.end[:n], monodromy)
         if missed <= CLOSED_WITHIN * max(1.0, float(np.linalg.norm(monodromy, 2))):
-            base += step  # it costs nothing more, and squares what is missed
+            base += step  # this step costs no further integration, and squares the remaining error
             return base[:n], float(base[n])
     return None
 
@@ -443,7 +452,7 @@ def _close_orbit(
 def _newton_step(
     scaled: ScaledModel, y: np.ndarray, reached: np.ndarray, monodromy: np.ndarray
 ) -> np.ndarray:
-    """Of the state, across the flow, and of the period."""
+    """Newton step of the state, across the flow, and of the period."""
     n = len(y)
     here, there = scaled.slope(np.stack([y, reached], axis=1)).T
     equations = np.zeros((n + 1, n + 1))
@@ -464,10 +473,10 @@ def _path(
     blow_up: float = ORBIT_BLOW_UP,
     keep: bool = False,
 ) -> _Path | None:
-    """From a state and departures, over scaled time; None where it is lost."""
+    """Integrate a state and departures over scaled time; None if the run is given up."""
     n = scaled.n_states
     times, pieces = [0.0], []
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is lost
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that overflows is given up
         solver = DOP853(scaled.with_departures(), 0.0, y, span, rtol=rtol, atol=rtol)
         for _ in range(MAX_STEPS):
             solver.step()
@@ -482,7 +491,7 @@ def _path(
 
 
 def _without_rounding(states: np.ndarray) -> np.ndarray:
-    """Scaled states that stand still, or at zero, to within the solver's error do so exactly."""
+    """Make scaled states that are constant, or zero, within the solver's error exactly so."""
     mean = states.mean(axis=0)
     still = np.ptp(states, axis=0) < 1e-6
     return np.where(still, np.where(np.abs(mean) < 1e-6, 0.0, mean), states)

@@ -1,4 +1,4 @@
-"""A model as text: JSON that gives back every number exactly."""
+"""Storage of models as JSON text, from which every number is restored exactly."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FORMAT = "ep2sindy.SparseModel/1"
 
 Model = TypeVar("Model")
 
-ROUNDING = 1e-6  # of a correlation
+ROUNDING = 1e-6  # tolerance for rounding errors in a correlation
 
 
 def model_text(
@@ -30,7 +30,7 @@ def model_text(
     provenance: Mapping[str, str],
     covariance: Float[np.ndarray, "_ _"] | None,
 ) -> str:
-    """Everything in the model; floats in their shortest exact form."""
+    """JSON text of the whole model; floats in their shortest exact form."""
     content = {
         "format": FORMAT,
         "states": list(equations),
@@ -45,10 +45,11 @@ def model_text(
 
 
 def read_model(text: str, make: Callable[..., Model]) -> Model:
-    """Inverse of `model_text`: make(library, equations, units=, provenance=, covariance=).
+    """Read the text of `model_text` and build the model by `make`.
 
-    Terms are read by name: no code runs, and a user's own function must be registered before.
-    Raises ValueError for anything else, also where it is `make` that refuses it.
+    `make` is called as make(library, equations, units=, provenance=, covariance=). Terms are read
+    by name: no code from the file runs, and user functions must be registered beforehand.
+    Raises ValueError for any other text, also if `make` rejects the content.
     """
     try:
         content = read_json(text)
@@ -74,7 +75,7 @@ def read_model(text: str, make: Callable[..., Model]) -> Model:
 
 
 def read_stored(path: Path, read: Callable[[str], Model]) -> Model:
-    """Read a file of JSON; what is wrong with it says which file it was.
+    """Read a JSON file with `read`; error messages name the file.
 
     Raises UnknownFunctionError or another ValueError.
     """
@@ -88,7 +89,7 @@ def read_stored(path: Path, read: Callable[[str], Model]) -> Model:
 
 
 def names_in(value: Any) -> list[str]:
-    """A list of texts, each once."""
+    """Check that `value` is a list of distinct strings, and return it."""
     if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
         raise ValueError(f"a list of names was to come, and not {value!r:.80}")
     if len(set(value)) < len(value):
@@ -97,7 +98,7 @@ def names_in(value: Any) -> list[str]:
 
 
 def _numbers(terms: Any, state: str) -> dict[str, float]:
-    """Coefficients by term, finite ones."""
+    """Coefficients by term; ValueError unless they are finite numbers."""
     for name, value in terms.items():
         if type(value) not in (int, float) or not np.isfinite(float(value)):
             raise ValueError(
@@ -113,7 +114,10 @@ def texts_in(value: Any, what: str) -> dict[str, str]:
 
 
 def covariance_in(rows: Any) -> Float[np.ndarray, "_ _"]:
-    """Rows of a stored matrix, which may be empty, and must be one that a covariance can be."""
+    """Covariance from the rows of a stored matrix, which may be empty.
+
+    Raises ValueError unless the matrix is finite, symmetric and positive semidefinite.
+    """
     if not all(type(value) in (int, float) for row in rows for value in row):
         raise ValueError("a covariance that is not of numbers")
     found = np.array(rows, dtype=np.float64).reshape(len(rows), len(rows))

@@ -1,4 +1,4 @@
-"""Refinement: coefficients fitted to integrated trajectories; PyTorch lives here."""
+"""Refinement: coefficients fitted to integrated trajectories; only this package uses PyTorch."""
 
 from ep2sindy._stubs import attach
 

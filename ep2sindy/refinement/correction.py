@@ -1,4 +1,4 @@
-"""A known right-hand side plus a learned one: a torch module trained along with a sparse model."""
+"""Known right-hand side plus a learned term: a torch module trained along with a sparse model."""
 
 from __future__ import annotations
 
@@ -30,28 +30,30 @@ from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 
-# Where nobody says otherwise.
+# Default settings and method.
 SETTINGS = RefinementSettings(n_reweights=0)
 DESCENT = GradientDescent(max_iter=60, tolerance=1e-3, patience=5)
 
-# A step is fine enough when half of it moves the trajectories by less than either of these.
-ERROR_PER_RESIDUAL, MIN_ERROR = 0.1, 1e-3  # rms, the second in std
+# A step is fine enough if halving it changes the trajectories (rms, in std) by less than the larger
+# of these: a share of the rms residual, and an absolute value.
+ERROR_PER_RESIDUAL, MIN_ERROR = 0.1, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
     """A model and a learned term whose sum follows the data, x' = model + learned.
 
-    model: the known part, its coefficients trained, without covariance: a flexible term can
-    imitate the known ones, so the data fix the sum and not its parts. Name the learned term,
-    add it to the model and `refine` that for coefficients with errors.
+    model: the known part with trained coefficients, without covariance: a flexible term can
+    imitate the known ones, so the data determine the sum and not its parts. For coefficients with
+    errors, identify the learned term, add it to the model and `refine` the result.
     correction: a trained copy, in float64 on the CPU. It takes states, then inputs, in units of
-    `scale` and returns the learned derivative in units of `rate`; both in SI.
-    loss_before: of the known part alone, as given, from the data's own initial states, infinite
-    if it blows up. loss: mean of window_loss, the mean square of (trajectory - data) / std.
-    status: converged; max_iter; coarse_step: the learned term makes up for the error of the time
-    step; flat: no better than a constant; non_finite: what was given comes back.
-    history: one entry per iteration. trajectories: the fitted states in SI; data cut by `batch`.
+    `scale`, and returns the learned derivative in units of `rate`; scale and rate are in SI.
+    loss_before: loss of the known part alone, as given, from the data's own initial states;
+    infinite if it blows up. loss: mean of window_loss, the mean square of (trajectory - data) / std
+    in each window.
+    status: converged; max_iter; coarse_step: the learned term compensates the error of the time
+    step; flat: no better than a constant; non_finite: the model and term given are returned.
+    history: one entry per iteration. trajectories: the fitted states in SI, in windows of `batch`.
     """
 
     model: SparseModel
@@ -71,9 +73,9 @@ class Corrected:
         states: Float[np.ndarray, "... n_states"],
         inputs: Float[np.ndarray, "... n_inputs"] | None = None,
     ) -> Float[np.ndarray, "... n_states"]:
-        """What the correction adds to the derivative, in SI; inputs in the order of the model's.
+        """Learned part of the derivative, in SI; inputs are in the order of the model's.
 
-        Far from the samples it was trained on, it means nothing.
+        It is meaningless far from the samples on which it was trained.
         Raises ValueError if the columns are not the model's states and inputs.
         """
         values = states if inputs is None else np.concatenate([states, inputs], axis=-1)
@@ -109,15 +111,15 @@ def refine_with_correction(
 ) -> Corrected:
     """Train x' = model + correction(states, inputs) to follow windows of the trajectories.
 
-    correction: maps (rows, states + inputs) to (rows, states): each state in units of its
-    standard deviation, each input of its rms, to a derivative of which one is as much as the
-    known part has over the data. Best zero at first (last layer of zeros), so that training
-    starts from the known part. It is copied; its initial weights, and so the only randomness
-    besides the windows, are the caller's: seed them by torch.manual_seed.
-    n_windows to n_reweights: in place of what `settings` say, as in `refine`; no reweighting if
-    left out. window: short at first: long windows of a model that lacks a term are hard to
-    follow. method: None means GradientDescent(max_iter=60, tolerance=1e-3, patience=5).
-    constraint: relations, or known coefficients that shall not move. The rest as in `refine`.
+    correction: maps (rows, states + inputs) to (rows, states). Each state is in units of its
+    standard deviation, each input of its rms; the derivative is in units of the known part's rms
+    over the data. It is best zero initially (last layer of zeros), so that training starts from
+    the known part. It is copied. Its initial weights come from the caller and are the only
+    randomness besides the windows: seed them by torch.manual_seed.
+    n_windows to n_reweights: override `settings`, as in `refine`; no reweighting if left out.
+    window: begin with short ones, since a model that lacks a term can hardly follow long windows.
+    method: None means GradientDescent(max_iter=60, tolerance=1e-3, patience=5). constraint:
+    relations, or known coefficients that are kept fixed. Other arguments are as in `refine`.
     Raises ValueError as `refine`, for a correction of the wrong shape, and for another method. A
     failed fit is a result: see `status`.
     Source: Rackauckas et al. 2020, arXiv:2001.04385.
@@ -143,7 +145,7 @@ def _train(
     observe: Callable[[Iteration], None],
     device: str,
 ) -> Corrected:
-    """From settings and trajectories to the result."""
+    """Cut windows, train the model with its correction, and assemble the result."""
     method = DESCENT if settings.method is None else settings.method
     if not isinstance(method, GradientDescent):
         raise ValueError(f"a learned correction is trained by GradientDescent alone: {method} came")
@@ -170,7 +172,7 @@ def _result(
     *,
     n_substeps: int,
 ) -> Corrected:
-    """Back to SI; what was given where the fit did not stay finite."""
+    """Result in SI; holds the model and term given if the fit did not stay finite."""
     (ode,), (batch,) = problem.odes, problem.batches
     nodes, window_loss, status = _judge(problem, fit, n_substeps)
     trained = status is not RefinementStatus.NON_FINITE
@@ -200,7 +202,7 @@ def _known_and_whole(
     constraint: Constraint | None,
     device: str,
 ) -> tuple[ODE, ODE]:
-    """The known part alone, and with a copy of the correction, of order one, added to it."""
+    """Modules of the known part alone, and of it plus a copy of the correction of order one."""
 
     def ode(term: nn.Module | None) -> ODE:
         return ODE(
@@ -228,7 +230,7 @@ class _Scaled(nn.Module):
 
 
 def _typical_rate(known: ODE, batch: WindowBatch) -> float:
-    """Rms of the known part over the windows, in std per sample; one where it vanishes."""
+    """Rms of the known part over the windows, in std per sample; one if it vanishes."""
     n_inputs = batch.inputs.shape[-1]
     values = np.concatenate([batch.data[:, :-1], batch.inputs[:, :, -1]], axis=-1)
     flat = torch.tensor(values.reshape(-1, known.n_states + n_inputs), device=known.free0.device)
@@ -252,7 +254,7 @@ def _check_shape(term: nn.Module, known: ODE, device: str) -> None:
 def _judge(
     problem: RefinementProblem, fit: RefinementFit, n_substeps: int
 ) -> tuple[np.ndarray, np.ndarray, RefinementStatus]:
-    """Trajectories in std, the loss of each window, and the gravest status that applies."""
+    """Trajectories in std, the loss of each window, and the most severe status that applies."""
     nodes, data = fit.nodes[0], problem.data[0]
     with np.errstate(over="ignore", invalid="ignore"):  # a blow-up is a status
         window_loss = np.square(nodes - data).mean(axis=(1, 2))
@@ -277,7 +279,7 @@ def _step_error(problem: RefinementProblem, nodes: np.ndarray, n_substeps: int) 
 
 
 def _loss_from_data(known: ODE, problem: RefinementProblem, n_substeps: int) -> float:
-    """Of a module that follows each window from its first sample."""
+    """Loss of a module integrated over each window from the window's first sample."""
     data = torch.tensor(problem.data[0], device=problem.device)
     with torch.no_grad():
         path = integrate(known, problem.whole, data[:, 0], data.shape[1], n_substeps)

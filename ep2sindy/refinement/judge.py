@@ -1,4 +1,4 @@
-"""Judge a fit: integrate it again, then loss, covariance, error of the step, and status."""
+"""Assessment of a fit: new integration, loss, covariance, error of the time step, and status."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from ep2sindy.refinement.methods.multiple_shooting import least_change, step_map
 from ep2sindy.refinement.problem import LawMap, Method, RefinementFit, RefinementProblem
 from ep2sindy.refinement.windows import WindowBatch
 
-FLAT = 0.95  # share of the loss of a constant from which on a model follows nothing
+FLAT = 0.95  # a model with more than this share of a constant's loss does not follow the data
 
-WIDE = 0.5  # standard error, relative to the coefficient: its 95 % interval reaches zero
+WIDE = 0.5  # relative standard error at which the 95 % interval of a coefficient reaches zero
 
 CLOSED = 1e-9  # largest gap, in std, between the steps of one trajectory
 
-CLOSING_STEPS = 10  # of Newton's method, until the gaps are
+CLOSING_STEPS = 10  # most Newton steps to close the gaps
 
-# A step counts as fine enough when the bias it leaves in a scaling is below either of these.
+# A step counts as fine enough if the bias that it causes in a scaling is below the larger of these:
+# a share of the standard error, and a share of the scaling.
 BIAS_PER_ERROR, MIN_BIAS = 0.1, 1e-4
 
-# A fit counts as stationary when one more Gauss-Newton step would gain less than this share of
-# the loss, or move no scaling by more.
+# A fit counts as stationary if one more Gauss-Newton step would reduce the loss by less than this
+# share, or change no scaling by more.
 STATIONARY = 1e-3
 
-# Independent windows that a sandwich needs, per scaling.
+# Independent windows per scaling that a sandwich covariance needs.
 CLUSTERS = 2.0
 
 
 class RefinementStatus(StrEnum):
-    """How a refinement ended; see `Refinement`."""
+    """Status of a finished refinement; see `Refinement`."""
 
     CONVERGED = "converged"
     MAX_ITER = "max_iter"
@@ -55,7 +56,7 @@ def status_of(
     settled: bool,
     coarse: Callable[[], bool],
 ) -> RefinementStatus:
-    """The gravest that applies; the time step is looked at where nothing else is wrong."""
+    """Most severe status that applies; the time step is checked only if nothing else is wrong."""
     if not finite:
         return RefinementStatus.NON_FINITE
     if flat:
@@ -70,18 +71,18 @@ def status_of(
 def is_flat(
     loss: float, data: Float[np.ndarray, "*points windows samples n_states"], *, free_start: bool
 ) -> bool:
-    """Whether constants do as well: each window's mean, or its first sample where that is given."""
+    """Return true if constants fit nearly as well: the means of windows, or their fixed starts."""
     level = data.mean(axis=-2, keepdims=True) if free_start else data[..., :1, :]
     return bool(loss > FLAT * np.square(data - level).mean())
 
 
 @dataclass(frozen=True, eq=False)
 class RefinementVerdict:
-    """One point of a fit, judged, or all points that a law ties.
+    """Assessment of one operating point of a fit, or of all points tied by a law.
 
     window_loss: mean square of (trajectory - data) / std in each window, point after point.
-    covariance, covariance_naive: of the unknowns, which are the scalings of a point or the theta
-    of a law.
+    covariance, covariance_naive: covariances of the unknowns, which are the scalings of a point or
+    the theta of a law.
     """
 
     status: RefinementStatus
@@ -93,9 +94,9 @@ class RefinementVerdict:
 def fit_and_judge(
     problem: RefinementProblem, method: Method
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
-    """Fit with steps as short as they must be, and judge the trajectories, integrated again.
+    """Fit, halving the time step as long as necessary, and judge the integrated trajectories.
 
-    Returns a verdict for each point, or a single one where a law ties them.
+    Returns the fit, and a verdict for each point or a single one if a law ties the points.
     """
     fit = method.fit(problem)
     closed, verdicts = judge(problem, fit)
@@ -112,9 +113,10 @@ def fit_and_judge(
 def judge(
     problem: RefinementProblem, fit: RefinementFit
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
-    """Verdicts on every point, or on all that a law ties; also the trajectories integrated again.
+    """Integrate the fit again, and return it with verdicts on its points.
 
-    A point that blows up makes all that a law ties to it not finite.
+    There is one verdict for each point, or a single one if a law ties the points. If one point
+    blows up, all points that a law ties to it count as not finite.
     """
     fit, maps = integrate(problem, fit)
     n_start, window = problem.n_start, fit.nodes.shape[2]
@@ -149,11 +151,11 @@ def _judge_points(
     bias: Float[np.ndarray, " unknowns"],
     change: Float[np.ndarray, " unknowns"],
 ) -> RefinementVerdict:
-    """Of points that share their unknowns.
+    """Verdict on points that share their unknowns.
 
     rows: each window's condensed residuals by the unknowns, right-hand side last.
     bias: change of the unknowns that the error of the time step causes, to first order.
-    change: of the unknowns by one more Gauss-Newton step.
+    change: change of the unknowns in one more Gauss-Newton step.
     """
     data = problem.data[points]
     n_residuals = data.size - problem.n_start * len(rows) - law.n_theta
@@ -182,7 +184,7 @@ def _judge_points(
 
 
 def _join_windows(batches: Sequence[WindowBatch]) -> WindowBatch:
-    """Windows of all points as if of one set: which ones overlap. The first's scale stands."""
+    """Join the windows of all points into one batch, to find overlaps; keeps the first scale."""
     if len(batches) == 1:
         return batches[0]
     offset = np.cumsum([0, *(batch.trajectory.max() + 1 for batch in batches)])
@@ -198,11 +200,11 @@ def _join_windows(batches: Sequence[WindowBatch]) -> WindowBatch:
 
 
 def integrate(problem: RefinementProblem, fit: RefinementFit) -> tuple[RefinementFit, np.ndarray]:
-    """Integrate every window from its fitted start; also the one-step maps along the way.
+    """Integrate every window from its fitted start; also returns the one-step maps.
 
-    All steps at once: Newton's method closes the gaps between them with starts and scalings
-    held, which converges to the trajectory itself. Where it does not, step after step.
-    Points that blow up come back as not finite.
+    All steps are integrated at once. Newton's method closes the gaps between them, with starts and
+    scalings held, and so converges to the trajectory itself. Points where it does not converge
+    are integrated step by step. Points that blow up are marked as not finite.
     """
     nodes, finite = fit.nodes.copy(), fit.finite.copy()
     points = np.arange(len(nodes))
@@ -230,9 +232,9 @@ def integrate(problem: RefinementProblem, fit: RefinementFit) -> tuple[Refinemen
 
 
 def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndarray:
-    """Trajectories from the fitted starts, as `integrate` closes them, window by window.
+    """Trajectories from the fitted starts, with gaps closed as in `integrate`, per window.
 
-    Returns (points, windows, samples, n_states), NaN in windows that do not close.
+    Returns (points, windows, samples, n_states); NaN in windows whose gaps do not close.
     """
     nodes, points = fit.nodes.copy(), np.arange(len(fit.nodes))
     start = np.zeros((*nodes.shape[:2], 1, nodes.shape[-1]))
@@ -250,7 +252,7 @@ def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndar
 
 
 def rollout(problem: RefinementProblem, fit: RefinementFit, *, n_substeps: int = 4) -> np.ndarray:
-    """Integrate every window step after step by torchdiffeq's rk4, from its fitted start."""
+    """Integrate every window step by step with torchdiffeq's rk4, from its fitted start."""
     system, n_steps = problem.system, fit.nodes.shape[2] - 1
     start = torch.tensor(fit.nodes[:, :, 0].transpose(0, 2, 1).copy(), device=problem.device)
     scaling = torch.tensor(fit.scaling, device=problem.device)
@@ -265,9 +267,9 @@ def rollout(problem: RefinementProblem, fit: RefinementFit, *, n_substeps: int =
 
 
 def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndarray) -> np.ndarray:
-    """Condensed residuals by scaling, with the error of the time step in the defects' place.
+    """Condensed residuals by scaling, with time-step errors in place of the defects.
 
-    That is the error of each step against two steps of half its length.
+    The error of a step is its difference from two steps of half its length.
     """
     error = fit.step.finer(problem.system, problem.one_step, fit.scaling, fit.nodes) - maps[:, :, 0]
     shifted = maps.copy()
@@ -279,7 +281,7 @@ def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndar
 
 
 def is_coarse(bias: np.ndarray, covariance: np.ndarray, scaling: np.ndarray) -> bool:
-    """Whether the error of the time step shows in any scaling."""
+    """Return true if the error of the time step causes a significant bias in any scaling."""
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     allowed = np.maximum(BIAS_PER_ERROR * error, MIN_BIAS * np.abs(scaling))
     return bool((~(np.abs(bias) <= allowed)).any())
@@ -288,15 +290,15 @@ def is_coarse(bias: np.ndarray, covariance: np.ndarray, scaling: np.ndarray) -> 
 def covariances(
     triangles: np.ndarray, batch: WindowBatch, *, n_residuals: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sandwich with windows as clusters, and the naive s^2 H^-1, of the scalings.
+    """Covariances of the scalings: a sandwich with windows as clusters, and the naive s^2 H^-1.
 
-    triangles: (windows, rows, free + 1), each window's R with its start eliminated, the residual
-    that nothing can mend in the last row.
-    Residuals of a cluster are those that the other clusters leave (CR3, the jackknife), and the
-    quantile of Student's t for their number is put into the covariance. Overlapping windows share
-    noise: their scores count together, the less the farther apart. With too few windows for
-    a sandwich, the naive one stands for it.
-    n_residuals: less what starts and scalings take.
+    triangles: (windows, rows, free + 1), each window's R with its start eliminated; the last row
+    holds the residual that no change of the scalings can reduce.
+    The residuals of a cluster are those of a fit to the other clusters (CR3, the jackknife). The
+    covariance is widened by the quantile of Student's t for their number. Overlapping windows
+    share noise, so their scores are correlated, with weights that fall with distance. With too few
+    windows for a sandwich, the naive covariance replaces it.
+    n_residuals: number of residuals minus the number of starts and scalings.
     Source: Bell & McCaffrey 2002, Surv. Methodol. 28, 169; Newey & West 1987,
     doi:10.2307/1913610 for the weights.
     """
@@ -308,7 +310,7 @@ def covariances(
     if n_windows < CLUSTERS * n_free * batch.multiplicity:
         return naive, naive
     leverage = jacobian @ bread @ jacobian.transpose(0, 2, 1)
-    # The share keeps a window that alone fixes a direction from dividing by zero.
+    # The factor prevents a division by zero if one window alone determines a direction.
     freed = np.linalg.solve((1.0 + 1e-6) * np.eye(n_rows) - leverage, z[..., None])
     scores = (jacobian.transpose(0, 2, 1) @ freed)[..., 0]
     window = batch.data.shape[1]

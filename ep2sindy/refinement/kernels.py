@@ -1,10 +1,10 @@
 """Compiled recurrences over windows: condense linearised trajectories, propagate their changes.
 
-maps: (points, n, 1 + n + p, windows, steps): the end of each step started at its node, and the
-derivatives of that end by the node and by the p scalings. nodes: (points, windows, samples, n).
-A block is a stretch of `block` samples with a start of its own; n_start is n where starts are
-free, 0 where they are fixed to the data. Columns of a condensed system: the block's start, the
-scalings, the right-hand side.
+maps: (points, n, 1 + n + p, windows, steps): the end of each step from its node, and the
+derivatives of this end by the node and by the p scalings. nodes: (points, windows, samples, n).
+A block is a stretch of `block` samples with its own start. n_start is n if the starts are free,
+0 if they are fixed to the data. Columns of a condensed system: the block's start, the scalings,
+the right-hand side.
 """
 
 import numpy as np
@@ -14,7 +14,10 @@ from ep2sindy.runtime.compilation import compiled
 
 @compiled(fastmath={"reassoc", "contract"})
 def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
-    """R of a QR decomposition by Householder reflections; columns: (columns, rows), destroyed."""
+    """Write R of a QR decomposition by Householder reflections.
+
+    columns: (columns, rows), overwritten.
+    """
     n_columns = len(columns)
     for i in range(min(n_columns, n_rows)):
         pivot = columns[i]
@@ -43,7 +46,7 @@ def _triangle(columns: np.ndarray, n_rows: int, out: np.ndarray) -> None:
 def _advance(
     maps: np.ndarray, nodes: np.ndarray, p: int, w: int, k: int, x: np.ndarray, new: np.ndarray
 ) -> None:
-    """Carry the columns of `x` (n, columns), the last being the defect's, over step k."""
+    """Propagate the columns of `x` (n, columns) over step k; the last column is the defect."""
     n, n_columns = x.shape
     n_start = n_columns - 1 - (maps.shape[2] - 1 - n)
     for j in range(n):
@@ -67,7 +70,7 @@ def condense(
     block: int,
     n_start: int,
 ) -> np.ndarray:
-    """R of weights * (linearised trajectory - data), block by block.
+    """Triangular factors R of weights * (linearised trajectory - data), block by block.
 
     data: (points, windows, samples, n); weights: (points, n).
     Returns (points, windows, blocks, columns, columns).
@@ -106,7 +109,7 @@ def condense(
 
 @compiled
 def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
-    """Best change of each block's free start, given that of the scalings (points, p).
+    """Best change of each block's free start for a given change of the scalings (points, p).
 
     Returns (points, windows, blocks, n).
     """
@@ -130,7 +133,7 @@ def starts(condensed: np.ndarray, change: np.ndarray, n: int) -> np.ndarray:
 def propagate(
     maps: np.ndarray, nodes: np.ndarray, start: np.ndarray, change: np.ndarray, block: int
 ) -> np.ndarray:
-    """Change of every node that closes the linearised defects inside each block.
+    """Changes of the nodes that close the linearised defects inside each block.
 
     start: (points, windows, blocks, n), change of each block's first node; change: (points, p).
     """

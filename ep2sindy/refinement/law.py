@@ -1,4 +1,4 @@
-"""One refinement of all operating points, whose coefficients are tied by a law."""
+"""Joint refinement of all operating points, whose coefficients follow one law."""
 
 from __future__ import annotations
 
@@ -28,22 +28,24 @@ from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 
-# Where nobody says otherwise; states count by their standard deviation at every point.
+# Default settings; states are weighted by their standard deviation at every point.
 SETTINGS = RefinementSettings(n_windows=20, n_reweights=0)
 
 
 @dataclass(frozen=True, eq=False)
 class LawRefinement:
-    """A law fitted to the trajectories of all points, and how far to trust it.
+    """A law fitted to the trajectories of all points, with its uncertainty.
 
-    coefficients: (state, term) of each free one; law: coefficient at a point = law @ basis there,
-    in SI. covariance: of law.ravel(), a sandwich with the windows of all points as clusters: how
-    far other windows would move it, not how far a law of this form is from the truth;
-    covariance_naive: for residuals that are white and independent. None where nothing finite came.
-    models: by point, with the covariance that the law gives. loss: by point, mean square of
-    (trajectory - data) / std, integrated again from the fitted starts.
+    coefficients: (state, term) of each free coefficient. law: the coefficients at a point are
+    law @ basis at this point, in SI.
+    covariance: covariance of law.ravel(), a sandwich with the windows of all points as clusters.
+    It states how far other windows would change the law, not how far a law of this form is from
+    the truth. covariance_naive: the same for white, independent residuals. Both are None if the
+    fit is not finite.
+    models: by point, with the covariance that follows from the law. loss: by point, mean square
+    of (trajectory - data) / std, integrated again from the fitted starts.
     status: converged; max_iter; coarse_step; unidentifiable: the interval of a coefficient
-    reaches zero at every point; flat: no better than constants; non_finite: the start comes back.
+    reaches zero at every point; flat: no better than constants; non_finite: the start is returned.
     """
 
     coefficients: tuple[tuple[str, str], ...]
@@ -70,15 +72,16 @@ def refine_law(
 ) -> LawRefinement:
     """Fit one law to windows of all points, by least squares: coef_p = law @ basis[p].
 
-    One Gauss-Newton on the law, with every point's windows condensed as in `refine`; residuals
-    count in each point's own standard deviations. Separate refinements are sloppy in some
-    directions; here a point gives the law only what its data fix.
-    models: one per point, of one structure, as they are refined or found; they size the
-    coefficients. settings: as for `refine`, by MultipleShooting; n_windows of every point, 20
-    without reweighting if left out. start: the law to start from; None takes one through the
-    models' coefficients. Raises ValueError for models of different structure, a basis that the
-    points do not tell apart, a window that fits no trajectory, or records of unlike numbers of
-    windows.
+    One Gauss-Newton iteration solves for the law, with the windows of every point condensed as in
+    `refine`; residuals are in units of each point's own standard deviations. In separate
+    refinements some directions of the coefficients are poorly determined; here a point influences
+    the law only in the directions that its data determine.
+    models: one per point, all with the same terms, refined or discovered; they set the scales of
+    the coefficients. settings: as for `refine`, with MultipleShooting only. n_windows is the
+    number at every point; the default is 20 windows without reweighting. start: initial law; None
+    takes one through the coefficients of the models.
+    Raises ValueError for models with different terms, a basis whose terms the points cannot tell
+    apart, a window that fits no trajectory, or points with different numbers of windows.
     """
     known = Basis(basis)
     relations = _one_structure(models, settings.constraint, len(basis), len(trajectories))
@@ -121,7 +124,7 @@ def _check_counts(batches: Sequence[WindowBatch]) -> None:
 def _one_structure(
     models: Sequence[SparseModel], constraint: Constraint | None, n_basis: int, n_runs: int
 ) -> Constraint:
-    """The relations that all models share."""
+    """Relations common to all models; ValueError unless the models have the same terms."""
     if not len(models) == n_basis == n_runs or not models:
         raise ValueError(
             "models, trajectories and rows of the basis must be one per point: "
@@ -147,7 +150,7 @@ def _result(
     basis: Basis,
     history: tuple[Iteration, ...],
 ) -> LawRefinement:
-    """Back to SI, and to the basis that was given; the start where nothing finite came."""
+    """Result in SI and in the given basis; holds the start if the fit is not finite."""
     n_free, finite = law_map.n_free, verdict.status is not RefinementStatus.NON_FINITE
     assert fit.theta is not None
     theta = fit.theta if finite else law_map.start

@@ -1,4 +1,4 @@
-"""Sparse models in torch: right-hand sides, derivatives by states and scalings, time steps."""
+"""Sparse models in torch: right-hand sides, derivatives by states and scalings, step schemes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ep2sindy.refinement.kernels import propagate
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Clock and inputs of a batch, while its own time runs from 0 to the number of segments.
+    """Step lengths and inputs of a batch, whose own time runs from 0 to the number of segments.
 
     steps: (segments, points, batch), length of each segment in the scaled time of the equations.
-    inputs: (segments, 4, points, n_inputs, batch), cubics in the share of a segment that has
-    passed, highest power first, in units of each input's scale.
+    inputs: (segments, 4, points, n_inputs, batch), cubics in the elapsed fraction of a segment,
+    highest power first, in units of each input's scale.
     """
 
     steps: torch.Tensor
@@ -36,9 +36,9 @@ class Drive:
         object.__setattr__(self, "_uniform", bool((self.steps == 1.0).all()))
 
     def at(self, t: torch.Tensor | float) -> tuple[torch.Tensor | None, torch.Tensor]:
-        """Steps (points, 1, batch), None where all are one, and inputs (points, n_inputs, batch).
+        """Steps (points, 1, batch), or None if all are one, and inputs (points, n_inputs, batch).
 
-        Raises ValueError past the last segment: nothing is extrapolated.
+        Raises ValueError outside the segments, since nothing is extrapolated.
         """
         now, n_segments = float(t), len(self.steps)
         if not -1e-9 <= now <= n_segments + 1e-9:
@@ -54,14 +54,15 @@ class Drive:
 
 
 class ODE(nn.Module):
-    """x' = (coef of the free scalings) library(x, inputs), in scaled states and scaled time.
+    """Equations x' = coef library(x, inputs), in scaled states and scaled time.
 
-    States and inputs are in units of `scale`, (states then inputs), time in units of `step_s`.
-    coef = C (scaling * free0) + d in SI, so relations between coefficients always hold.
+    States and inputs are in units of `scale` (states, then inputs), time in units of `step_s`.
+    coef = C (scaling * free0) + d in SI, so relations between coefficients always hold; the
+    scalings are the unknowns.
     correction: an extra term of shape (..., states + inputs) -> (..., states), in scaled
-    variables, whose parameters train together with the scalings; only `forward` knows it.
+    variables, whose parameters are trained together with the scalings; only `forward` includes it.
     Raises ValueError for a model without terms, a relation that leaves out one of its terms or
-    names an unknown one, or a free coefficient of zero, which no scaling can move.
+    names an unknown one, or a free coefficient of zero, which no scaling can change.
     """
 
     free0: torch.Tensor
@@ -104,19 +105,19 @@ class ODE(nn.Module):
 
     @property
     def coef(self) -> torch.Tensor:
-        """(coefs,) in SI, in the order of the constraint."""
+        """Coefficients (coefs,) in SI, in the order of the constraint."""
         return self.C @ (self.scaling * self.free0) + self.d
 
     @property
     def matrix(self) -> torch.Tensor:
-        """(terms, equations) in scaled variables and time."""
+        """Coefficient matrix (terms, equations) in scaled variables and time."""
         flat = torch.zeros(
             len(self.library) * self.n_states, dtype=self.free0.dtype, device=self.free0.device
         )
         return flat.index_add(0, self.places, self.coef * self.unit).view(-1, self.n_states)
 
     def forward(self, t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """x: (batch, n_states); t: in samples since each window's start, as `drive` counts."""
+        """Right-hand side at x (batch, n_states); t: in samples since each window's start."""
         values, steps = x, None
         if self.drive is not None:
             steps, inputs = self.drive.at(t)
@@ -127,7 +128,10 @@ class ODE(nn.Module):
         return rate if steps is None else rate * steps[0].T
 
     def linear_parts(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """`matrix` = first @ scaling + second: (terms, equations, free), (terms, equations)."""
+        """Linear parts of `matrix` = first @ scaling + second.
+
+        Returns first, (terms, equations, free), and second, (terms, equations).
+        """
         shape = (len(self.library), self.n_states)
         by_scaling = self.C * self.free0 * self.unit[:, None]
         basis = self.C.new_zeros((shape[0] * shape[1], len(self.free0)))
@@ -137,12 +141,12 @@ class ODE(nn.Module):
 
 
 def unconstrained(model: SparseModel) -> Constraint:
-    """Every coefficient of a model that is not zero, each free."""
+    """Constraint that leaves every nonzero coefficient of a model free."""
     return build_constraint(model.library, {s: tuple(model.terms(s)) for s in model.states})
 
 
 def all_fixed(model: SparseModel) -> Constraint:
-    """Every coefficient of a model that is not zero, none of them free."""
+    """Constraint that fixes every nonzero coefficient of a model."""
     every = unconstrained(model)
     values = _coef(model, every)
     nothing = np.empty(0, dtype=np.int64)
@@ -183,10 +187,10 @@ def _coef(model: SparseModel, relations: Constraint) -> np.ndarray:
 class Augmented:
     """Right-hand sides of many points with their derivatives by state and scaling, in one batch.
 
-    One gather and product gives every distinct product of `library`; one matmul of them gives the
-    rate, its derivative by the states and its derivative by the scalings, column by column.
-    factors: (degree, products); basis: (points, rows, products, free); offset: the same without
-    `free`, for rows = n_states * columns.
+    One gather and product evaluates every distinct product of `library`. One matmul of these gives
+    the rate, its derivatives by the states and its derivatives by the scalings, column by column.
+    factors: (degree, products). basis: (points, rows, products, free), with rows = n_states *
+    columns. offset: the same without `free`.
     """
 
     library: Library
@@ -201,18 +205,21 @@ class Augmented:
 
     @property
     def n_columns(self) -> int:
-        """The rate, its derivatives by each state, then by each scaling."""
+        """Number of columns: the rate, its derivatives by each state, then by each scaling."""
         return 1 + self.n_states + self.n_free
 
     def take(self, points: torch.Tensor) -> Augmented:
         return replace(self, basis=self.basis[points], offset=self.offset[points])
 
     def weights(self, scaling: torch.Tensor) -> torch.Tensor:
-        """(points, rows, products) of scaling (points, free)."""
+        """Weights of the products, (points, rows, products), for scalings (points, free)."""
         return (self.basis @ scaling[:, None, :, None])[..., 0] + self.offset
 
     def fields(self, weights: torch.Tensor, x: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
-        """(points, n_states, columns, batch) of x (points, n_states, batch)."""
+        """Rates and their derivatives, (points, n_states, columns, batch).
+
+        x: (points, n_states, batch).
+        """
         columns = torch.cat([x, inputs, torch.ones_like(x[:, :1])], dim=1)
         columns = self.library.with_functions(columns, axis=1)
         products = columns.index_select(1, self.factors[0])
@@ -223,9 +230,9 @@ class Augmented:
     def rhs(
         self, scaling: torch.Tensor, drive: Drive
     ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-        """d/dt of the state and its derivatives by its start and by the scalings.
+        """Function for d/dt of the state and of its derivatives by its start and the scalings.
 
-        The function takes and gives (points, n_states, columns, batch).
+        The function takes and returns (points, n_states, columns, batch).
         """
         weights, n = self.weights(scaling), self.n_states
 
@@ -244,7 +251,7 @@ class Augmented:
     def value_rhs(
         self, scaling: torch.Tensor, drive: Drive
     ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-        """d/dt of the state alone, (points, n_states, batch)."""
+        """Function for d/dt of the state only, (points, n_states, batch)."""
         weights = self.weights(scaling)[:, :: self.n_columns]
 
         def rate(t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
@@ -256,12 +263,12 @@ class Augmented:
 
 
 def augment(odes: Sequence[ODE]) -> Augmented:
-    """Modules of the same variables as one batch of points, on the device of the first.
+    """Combine modules of the same variables into one batch of points, on the first's device.
 
-    Terms may differ: products are those that any module needs, and columns of zeros stand for
-    the scalings that a module has fewer of than the others.
+    Terms may differ: the products are those that any module needs, and modules with fewer
+    scalings are padded with columns of zeros.
     Raises ValueError for modules that differ in variables, or hold a correction, whose
-    derivatives only autograd knows.
+    derivatives are available only from autograd.
     """
     first = odes[0]
     if any(ode.correction is not None for ode in odes):
@@ -295,37 +302,37 @@ def augment(odes: Sequence[ODE]) -> Augmented:
     )
 
 
-NEWTON_STEPS = 20  # for two implicit half steps, from what one whole step gives
+NEWTON_STEPS = 20  # most Newton steps for two implicit half steps, started from one whole step
 
 
 @runtime_checkable
 class Step(Protocol):
-    """What the alternatives share.
+    """Interface of the step schemes.
 
-    nodes: (points, windows, samples, n_states); scaling: (points, free); drive: one segment and
+    nodes: (points, windows, samples, n_states); scaling: (points, free); drive: one segment, with
     a batch of (windows * segments).
     """
 
     def maps(
         self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
     ) -> np.ndarray:
-        """End of each step and its derivatives, as the kernels take them."""
+        """End of each step and its derivatives, in the layout of the kernels."""
         ...
 
     def finer(
         self, system: Augmented, drive: Drive, scaling: np.ndarray, nodes: np.ndarray
     ) -> np.ndarray:
-        """End of each step taken in two: (points, n_states, windows, segments)."""
+        """End of each step, taken as two half steps: (points, n_states, windows, segments)."""
         ...
 
     def halved(self) -> Step | None:
-        """The same with twice as many steps, None where there is no such thing."""
+        """Scheme with twice as many steps; None if there is none."""
         ...
 
 
 @dataclass(frozen=True)
 class RungeKutta:
-    """torchdiffeq's `rk4` (the 3/8 rule), `n_substeps` equal steps per sample, explicit."""
+    """Explicit scheme: torchdiffeq's `rk4` (3/8 rule), with `n_substeps` equal steps per sample."""
 
     n_substeps: int = 1
 
@@ -366,7 +373,8 @@ ONE_RUNGE_KUTTA = RungeKutta()
 class HermiteSimpson:
     """Implicit collocation of order four over one sample, for stiff models.
 
-    A-stable: a fast mode that has died out does not limit the step. Not torchdiffeq's.
+    It is A-stable: a fast mode that has decayed does not limit the step. It is our own
+    implementation, not part of torchdiffeq.
     Source: Hargraves & Paris 1987, doi:10.2514/3.20223.
     """
 
@@ -405,7 +413,7 @@ def _tensor(values: np.ndarray, system: Augmented) -> torch.Tensor:
 
 
 def _batch(nodes: np.ndarray, system: Augmented) -> torch.Tensor:
-    """(points, windows, samples, n_states) to (points, n_states, batch)."""
+    """Reshape (points, windows, samples, n_states) to a tensor (points, n_states, batch)."""
     flat = nodes.reshape(len(nodes), -1, nodes.shape[-1]).transpose(0, 2, 1)
     return _tensor(np.ascontiguousarray(flat), system)
 
@@ -413,14 +421,14 @@ def _batch(nodes: np.ndarray, system: Augmented) -> torch.Tensor:
 def _end(
     rhs: Callable[[torch.Tensor, torch.Tensor], torch.Tensor], start: torch.Tensor, n_steps: int
 ) -> torch.Tensor:
-    """Integrate over one unit of time by torchdiffeq; its clock stays on the CPU."""
+    """Integrate over one unit of time by torchdiffeq; the time grid stays on the CPU."""
     grid = torch.linspace(0.0, 1.0, n_steps + 1, dtype=torch.float64)
     options = {"grid_constructor": lambda func, y0, t: grid}
     return odeint(rhs, start, grid[[0, -1]], method="rk4", options=options)[-1]
 
 
 def _half(drive: Drive) -> Drive:
-    """The same batch with each step cut in two, one after the other."""
+    """Drive with each step divided into two consecutive half steps."""
     steps = torch.repeat_interleave(0.5 * drive.steps, 2, dim=-1)
     powers = 0.5 ** torch.arange(3, -1, -1, dtype=torch.float64, device=steps.device)
     a, b, c, d = drive.inputs.unbind(1)
@@ -437,15 +445,15 @@ def _collocate(
     left: torch.Tensor,
     right: torch.Tensor,
 ) -> torch.Tensor:
-    """One Newton step for the end of each step, with its derivatives, from nodes at both ends.
+    """Ends of the implicit steps and their derivatives, by one Newton step from both nodes.
 
-    g = right - left - h/6 (f_left + 4 f_mid + f_right), where
+    The collocation residual is g = right - left - h/6 (f_left + 4 f_mid + f_right), where
     mid = (left + right)/2 + h/8 (f_left - f_right).
     """
     n, weights = system.n_states, system.weights(scaling)
 
     def fields(t: float, x: torch.Tensor) -> torch.Tensor:
-        """h * (rate, derivatives by state, by scaling): (points, batch, n_states, columns)."""
+        """h * (rate, derivatives by state, by scaling), (points, batch, n_states, columns)."""
         steps, inputs = drive.at(t)
         out = system.fields(weights, x, inputs)
         return (out if steps is None else out * steps[:, None]).permute(0, 3, 1, 2)
@@ -466,7 +474,7 @@ def _collocate(
         / 6.0
     )
     whole = torch.cat([g[..., None], by_left, by_scaling], dim=-1)
-    # Singular where two trajectories of the implicit step meet: not finite, so a result.
+    # Singular if two solutions of the implicit step merge; the end is then NaN, a valid result.
     solution, failed = torch.linalg.solve_ex(by_right, whole)
     end = torch.where(failed[..., None, None] == 0, -solution, torch.nan)
     end[..., 0] += x_right

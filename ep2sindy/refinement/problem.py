@@ -1,4 +1,4 @@
-"""How integral least squares is set, what every way of it starts from, and what it hands back."""
+"""Settings, problem and result of integral least squares, common to all methods."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ Values = TypeVar("Values", bound=np.ndarray)
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """How a refinement is set: the windows that are followed, and the way to follow them.
+    """Settings of a refinement: the windows to be followed, and the method.
 
-    n_windows: spread over the trajectories, fewer where there are not that many places.
-    window: samples in each; None takes `periods`.
-    periods: of the dominant frequency in each window, as the data allow; None takes one and a
-    half, or what `window` says.
-    method: None means MultipleShooting(), or what a function says of its own.
-    constraint: relations between coefficients, or known ones that shall not move; None leaves
-    every coefficient free.
-    free_start: fit each window's initial state as well, without which noise in it biases the
-    coefficients; False starts at the data, as the thesis.
-    n_reweights: passes with each state weighted by 1/std of its residuals.
-    Raises ValueError for less than one window or one that holds too little, for windows set by
+    n_windows: number of windows, spread over the trajectories; fewer if the data are too short.
+    window: samples in each window; None takes `periods`.
+    periods: periods of the dominant frequency in each window, as far as the data allow; None takes
+    one and a half, unless `window` is given.
+    method: None means MultipleShooting(), unless a function states its own default.
+    constraint: relations between coefficients, or known coefficients that are kept fixed; None
+    leaves every coefficient free.
+    free_start: also fit the initial state of each window, whose noise would otherwise bias the
+    coefficients; False starts at the data, as in the thesis.
+    n_reweights: number of passes with each state weighted by 1/std of its residuals.
+    Raises ValueError for less than one window or one with too few samples, for windows set by
     both samples and periods, or for a negative number of passes.
 
     >>> ep.RefinementSettings(n_windows=20, periods=2.0).free_start
@@ -75,9 +75,9 @@ class RefinementSettings:
             raise ValueError(f"n_reweights must be zero or more: {self.n_reweights} came")
 
     def override(self, given: Mapping[str, Any]) -> RefinementSettings:
-        """The same but for the values that are given: those that are not None."""
+        """Copy of the settings, with the given values that are not None replaced."""
         changes = {name: value for name, value in given.items() if value is not None}
-        if changes.keys() & {"window", "periods"}:  # two ways to say one thing
+        if changes.keys() & {"window", "periods"}:  # both set the length of a window
             changes = {"window": None, "periods": None} | changes
         return replace(self, **changes)
 
@@ -87,8 +87,9 @@ class RefinementSettings:
         trajectories: Sequence[Sequence[Trajectory]],
         rng: np.random.Generator,
     ) -> list[WindowBatch]:
-        """Windows for every model, of its own trajectories, all as long as the shortest of them.
+        """Cut windows for every model from its own trajectories.
 
+        All windows have one length: `window`, or else the shortest that any model would choose.
         Raises ValueError unless there is a list of trajectories for each model.
         """
         if len(models) != len(trajectories):
@@ -118,11 +119,11 @@ class RefinementSettings:
 
 @dataclass(frozen=True, eq=False)
 class Iteration:
-    """One step of a fit, for whoever watches.
+    """One iteration of a fit, as reported to observers.
 
     block: samples in one piece of trajectory at this stage. loss: mean square of (trajectory -
     data) / std. step: largest relative change of a scaling. defect: largest gap between the end
-    of a step and the next node, in std; zero where there are no nodes.
+    of a step and the next node, in std; zero for methods without nodes.
     """
 
     point: int
@@ -136,7 +137,10 @@ class Iteration:
 def record(
     callback: Callable[[Iteration], None] | None, advance: Advance = nothing
 ) -> tuple[list[Iteration], Callable[[Iteration], None]]:
-    """A list that fills as a fit goes, and who fills it; `callback` and `advance` are told."""
+    """List of the iterations of a fit, and the observer that fills it.
+
+    The observer also calls `advance` and `callback`.
+    """
     history: list[Iteration] = []
 
     def observe(iteration: Iteration) -> None:
@@ -149,16 +153,16 @@ def record(
 
 
 def ignore(iteration: Iteration) -> None:
-    """The observer of a fit that nobody watches."""
+    """Observer that ignores all iterations."""
 
 
 @dataclass(frozen=True, eq=False)
 class LawMap:
-    """Scalings of point p = spread[p] @ theta; the law in SI = to_law @ theta.
+    """Linear map from theta to scalings and law: scalings of point p are spread[p] @ theta.
 
-    theta: coefficient by coefficient, what multiplies an orthonormal basis, in units of the
-    coefficient's RMS over the points. The law: the same order, what multiplies the basis given.
-    start: theta that a fit begins with.
+    theta: factors of an orthonormal basis, coefficient by coefficient, in units of the
+    coefficient's RMS over the points. to_law: to_law @ theta gives the law in SI, in the same
+    order: the factors of the given basis. start: initial theta of a fit.
     """
 
     spread: Float[np.ndarray, "points free theta"]
@@ -175,8 +179,10 @@ class LawMap:
         basis: Basis,
         law: Float[np.ndarray, "free terms"],
     ) -> LawMap:
-        """free0: values of the free coefficients that a scaling of one stands for; law: to begin
-        with, both in SI.
+        """Map for a basis and the initial values of a fit.
+
+        free0: values of the free coefficients at a scaling of one. law: the initial law. Both are
+        in SI.
         """
         n_points, n_free = free0.shape
         n_terms = basis.values.shape[1]
@@ -191,7 +197,7 @@ class LawMap:
 
     @staticmethod
     def identity(n_free: int) -> LawMap:
-        """Of one point that no law ties: its unknowns are its scalings."""
+        """Map of a single point without a law, whose unknowns are its scalings."""
         return LawMap(np.eye(n_free)[None], np.eye(n_free), np.ones(n_free))
 
     @property
@@ -208,19 +214,22 @@ class LawMap:
     def rows(
         self, triangles: Float[np.ndarray, "points windows size size"]
     ) -> Float[np.ndarray, "points windows size columns"]:
-        """Triangles of condensed residuals by scaling as rows by theta, right-hand side last."""
+        """Convert triangles of condensed residuals by scaling to rows by theta.
+
+        The right-hand side is the last column.
+        """
         by_theta = triangles[..., :-1] @ self.spread[:, None]
         return np.concatenate([by_theta, triangles[..., -1:]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class RefinementProblem:
-    """Models of the same states, a batch of windows for each, on one device.
+    """Models of the same states, with a batch of windows for each, on one device.
 
-    free_start: each window's initial state is fitted too; else it is the data's.
-    n_reweights: passes of weights 1/std of the residuals, after weights 1/std of the data.
-    law: ties the scalings of all points to the few unknowns of a law; None leaves each point
-    scalings of its own.
+    free_start: true if the initial state of each window is fitted; otherwise it is the data's.
+    n_reweights: number of passes with weights 1/std of the residuals, after weights 1/std of the
+    data. law: ties the scalings of all points to the few unknowns of a law; None gives each point
+    its own scalings.
     """
 
     odes: tuple[ODE, ...]
@@ -241,7 +250,7 @@ class RefinementProblem:
         observe: Callable[[Iteration], None] = ignore,
         device: str = "cpu",
     ) -> RefinementProblem:
-        """Models in the scale of their windows; a constraint of None leaves all terms free."""
+        """Problem with models scaled like their windows; a constraint of None frees all terms."""
         odes = [
             ODE(model, scale=batch.scale, step_s=batch.step_s, constraint=relations).to(device)
             for model, batch, relations in zip(models, batches, constraints, strict=True)
@@ -258,7 +267,7 @@ class RefinementProblem:
 
     @property
     def n_free(self) -> int:
-        """Of the model that has the most; scalings beyond a model's own move nothing."""
+        """Largest number of scalings of a model; other models ignore the excess ones."""
         return max(len(ode.free0) for ode in self.odes)
 
     @property
@@ -272,20 +281,20 @@ class RefinementProblem:
 
     @cached_property
     def one_step(self) -> Drive:
-        """Every step of every window as a batch element of its own, over one segment."""
+        """Drive with every step of every window as a separate batch element, over one segment."""
         return self._drive(one=True)
 
     @cached_property
     def whole(self) -> Drive:
-        """Windows as batch elements, one segment per step."""
+        """Drive with windows as batch elements, and one segment per step."""
         return self._drive(one=False)
 
     def take(self, point: int) -> RefinementProblem:
-        """One point of a problem."""
+        """Problem of a single point."""
         return replace(self, odes=(self.odes[point],), batches=(self.batches[point],))
 
     def agree(self, values: Values, reduce: Callable[[Values], Any]) -> Values:
-        """Values by point, made one value for all where a law ties the points together."""
+        """Values by point; if a law ties the points, all get the value given by `reduce`."""
         return values if self.law is None else np.full_like(values, reduce(values))
 
     def _drive(self, *, one: bool) -> Drive:
@@ -306,11 +315,12 @@ class RefinementProblem:
 
 @dataclass(frozen=True, eq=False)
 class RefinementFit:
-    """Where a method ended, point by point, before anybody judges it.
+    """Result of a method, point by point, before it is judged.
 
-    scaling: ones beyond a model's own. nodes: the fitted trajectories at the samples, in std.
-    weights: last used. finished: the method's own test was met. finite: False where it never was.
-    step: the map of nodes to nodes. theta: unknowns of the law that the scalings follow, if any.
+    scaling: padded with ones beyond a model's own scalings. nodes: the fitted trajectories at the
+    samples, in std. weights: the last ones used. finished: true if the method's own convergence
+    test was met. finite: False for points that did not stay finite. step: time-step scheme from
+    node to node. theta: unknowns of the law that determines the scalings, if any.
     """
 
     scaling: Float[np.ndarray, "points free"]
@@ -324,14 +334,14 @@ class RefinementFit:
 
 @runtime_checkable
 class Method(Protocol):
-    """What the alternatives share: a fit of all points of a problem."""
+    """Interface of the methods: a fit of all points of a problem."""
 
     def fit(self, problem: RefinementProblem) -> RefinementFit: ...
 
     def finer(
         self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray
     ) -> RefinementFit | None:
-        """Some points again with half the time step; None where the method has no way to."""
+        """Refit some points with half the time step; None if the method cannot do so."""
         ...
 
 
@@ -339,9 +349,9 @@ def residual_weights(
     nodes: Float[np.ndarray, "points windows samples n_states"],
     data: Float[np.ndarray, "points windows samples n_states"],
 ) -> Float[np.ndarray, "points n_states"]:
-    """1/std of each state's residuals, the geometric mean of a point's weights being one.
+    """Weights 1/std of each state's residuals, with geometric mean one at every point.
 
-    A state fitted exactly gets at most 1000 times the weight of the worst.
+    A state that is fitted exactly gets at most 1000 times the weight of the worst.
     """
     spread = np.sqrt(np.square(nodes - data).mean(axis=(1, 2)))
     floor = np.maximum(1e-3 * spread.max(axis=1, keepdims=True), 1e-300)
@@ -350,7 +360,7 @@ def residual_weights(
 
 
 def join(fits: Sequence[RefinementFit]) -> RefinementFit:
-    """Fits of single points, by one step, as one."""
+    """Join fits of single points with the same step scheme into one."""
     n_free = max(fit.scaling.shape[1] for fit in fits)
     scaling = np.ones((len(fits), n_free))
     for fit, row in zip(fits, scaling, strict=True):

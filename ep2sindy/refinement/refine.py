@@ -1,4 +1,4 @@
-"""Integral least squares: refine a model's coefficients until its trajectories follow the data."""
+"""Integral least squares: refinement of coefficients until trajectories follow the data."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ SETTINGS = RefinementSettings()
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A model fitted to trajectories, and how far to trust it.
+    """A model fitted to trajectories, with its uncertainty and status.
 
     model: with the covariance of its coefficients, a sandwich with windows as clusters.
-    covariance_naive: the same for residuals that are white and independent.
-    window_loss: mean square of (trajectory - data) / std, integrated again from the fitted
-    starts; loss: its mean, one being that of a constant.
-    status: converged; max_iter; coarse_step: the error of the time step shows in a coefficient;
-    unidentifiable: the 95 % interval of a free coefficient reaches zero; flat: no better than a
-    constant; non_finite: the model given comes back, without covariance.
-    history: one entry per iteration. trajectories: the fitted states in SI; data cut by `batch`.
+    covariance_naive: the same for white, independent residuals.
+    window_loss: mean square of (trajectory - data) / std in each window, integrated again from
+    the fitted starts. loss: its mean; a constant has a loss of one.
+    status: converged; max_iter; coarse_step: the error of the time step biases a coefficient
+    significantly; unidentifiable: the 95 % interval of a free coefficient reaches zero; flat: no
+    better than a constant; non_finite: the given model is returned, without covariance.
+    history: one entry per iteration. trajectories: the fitted states in SI, in windows of `batch`.
     """
 
     model: SparseModel
@@ -133,15 +133,16 @@ def refine(
 ) -> Refinement | list[Refinement]:
     """Fit the free coefficients to windows spread over trajectories, by least squares.
 
-    model: one, or a list of models of the same states, each with a list of trajectories of its
-    own; a list gives a list. n_windows to n_reweights: in place of what `settings` say; see
-    `RefinementSettings`.
-    points_per_batch: models integrated together, few enough to stay in the processor's cache; on
-    a GPU, thousands. One that has converged leaves its batch. They may differ in their terms; all
-    of a batch cost what the largest does. progress: True shows a bar; see `Progress`.
+    model: one model, or a list of models of the same states, each with its own list of
+    trajectories; for a list the result is a list. n_windows to n_reweights: override `settings`;
+    see `RefinementSettings`.
+    points_per_batch: number of models integrated together, few enough to fit in the processor's
+    cache; thousands on a GPU. A model that has converged leaves its batch. Models may differ in
+    their terms; each model in a batch costs as much as the largest one. progress: True shows a
+    bar; see `Progress`.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
-    terms, a constraint that leaves out one of them, or models that differ in their variables or
-    the number of their windows. A failed fit is a result: see `status`.
+    terms, a constraint that leaves out one of its terms, or models that differ in their variables
+    or the number of their windows. A failed fit is a result: see `status`.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     >>> refined = ep.refine(ep.discover(run).model, [run], rng=0)
@@ -169,7 +170,7 @@ def _by_model(
     model: SparseModel | Sequence[SparseModel],
     trajectories: Sequence[Trajectory] | Sequence[Sequence[Trajectory]],
 ) -> tuple[Sequence[SparseModel], Sequence[Sequence[Trajectory]]]:
-    """Models, and the trajectories of each."""
+    """Arguments of `refine` as a list of models and the trajectories of each."""
     if isinstance(model, SparseModel):
         return [model], [cast("Sequence[Trajectory]", trajectories)]
     return model, cast("Sequence[Sequence[Trajectory]]", trajectories)
@@ -184,7 +185,7 @@ def _refine(
     device: str,
     advance: Advance,
 ) -> list[Refinement]:
-    """One batch of points, from windows to results."""
+    """Refine one batch of points on their windows."""
     history, observe = record(callback, advance)
     problem = RefinementProblem.of(
         models,
@@ -215,7 +216,7 @@ def _result(
     constraint: Constraint | None,
     history: Sequence[Iteration],
 ) -> Refinement:
-    """Back to SI and to the model's own order of coefficients."""
+    """Result of one point, in SI and in the model's own order of coefficients."""
     batch, ode = problem.batches[point], problem.odes[point]
     relations = unconstrained(model) if constraint is None else constraint
     finite = verdict.status is not RefinementStatus.NON_FINITE
@@ -231,7 +232,7 @@ def _result(
             for covariance in (verdict.covariance, verdict.covariance_naive)
         )
         refined = replace(refined, covariance=robust)
-    with np.errstate(over="ignore"):  # of a fit that blew up
+    with np.errstate(over="ignore"):  # a fit that blew up overflows
         trajectories = fit.nodes[point] * batch.scale[: fit.nodes.shape[-1]]
     return Refinement(
         model=refined,
@@ -248,7 +249,7 @@ def _result(
 def with_coef(
     model: SparseModel, constraint: Constraint, values: np.ndarray
 ) -> tuple[SparseModel, list[int]]:
-    """The model with these coefficients, and where its own order finds them among `values`."""
+    """Model with these coefficients, and their indices in `values` in the model's own order."""
     coef = np.zeros_like(model.coef)
     places = {}
     for k, (state, term) in enumerate(constraint.coefficients):
@@ -261,11 +262,11 @@ def with_coef(
 
 @dataclass(frozen=True, eq=False)
 class BatchRefinement:
-    """Models refined on the same windows, judged by none.
+    """Models refined on the same windows, without assessment.
 
-    finished: which met the method's own test. loss: mean square of (trajectory - data) in the
-    batch's scale; infinite for a model whose refinement did not stay finite, which comes back as
-    it was.
+    finished: true for models that met the method's own convergence test. loss: mean square of
+    (trajectory - data) in the batch's scale. If a refinement did not stay finite, the loss is
+    infinite and the model is returned unchanged.
     """
 
     models: Sequence[SparseModel]
@@ -284,10 +285,11 @@ def refine_batch(
     points_per_batch: int = 8,
     advance: Advance = nothing,
 ) -> BatchRefinement:
-    """Refine models of the same states on the same windows, with free starts, and judge none.
+    """Refine models of the same states on the same windows, with free starts, unassessed.
 
     constraints: one per model; None leaves all coefficients free. points_per_batch: as for
-    `refine`; models may differ in their terms as there. advance: told of finished models.
+    `refine`, where models may also differ in their terms. advance: called with the number of
+    models finished.
     Raises ValueError for a model without terms.
     """
     relations = [unconstrained(model) for model in models] if constraints is None else constraints
@@ -319,10 +321,11 @@ def smooth_batch(
     points_per_batch: int = 8,
     advance: Advance = nothing,
 ) -> Float[np.ndarray, "models windows samples n_states"]:
-    """Trajectories that follow the windows best: starts fitted, coefficients held.
+    """Trajectories that follow the windows best, with starts fitted and coefficients fixed.
 
-    In units of the batch's scale; NaN in windows where a model blows up. points_per_batch: as
-    for `refine`; models may differ in their terms as there. advance: told of those followed.
+    They are in units of the batch's scale; NaN in windows where a model blows up.
+    points_per_batch: as for `refine`, where models may also differ in their terms. advance:
+    called with the number of models finished.
     Raises ValueError for a model without terms.
     """
     windows = batch.split()
@@ -332,7 +335,7 @@ def smooth_batch(
         by_model = RefinementProblem.of(
             chunk, [batch] * len(chunk), [all_fixed(model) for model in chunk]
         )
-        # Every window is a point of its own: one that blows up stops no other.
+        # Every window is a separate point, so one that blows up does not stop the others.
         problem = replace(
             by_model,
             odes=tuple(ode for ode in by_model.odes for _ in windows),

@@ -1,4 +1,4 @@
-"""Laws through coefficients that data fix in some directions well and in others hardly."""
+"""Laws fitted to coefficients that data determine well in some directions and poorly in others."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.runtime.arrays import read_only
 
-# Directions of a basis or of all information below this share of the strongest count as absent.
+# Directions of a basis or of the information weaker than this share of the strongest are dropped.
 RANK = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Functions of the operating parameters at some points, and an orthonormal basis of them.
+    """Functions of the operating parameters at the points, with an orthonormal basis of them.
 
-    What is solved for in the latter does not depend on the units of the parameters.
-    Raises ValueError where the points do not tell the functions apart.
+    A solution in the orthonormal basis does not depend on the units of the parameters.
+    Raises ValueError if the points cannot tell the functions apart.
     """
 
     values: Float[np.ndarray, "points terms"]
@@ -53,7 +53,7 @@ class Basis:
 
     @property
     def back(self) -> Float[np.ndarray, "terms terms"]:
-        """orthonormal @ a = values @ (back @ a)."""
+        """Matrix back to the given functions: orthonormal @ a = values @ (back @ a)."""
         _, triangle, size = self._factors
         inverse: np.ndarray = np.linalg.inv(triangle)
         return inverse / size[:, None]
@@ -64,12 +64,13 @@ def weighted_law(
     information: Float[np.ndarray, "points coefs coefs"] | None,
     basis: Float[np.ndarray, "points terms"],
 ) -> Float[np.ndarray, "coefs terms"]:
-    """The law whose coefficients miss those of the points least, as far as data fix them.
+    """Law whose coefficients are closest to those of the points, weighted by their information.
 
-    Minimised is the sum over the points of miss @ information @ miss, each information (an inverse
-    covariance) divided by its trace in relative coefficients, so that points count alike. Of least
-    norm where nothing fixes a direction. information: None weights all coefficients alike.
-    Raises ValueError for a basis that the points do not tell apart.
+    With the deviation miss at each point, the sum over the points of miss @ information @ miss is
+    minimised. Each information (an inverse covariance) is divided by its trace in relative
+    coefficients, so that points have equal weight. The solution has the least norm in directions
+    that no data determine. information: None weights all coefficients equally.
+    Raises ValueError for a basis whose functions the points cannot tell apart.
     """
     known = Basis(basis)
     n_coefs, n_terms = coefficients.shape[1], basis.shape[1]
@@ -80,7 +81,7 @@ def weighted_law(
     else:
         information = information * np.outer(size, size)
     roots = np.stack([_root(each) for each in information])
-    # Unknowns coefficient by coefficient: row (p, i) holds root_p[i, k] q_p[m] at place (k, m).
+    # Unknowns are ordered by coefficient: row (p, i) holds root_p[i, k] q_p[m] in column (k, m).
     columns = np.einsum("pik,pm->pikm", roots, known.orthonormal)
     target = np.einsum("pik,pk->pi", roots, relative)
     flat = columns.reshape(-1, n_coefs * n_terms)
@@ -91,13 +92,13 @@ def weighted_law(
 def information_of(
     covariance: Float[np.ndarray, "coefs coefs"],
 ) -> Float[np.ndarray, "coefs coefs"]:
-    """The inverse of a covariance; what it says is certain beyond rounding counts no more."""
+    """Inverse of a covariance; directions with variance below rounding get no weight."""
     size = zero_to_one(np.sqrt(np.diag(covariance)))
     return np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) / np.outer(size, size)
 
 
 def _root(information: np.ndarray) -> np.ndarray:
-    """R with R^T R = information over its trace; not a triangle."""
+    """Root R with R^T R = information / trace; R is not triangular."""
     values, vectors = np.linalg.eigh(information / zero_to_one(np.array(np.trace(information))))
     root: np.ndarray = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     return root

@@ -1,4 +1,4 @@
-"""Windows of trajectories cut out together, scaled, with their inputs as cubics in time."""
+"""Batches of windows of trajectories, in scaled units, with inputs as cubics in time."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
 
-PERIODS = 1.5  # of the dominant frequency in a window, where nobody says otherwise
+PERIODS = 1.5  # default length of a window, in periods of the dominant frequency
 
-MIN_SAMPLES = 5  # of a window: fewer say nothing about the dynamics
+MIN_SAMPLES = 5  # least samples in a window; fewer do not determine the dynamics
 
 
 @dataclass(frozen=True, eq=False)
 class WindowBatch:
     """Equally long windows of one set of trajectories.
 
-    scale: of states, then inputs: standard deviation of each state, rms of each input, in SI.
-    step_s: mean time step; steps: (windows, samples - 1) in units of it.
+    scale: standard deviation of each state, then rms of each input, in SI.
+    step_s: mean time step. steps: (windows, samples - 1) in units of it.
     data: (windows, samples, n_states) in units of scale.
-    inputs: (windows, samples - 1, 4, n_inputs), cubics in the share of a step that has passed,
+    inputs: (windows, samples - 1, 4, n_inputs), cubics in the elapsed fraction of a step,
     highest power first, in units of scale.
-    trajectory, start: (windows,), where each window was cut.
+    trajectory, start: (windows,), number of the trajectory and first sample of each window.
     """
 
     scale: Float[np.ndarray, " variables"]
@@ -48,7 +48,7 @@ class WindowBatch:
 
     @property
     def multiplicity(self) -> float:
-        """How many windows an average sample sits in: one, unless windows overlap."""
+        """Mean number of windows that contain a sample: one, unless windows overlap."""
         window = self.data.shape[1]
         order = np.lexsort((self.start, self.trajectory))
         gaps = np.diff(self.start[order])
@@ -57,7 +57,7 @@ class WindowBatch:
         return float(window * len(order) / covered)
 
     def split(self) -> list[WindowBatch]:
-        """Every window as a batch of its own, in the same scale."""
+        """Split into batches of one window each, in the same scale."""
         return [
             replace(
                 self,
@@ -80,9 +80,9 @@ def cut_windows(
     window: int,
     rng: np.random.Generator | int,
 ) -> WindowBatch:
-    """Cut `n_windows` windows of `window` samples, fewer where there are not that many places.
+    """Cut `n_windows` windows of `window` samples; fewer if there are not that many positions.
 
-    Raises ValueError for no trajectory, a window that no trajectory can hold or of under five
+    Raises ValueError for no trajectory, a window longer than every trajectory or of under five
     samples, or a missing variable.
     """
     rng = np.random.default_rng(rng)
@@ -115,10 +115,10 @@ def cut_windows(
 def dominant_window(
     trajectories: Sequence[Trajectory], states: Sequence[str], *, periods: float = PERIODS
 ) -> int:
-    """So many periods of the dominant frequency, in samples, as the data allow.
+    """Length in samples of `periods` periods of the dominant frequency, as far as data allow.
 
-    The frequency is that of the state whose peak holds the largest share of its power, the
-    median over trajectories. At most half of the longest trajectory.
+    The frequency is that of the state whose peak holds the largest share of its power. The
+    length is the median over trajectories, and at most half of the longest trajectory.
     Raises ValueError for no trajectory.
     """
     _check_trajectories(trajectories)
@@ -135,14 +135,14 @@ def dominant_window(
 
 
 def _peak_share(t: np.ndarray, x: np.ndarray) -> float:
-    """Share of the power, mean apart, in the highest bin and its neighbours."""
+    """Share of the power, without the mean, in the highest bin and its neighbours."""
     power = power_spectrum(t, x)[1][1:]
     k = int(np.argmax(power))
     return float(power[max(k - 1, 0) : k + 2].sum() / max(power.sum(), 1e-300))
 
 
 def check_windows(n_windows: int, window: int | None) -> None:
-    """Raise ValueError for no window, or for one of too few samples; None is a length unknown."""
+    """Raise ValueError for no window, or one of too few samples; None is an unknown length."""
     if n_windows < 1 or (window is not None and window < MIN_SAMPLES):
         raise ValueError(
             f"at least one window of {MIN_SAMPLES} samples is needed: n_windows={n_windows}, "
@@ -167,7 +167,7 @@ def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
 def _places(
     lengths: Sequence[int], n_windows: int, window: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Trajectory and first sample of every window, trajectories served by the room they have."""
+    """Trajectory and first sample of every window, in proportion to the room in trajectories."""
     room = np.array([max(n - window + 1, 0) for n in lengths])
     share = np.minimum(np.round(n_windows * np.cumsum(room) / room.sum()), np.cumsum(room))
     counts = np.minimum(np.diff(share, prepend=0.0).astype(int), room)
@@ -176,7 +176,7 @@ def _places(
 
 
 def _spread(room: int, count: int, window: int, rng: np.random.Generator) -> np.ndarray:
-    """First samples: apart with random gaps where the trajectory is long enough, else even."""
+    """First samples of windows: disjoint with random gaps if there is room, else evenly spaced."""
     slack = room - 1 - (count - 1) * window
     if count and slack >= 0:
         return np.sort(rng.integers(slack + 1, size=count)) + window * np.arange(count)
@@ -184,7 +184,7 @@ def _spread(room: int, count: int, window: int, rng: np.random.Generator) -> np.
 
 
 def _cubics(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(segments, 4, columns): a cubic spline in the share of each step that has passed."""
+    """Cubic spline in the elapsed fraction of each step, (segments, 4, columns)."""
     if not values.shape[1]:
         return np.zeros((len(t) - 1, 4, 0))
     powers = np.diff(t)[:, None, None] ** np.arange(3, -1, -1)[:, None]

@@ -1,4 +1,4 @@
-"""Regression: rows of terms and targets, in each form that the data can be brought to."""
+"""Regression: rows of terms and targets in differential or weak form, searches, and fits."""
 
 from ep2sindy._stubs import attach
 

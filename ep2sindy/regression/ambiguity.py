@@ -1,4 +1,4 @@
-"""Terms that the data cannot tell apart: zero, repeated, nearly repeated, dependent."""
+"""Detection of terms that the data cannot tell apart: zero, repeated, nearly so, dependent."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from ep2sindy.library.library import Library
 from ep2sindy.regression.gram_fits import independent_terms
 from ep2sindy.regression.rows import RegressionRows
 
-# One minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
+# Bounds on one minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.
 SAME = 1e-10
 
 ALIKE = 1e-3
 
-# Simpler terms that a term is left out for. Without noise, every term on a periodic orbit is nearly
-# a combination of many others, and the law may be the shorter for it.
+# A term is left out if it combines at most this many simpler terms. Without noise, every term on a
+# periodic orbit is nearly a combination of many others, and may itself give the shorter law.
 MAX_PARTS = 3
 
-# Rows per term of the library below which a search would fit the noise of its rows...
+# With fewer rows per term of the library than this, a search would fit the noise of its rows...
 FEW = 3
 
-# ...unless each coefficient has this many rows to itself: the least that is held to do
-# (Vittinghoff & McCulloch 2007, doi:10.1093/aje/kwk052).
+# ...so equations are limited to this many rows per coefficient, the least that is considered
+# sufficient (Vittinghoff & McCulloch 2007, doi:10.1093/aje/kwk052).
 ROWS_PER_COEFFICIENT = 5
 
 
@@ -32,8 +32,8 @@ ROWS_PER_COEFFICIENT = 5
 class Ambiguity:
     """A finding about some terms, in words for the user.
 
-    exact: it holds of these rows whatever their noise, and the search keeps to it; otherwise it
-    is a matter of noise.
+    exact: true if the finding holds exactly on these rows and restricts the search; otherwise it
+    depends on the noise.
     """
 
     terms: tuple[str, ...]
@@ -42,9 +42,9 @@ class Ambiguity:
 
 
 def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
-    """Terms that are not zero and are no combination of a few simpler ones on the training rows.
+    """Terms that are neither zero nor a combination of a few simpler ones on the training rows.
 
-    Simpler is of lower degree, or earlier in the library.
+    A term is simpler if its degree is lower, or if it is earlier in the library.
     """
     xx = problem.train_gram.xx[0]
     usable = _distinct(problem.library, xx)
@@ -54,13 +54,13 @@ def usable_terms(problem: RegressionRows) -> Bool[np.ndarray, " terms"]:
 
 
 def largest_support(problem: RegressionRows) -> int:
-    """How many terms an equation may have: all that are usable, unless the rows are few."""
+    """Largest number of terms in an equation: all usable ones, or fewer if there are few rows."""
     n_terms, n_rows = int(usable_terms(problem).sum()), len(problem.train_rows)
     return n_terms if n_rows >= FEW * n_terms else max(1, n_rows // ROWS_PER_COEFFICIENT)
 
 
 def few_rows(problem: RegressionRows) -> tuple[Ambiguity, ...]:
-    """What is said where `largest_support` holds equations down."""
+    """Message for the user if `largest_support` limits the equations; empty otherwise."""
     largest, n_terms = largest_support(problem), int(usable_terms(problem).sum())
     if largest == n_terms:
         return ()
@@ -86,7 +86,7 @@ def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np
 
 
 def ambiguities(problem: RegressionRows) -> tuple[Ambiguity, ...]:
-    """Everything that keeps terms from being told apart, over the training rows."""
+    """All ambiguities between terms on the training rows."""
     return find_ambiguities(problem.library, problem.train_theta, problem.train_gram.xx[0])
 
 
@@ -95,9 +95,9 @@ def find_ambiguities(
     theta: Float[np.ndarray, "rows terms"],
     xx: Float[np.ndarray, "terms terms"],
 ) -> tuple[Ambiguity, ...]:
-    """Everything that keeps terms from being told apart.
+    """All ambiguities between terms of a library.
 
-    theta: of the library's terms, columns of unit norm, or of zeros. xx: its Gram matrix.
+    theta: columns of the library's terms, of unit norm or zero. xx: Gram matrix of theta.
     """
     return (*_zero(library, xx), *_alike(library, xx), *_dependent(library, theta, xx))
 
@@ -111,7 +111,7 @@ def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambigu
 
 
 def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
-    """Pairs of terms that are proportional, the simpler one first; what is left out only once."""
+    """Pairs of proportional terms, the simpler one first; a term left out is reported once."""
     names, order = library.names, _simplest_first(library)
     kept = _distinct(library, xx)
     cosines = np.abs(xx[np.ix_(order, order)])
@@ -137,7 +137,7 @@ def _dependent(
     theta: Float[np.ndarray, "rows terms"],
     xx: Float[np.ndarray, "terms terms"],
 ) -> list[Ambiguity]:
-    """Each term that is a combination of simpler ones, with the terms that make it up."""
+    """Terms that are linear combinations of simpler ones, with the terms they consist of."""
     names = library.names
     found = []
     for j, columns in _combinations(library, theta, xx):
@@ -153,7 +153,7 @@ def _combinations(
     theta: Float[np.ndarray, "rows terms"],
     xx: Float[np.ndarray, "terms terms"],
 ) -> list[tuple[int, list[int]]]:
-    """Distinct terms that depend on simpler ones, each with those that it is made of."""
+    """Distinct terms that depend on simpler ones, each with the indices of those terms."""
     order = _simplest_first(library)
     columns = order[_distinct(library, xx)[order]]
     independent = independent_terms(xx[np.ix_(columns, columns)])
@@ -162,7 +162,7 @@ def _combinations(
         basis = np.sort(columns[:rank][independent[:rank]])
         weights = np.linalg.solve(xx[np.ix_(basis, basis)], xx[basis, columns[rank]])
         if (np.abs(weights) > 1e-6).sum() > MAX_PARTS:
-            # A Gram matrix has lost half the digits: by rows, many parts may turn out few.
+            # The Gram matrix has lost half the digits; a fit on the rows may need fewer parts.
             weights = np.linalg.lstsq(theta[:, basis], theta[:, columns[rank]], rcond=None)[0]
         found.append((int(columns[rank]), basis[np.abs(weights) > 1e-6].tolist()))
     return found

@@ -1,6 +1,6 @@
-"""Bootstraps: a search repeated on resampled rows, its supports pooled and their terms counted.
+"""Bootstraps: a search repeated on resampled rows; its supports are pooled, their terms counted.
 
-Rows are drawn with replacement, in blocks of neighbours where neighbours are alike.
+Rows are drawn with replacement, in blocks of neighbours if neighbours are correlated.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from ep2sindy.runtime.progress import Advance, nothing
 
 @dataclass(frozen=True)
 class Bootstraps:
-    """Resampled rows and a reduced library, over and over, so that no support hangs on a few.
+    """Repeated draws of rows and of a reduced library, so that no support depends on a few rows.
 
     Each of the `n` draws takes, with replacement, a random share of the training groups
     between `smallest` and `largest`, and leaves out `n_culled` random terms.
-    block: training groups drawn together, side by side; 1 draws them one by one, as the thesis
-    does, and then says too little of a time series, whose neighbours are alike. Above 1 for one
-    trajectory only. A draw of fewer rows than there are varies more than the whole record would.
-    n = 0: one search on all training rows and terms. Source: the thesis, II-C and II-H.
+    block: number of neighbouring training groups drawn together. 1 draws single groups, as in the
+    thesis, and understates the scatter for a time series, whose neighbours are correlated. More
+    than 1 is allowed for one trajectory only. A draw of fewer rows than there are scatters more
+    than the whole record would. n = 0: one search on all training rows and terms.
+    Source: the thesis, II-C and II-H.
     """
 
     n: int = 32
@@ -52,7 +53,7 @@ class Bootstraps:
     def draw(
         self, problem: RegressionRows, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator
     ) -> tuple[Grams, Bool[np.ndarray, "draws terms"]]:
-        """Gram matrices and kept terms of every bootstrap, out of the terms that may be used."""
+        """Gram matrices and kept terms of every bootstrap, chosen among the usable `terms`."""
         if self.n == 0:
             return problem.train_gram, terms[None]
         usable = np.flatnonzero(terms)
@@ -81,11 +82,12 @@ class Bootstraps:
 
 @dataclass(frozen=True, eq=False)
 class Supports:
-    """What the bootstraps found for one equation, pooled.
+    """Supports that the bootstraps found for one equation, pooled.
 
-    masks: (supports, terms), each once. share: (supports,), share of bootstraps that found it.
-    inclusion: (terms + 1, terms), row k: of the bootstraps that had a term at hand, the share
-    in which it stood in a support of k terms. Without bootstraps both are NaN.
+    masks: (supports, terms), each once. share: (supports,), share of bootstraps that found the
+    support. inclusion: (terms + 1, terms); row k is the share of bootstraps, among those whose
+    library held the term, in which the term was in a support of k terms. Without bootstraps both
+    are NaN.
     """
 
     equation: str
@@ -96,12 +98,13 @@ class Supports:
 
 @dataclass(frozen=True, eq=False)
 class Resamples:
-    """Bootstraps of one problem, columns scaled to unit norm in every draw.
+    """Bootstraps of one problem, with columns scaled to unit norm in every draw.
 
     xx: (draws, terms, terms), xy: (draws, equations, terms), yy: (draws, equations); a term that
-    a draw lacks is a column of zeros. at_hand: (draws, terms). scale: from the problem's scaled
-    columns to these. counted: False for the one search on all rows. largest: terms that a
-    support may have on so many rows.
+    is missing from a draw is a column of zeros. at_hand: (draws, terms), true for terms in the
+    draw that are not zero on its rows. scale: factors from the problem's scaled columns to these.
+    kept: (draws, terms), true for terms that were not culled. counted: False for one search on
+    all rows. largest: largest number of terms that the number of rows allows in a support.
     """
 
     equations: Sequence[str]
@@ -117,7 +120,7 @@ class Resamples:
     def search(
         self, search: Search, equation: int, advance: Advance = nothing
     ) -> list[Bool[np.ndarray, "_ terms"]]:
-        """What a search proposes in every draw, as far as the rows can bear it."""
+        """Supports that a search proposes in every draw, without those that are too large."""
         draws = zip(self.xx, self.xy[:, equation], self.yy[:, equation].tolist(), strict=True)
         found = []
         for draw in draws:
@@ -131,10 +134,10 @@ class Resamples:
         found: Sequence[Bool[np.ndarray, "_ terms"]],
         support: Bool[np.ndarray, " terms"],
     ) -> Float[np.ndarray, "draws terms"]:
-        """Each draw's own best support of this support's size, fitted to the draw.
+        """Fit, in each draw, the draw's best support of the same size as the given one.
 
-        found: as `search` gives it; where a draw has none of that size, the support itself
-        serves, as far as its terms are at hand. In units of the problem's scaled columns.
+        found: the result of `search`. A draw without a support of that size fits the given one,
+        restricted to the terms in the draw. Coefficients are those of the problem's scaled columns.
         """
         coef = np.empty(self.at_hand.shape)
         for k, masks in enumerate(found):
@@ -158,8 +161,8 @@ def draw_resamples(
     if bootstraps.n:
         problem.check_grams(bootstraps.n)  # before the work on terms, which may take minutes
     grams, kept = bootstraps.draw(problem, usable_terms(problem), rng)
-    # A resample changes the norms: unit columns again, so that no unit or draw leaks in; a
-    # culled term becomes a column of zeros.
+    # Resampling changes the norms, so columns are scaled to unit norm again; then the search does
+    # not depend on units or draws. A culled term becomes a column of zeros.
     diagonal = np.diagonal(grams.xx, axis1=1, axis2=2)
     at_hand = kept & (diagonal > 0.0)
     scale = at_hand / np.sqrt(np.where(at_hand, diagonal, 1.0))
@@ -183,13 +186,13 @@ def pooled_supports(
     *,
     rng: np.random.Generator,
 ) -> tuple[Supports, ...]:
-    """Search every bootstrap of the training rows; one `Supports` per equation."""
+    """Search every bootstrap of the training rows, and return one `Supports` per equation."""
     draws = draw_resamples(problem, bootstraps, rng=rng)
     return tuple(pool(draws, k, draws.search(search, k)) for k in range(len(draws.equations)))
 
 
 def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ terms"]]) -> Supports:
-    """Count supports and terms over the draws, as `search` found them."""
+    """Count the supports and terms that `search` found over the draws of one equation."""
     n_terms = draws.kept.shape[1]
     source = np.repeat(np.arange(len(found)), [len(masks) for masks in found])
     masks = np.concatenate(found)
@@ -212,7 +215,7 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
     )
     if draws.counted:
         return supports
-    # One search on all rows says nothing of how often another would agree.
+    # One search on all rows does not tell how often another search would agree.
     return replace(
         supports,
         share=np.full_like(supports.share, np.nan),
@@ -223,11 +226,11 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
 def moving_block_counts(
     n_rows: int, *, n_drawn: int, block: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " rows"]:
-    """How often each row comes in one draw of `n_drawn` rows, taken as runs of `block` rows.
+    """Number of times each row occurs in a draw of `n_drawn` rows, made of runs of `block` rows.
 
-    A row may stand for a group of rows, which come together.
-    Every run lies within the rows; the last one is cut to length. block: 1 draws single rows;
-    for a time series, long enough that rows farther apart are unrelated.
+    A row may stand for a group of rows that are drawn together.
+    Every run lies within the rows; the last run is cut to length. block: 1 draws single rows; for
+    a time series choose it long enough that rows farther apart are uncorrelated.
     Raises ValueError for a block that is not between one row and all of them.
     Source: Kuensch 1989, doi:10.1214/aos/1176347265.
     """

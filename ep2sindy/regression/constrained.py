@@ -1,4 +1,4 @@
-"""Least squares over all equations at once, under exact relations between coefficients."""
+"""Least squares over all equations at once, with exact relations between coefficients."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import WhitenedRows, whitened_rows
 
-MIN_RESIDUAL = 1e-6  # of the target's RMS: no equation weighs more, however exact its fit
+# Lower bound on the residual, as a share of the target's RMS; it limits the weight of an equation
+# with an exact fit.
+MIN_RESIDUAL = 1e-6
 
-N_PASSES = 4  # then a fifth moves nothing by 1e-6 of its error, at 20 % noise
+# Number of reweighting passes. A fifth changes no coefficient by 1e-6 of its error at 20 % noise.
+N_PASSES = 4
 
 
 def constrained_fit(
@@ -30,20 +33,21 @@ def constrained_fit(
 ) -> SparseModel:
     """Fit the free coefficients to the training rows of all equations at once.
 
-    The equations' weights do not depend on their units. Rows whose noise is followed are
-    whitened, to unit variance under the coefficients of the pass before; their samples are
+    The weights of the equations do not depend on their units. Rows with a noise model are
+    whitened to unit variance under the coefficients of the previous pass; their samples are
     corrected by a fit without relations. Rows of any other equation are divided by the standard
     deviation of its residuals without relations, or by 1e-6 of the target's RMS if that is more.
 
-    The covariance is that of the free coefficients carried through C: singular, and zero for
-    fixed values. It takes all rows as independent, although those of two equations share the
-    noise of samples. Rows have variance 1 where all are whitened, that of the residuals
-    otherwise. A coefficient at its bound is held there; it is zero, and has no covariance.
+    The covariance is that of the free coefficients, propagated through C; it is singular, and
+    zero for fixed values. It treats all rows as independent, although the rows of two equations
+    share the noise of samples. If all rows are whitened, their variance is 1; otherwise it is
+    that of the residuals. A coefficient at its bound is held there; it is zero, and has no
+    covariance.
 
     problems: as a formulation assembles them. The model has the constraint's states.
-    signs: (state, term) -> +1 or -1, for coefficients that follow from one free one.
+    signs: (state, term) -> +1 or -1, for coefficients that depend on exactly one free one.
     Raises ValueError for a state without rows, coefficients that these rows cannot tell apart,
-    or a sign that cannot be kept.
+    or a sign that cannot be satisfied.
     """
     library = problems[0].library
     names, states = constraint.coefficients, constraint.states
@@ -55,7 +59,7 @@ def constrained_fit(
     coef, covariance = _solve(equations, constraint, _bounds(constraint, signed))
     for k, sign in signed:
         if sign * coef[k] <= ROUNDING * abs(constraint.d[k]):
-            coef[k] = 0.0  # at its bound, but for rounding
+            coef[k] = 0.0  # at its bound, apart from rounding
     values = [
         {term: c for (s, term), c in zip(names, coef.tolist(), strict=True) if s == state}
         for state in states
@@ -75,7 +79,7 @@ def constrained_fit(
 def _bounds(
     constraint: Constraint, signed: Sequence[tuple[int, int]]
 ) -> Float[np.ndarray, "2 free"]:
-    """Lower and upper bounds of the free coefficients, from the signs of any."""
+    """Lower and upper bounds of the free coefficients that follow from the required signs."""
     bounds = np.outer([-np.inf, np.inf], np.ones(len(constraint.free)))
     for k, sign in signed:
         name = constraint.coefficients[k]
@@ -104,11 +108,11 @@ def _bounds(
 
 @dataclass(frozen=True, eq=False)
 class WeightedEquation:
-    """The rows of one equation.
+    """Rows of one equation, with its part of the constraint's coefficients.
 
-    at: which of the constraint's coefficients are its own; terms: their places in the library.
-    start: these, from a fit without relations, by which the samples of noisy rows are corrected.
-    std: of the residuals of that fit, in units of the target's scale.
+    at: indices of this equation's coefficients in the constraint; terms: their library indices.
+    start: coefficients of a fit without relations, by which samples of noisy rows are corrected.
+    std: standard deviation of the residuals of that fit, in units of the target's scale.
     """
 
     problem: RegressionRows
@@ -121,7 +125,7 @@ class WeightedEquation:
     def rows(
         self, coef: Float[np.ndarray, " own"]
     ) -> tuple[Float[np.ndarray, "rows own"], Float[np.ndarray, " rows"]]:
-        """Terms and target, whose residuals have variance 1 if these are the coefficients."""
+        """Terms and target, weighted so that residuals have variance 1 for these coefficients."""
         scale = self.problem.coef_scale(self.number)[self.terms]
         if self.problem.noisy is not None:
             white = _whiten(self.problem, self.terms, coef / scale, n_steps=0)
@@ -141,7 +145,7 @@ def _whiten(
 def weighted_equations(
     problems: Sequence[RegressionRows], constraint: Constraint
 ) -> list[WeightedEquation]:
-    """Those of the constraint's equations that free coefficients have a part in."""
+    """The constraint's equations that depend on at least one free coefficient."""
     places = {name: (p, k) for p in problems for k, name in enumerate(p.equations)}
     equations = []
     for state in constraint.states:
@@ -182,7 +186,7 @@ def _solve(
     constraint: Constraint,
     bounds: Float[np.ndarray, "2 free"],
 ) -> tuple[Float[np.ndarray, " coefs"], Float[np.ndarray, "coefs coefs"]]:
-    """All coefficients and their covariance, in SI; noisy rows are weighted anew in each pass."""
+    """All coefficients and their covariance, in SI; noisy rows are reweighted in each pass."""
     C, d = constraint.C, constraint.d
     coef = d.copy()
     for equation in equations:
@@ -206,8 +210,8 @@ def _least_squares(
     bounds: Float[np.ndarray, "2 free"],
     names: Sequence[tuple[str, str]],
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"], float]:
-    """Coefficients, a root of their covariance for rows of variance 1, that variance."""
-    from scipy.optimize import lsq_linear  # half a second that most searches do not need
+    """Coefficients, a root of their covariance for rows of variance 1, and the rows' variance."""
+    from scipy.optimize import lsq_linear  # import takes 0.5 s; most searches do not need it
 
     n = theta.shape[1]
     norms, size = column_norms(theta), np.linalg.norm(target) or 1.0

@@ -1,4 +1,4 @@
-"""The differential form: derivatives at samples regressed on terms at samples."""
+"""Differential form: derivatives at samples are regressed on library terms at the samples."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 class Differential:
     """Regress the derivative at every sample on the library at that sample.
 
-    smooth_library: evaluate the terms on smoothed samples (the default: with noise in them a
-    wrong support can score best) or on raw ones (the thesis).
+    smooth_library: evaluate the terms on smoothed samples (default) or on raw ones (the thesis).
+    With noise in the terms a wrong support can score best.
     """
 
     smoother: Smoother = field(default_factory=SavitzkyGolay)
@@ -34,10 +34,10 @@ class Differential:
         *,
         rng: np.random.Generator,
     ) -> tuple[RegressionRows, ...]:
-        """Rows of all trajectories below one another; every row uses one trajectory alone.
+        """Stack the rows of all trajectories; every row uses samples of one trajectory only.
 
         All equations share their rows, so there is one regression.
-        Raises ValueError for no trajectory, trajectories with other states, or a variable of
+        Raises ValueError for no trajectory, trajectories with different states, or a variable of
         the library that a trajectory lacks.
         """
         check_agreement(trajectories, library.variables)

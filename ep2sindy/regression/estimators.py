@@ -1,12 +1,12 @@
-"""The adaptive lasso as a scikit-learn regressor, to be plugged into other tools such as PySINDy.
+"""The adaptive lasso as a scikit-learn regressor, for use in other tools such as PySINDy.
 
-scikit-learn asks for what the rest of the package does without: a class that inherits, and that
-must be fitted before it predicts. It stays in this module. There is no intercept, since a
-library of terms holds the constant itself.
+scikit-learn requires a class that inherits, and that must be fitted before it predicts. The rest
+of the package avoids both, so such classes are confined to this module. There is no intercept,
+since a library of terms contains the constant itself.
 
 In PySINDy: SINDy(optimizer=WrappedOptimizer(AdaptiveLassoRegressor(), unbias=False)). The
-coefficients are those of least squares already, and unbiasing them once more drops whatever is
-below 1e-14, where the rate coefficients of a plasma in SI lie.
+coefficients are least-squares values already. Unbiasing them again would drop coefficients
+below 1e-14, such as the rate coefficients of a plasma in SI.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from ep2sindy.regression.searches import AdaptiveLasso
 
 
 class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
-    """The support of least BIC on the path of the adaptive lasso, fitted by least squares.
+    """Least-squares fit of the support with the lowest BIC on the adaptive-lasso path.
 
     BIC = n_rows log(residual) + n_terms log(n_rows), where the residual is a share of the sum
-    of the target's squares. Nothing depends on the units of the columns or the target.
+    of the target's squares. The support does not depend on the units of columns or target.
     gamma, max_terms: as in `AdaptiveLasso`.
-    tolerance: a residual below it counts as equal to it. Differentiation leaves an error that
-    is no white noise, and without a floor BIC spends the whole library on explaining it.
-    Once fitted: coef_ and support_, its mask: (terms,) for y of (rows,), else (targets, terms).
+    tolerance: a residual below it counts as equal to it. The error of differentiation is not
+    white noise, and without a lower bound BIC would use the whole library to explain it.
+    Attributes after `fit`: coef_, and its mask support_; (terms,) for y of (rows,), otherwise
+    (targets, terms).
     Source of the criterion: Schwarz 1978, doi:10.1214/aos/1176344136.
     """
 
@@ -39,7 +40,7 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     max_terms: int | None
     tolerance: float
 
-    @no_type_check  # scikit-learn's rule: it stores anything, and `fit` refuses
+    @no_type_check  # rule of scikit-learn: the constructor stores any value, and `fit` checks it
     def __init__(
         self, *, gamma: float = 1.0, max_terms: int | None = None, tolerance: float = 1e-4
     ) -> None:
@@ -48,7 +49,10 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.tolerance = tolerance
 
     def fit(self, X: Any, y: Any) -> AdaptiveLassoRegressor:
-        """X: (rows, terms). y: (rows,) or (rows, targets); each target gets its own support."""
+        """Choose and fit a support for each target.
+
+        X: (rows, terms). y: (rows,) or (rows, targets).
+        """
         search = AdaptiveLasso(gamma=self.gamma, max_terms=self.max_terms)
         if not 0.0 < self.tolerance < 1.0:
             raise ValueError(f"tolerance must lie in (0, 1): {self.tolerance} came")
@@ -59,7 +63,7 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         support = np.array([self._choose(search, xx, products, len(X)) for products in xy])
         coef = np.zeros(support.shape)
         for mask, row, target in zip(support, coef, targets.T, strict=True):
-            # Solved on the rows: the Gram matrix squares their condition.
+            # Solved on the rows, since the Gram matrix squares their condition number.
             row[mask] = np.linalg.lstsq(columns[:, mask], target, rcond=None)[0]
         coef *= target_norms[:, None] / column_norms
         self.coef_ = coef if y.ndim == 2 else coef[0]
@@ -68,7 +72,7 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self
 
     def predict(self, X: Any) -> np.ndarray:
-        """X: (rows, terms). Returns (rows,) or (rows, targets), as y was."""
+        """Predict the targets for X (rows, terms); returns (rows,) or (rows, targets), like y."""
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, reset=False)
         return X @ self.coef_.T
@@ -76,7 +80,7 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _choose(
         self, search: AdaptiveLasso, xx: np.ndarray, xy: np.ndarray, n_rows: int
     ) -> np.ndarray:
-        """One support, from Gram matrices of columns and a target of unit norm."""
+        """Support of lowest BIC, from Gram matrices of columns and a target of unit norm."""
         masks = search.supports(xx, xy, 1.0)
         residual = np.maximum(_residual_shares(xx, xy, masks), self.tolerance)
         bic = n_rows * np.log(residual) + masks.sum(axis=1) * np.log(n_rows)
@@ -86,7 +90,7 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 def _unit_columns(
     values: Float[np.ndarray, "rows columns"],
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " columns"]]:
-    """Columns over their L2 norms, and the norms; 1 for a column of zeros."""
+    """Columns divided by their L2 norms, and the norms; the norm of a zero column is set to 1."""
     # Unlike squares, hypot does not overflow at densities to high powers.
     norms = zero_to_one(np.hypot.reduce(np.abs(values), axis=0))
     return values / norms, norms
@@ -97,6 +101,6 @@ def _residual_shares(
     xy: Float[np.ndarray, " terms"],
     masks: Bool[np.ndarray, "supports terms"],
 ) -> Float[np.ndarray, " supports"]:
-    """What least squares on each support leaves of a target of norm 1; NaN if terms depend."""
+    """Least-squares residual, squared, of a target of norm 1; NaN for dependent terms."""
     coef = solve_masks(xx, np.where(masks, xy, 0.0), masks)
     return 1.0 - (coef * (2.0 * xy - coef @ xx)).sum(axis=1)

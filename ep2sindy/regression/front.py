@@ -1,4 +1,4 @@
-"""The Pareto front of error against number of terms."""
+"""Pareto front of error versus number of terms."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ from ep2sindy.runtime.screen import html_table, one_screen, text_table
 class Candidate:
     """One support of one equation, with its fit.
 
-    coef: (terms of the support,), in SI: of a regression least squares on the training rows, of a
-    search of trajectories the likeliest beside the other equations. r2_train, r2_test: 1 -
-    SS_res/SS_tot with the data as truth; NaN without such rows, both where there are none at all.
+    coef: (terms of the support,), in SI. From a regression: least squares on the training rows;
+    from a search of trajectories: the most likely values given the other equations.
+    r2_train, r2_test: 1 - SS_res/SS_tot with the data as truth; NaN if there are no such rows.
     share: share of bootstraps that found this support. inclusion: for each of its terms, the share
-    of bootstraps in which the term stood in a support of this size; both NaN without bootstraps.
-    deviance: -2 log likelihood of whole trajectories plus the price of the terms, beside the best
-    system's; None where rows alone were fitted. score: of the rule that selected among the
-    candidates of its front, least selected; NaN before.
+    of bootstraps in which the term was in a support of this size. Both are NaN without bootstraps.
+    deviance: -2 log likelihood of whole trajectories plus the penalty for the terms, relative to
+    the best system; None if only rows were fitted.
+    score: value of the selection rule, the lowest of the front being selected; NaN before
+    selection.
     """
 
     equation: str
@@ -51,16 +52,16 @@ class Candidate:
 
     @property
     def r2(self) -> float:
-        """On held-out rows, or on the training rows where none are held out."""
+        """R2 on held-out rows, or on the training rows if none are held out."""
         return self.r2_train if np.isnan(self.r2_test) else self.r2_test
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Every distinct support that a search proposed: its number of terms, and its error.
+    """Number of terms and error of every distinct support that a search proposed.
 
-    errors: 1 - R2 as `ParetoFront.errors`, but from Gram matrices alone, so an exact fit has one
-    of some 1e-13, of either sign. Supports whose terms depend on each other have none.
+    errors: 1 - R2 as in `ParetoFront.errors`, but from Gram matrices only, so an exact fit has an
+    error of about 1e-13, of either sign. Supports with linearly dependent terms are left out.
     """
 
     sizes: Int[np.ndarray, " supports"]
@@ -71,11 +72,11 @@ class Cloud:
 class ParetoFront:
     """The best candidates of every size, the empty model first.
 
-    From `pareto_front` they are sorted by size, and within a size by error: the first of each
-    size is the front proper, whose error falls, any others are runners-up. A shared search ranks
-    by all of its points: at one of them errors may rise. problem: the rows they were fitted to;
-    None of a search of trajectories, which has none. cloud: all supports that these were taken
-    from; None where a front was not made of any.
+    `pareto_front` sorts them by size, and within a size by error. The first candidates of the
+    sizes form the front proper, along which the error decreases; the others are runners-up. A
+    search shared by several points ranks by all of them, so errors may increase at one point.
+    problem: rows that the candidates were fitted to; None for a search of trajectories. cloud:
+    all supports that the candidates were taken from; None if the front was not made from a cloud.
     """
 
     equation: str
@@ -90,7 +91,7 @@ class ParetoFront:
 
     @property
     def rows(self) -> RegressionRows:
-        """The rows of a regression. Raises ValueError where there are none."""
+        """Rows of the regression. Raises ValueError if there are none."""
         if self.problem is None:
             raise ValueError(
                 f"rows are needed to judge the candidates of {self.equation!r}, and a search of "
@@ -100,27 +101,27 @@ class ParetoFront:
 
     @property
     def held_out(self) -> bool:
-        """Whether some rows were held out from the fits."""
+        """True if some rows were held out from the fits."""
         return any(not np.isnan(candidate.r2_test) for candidate in self.candidates)
 
     @property
     def scores(self) -> Float[np.ndarray, " candidates"]:
-        """Of the rule that selected among them, the lowest selected."""
+        """Scores by the selection rule; the candidate of lowest score is selected."""
         return np.array([candidate.score for candidate in self.candidates])
 
     @property
     def best(self) -> Candidate:
-        """The candidate of least score; of several, the smallest."""
+        """Candidate of lowest score; the smallest one if several tie."""
         return self.candidates[int(np.argmin(self.scores))]
 
     def with_scores(self, scores: Float[np.ndarray, " candidates"]) -> ParetoFront:
-        """The same candidates, with what a rule says of them."""
+        """Copy of the front whose candidates have these scores."""
         pairs = zip(self.candidates, scores.tolist(), strict=True)
         return replace(self, candidates=[replace(each, score=score) for each, score in pairs])
 
     @property
     def errors(self) -> Float[np.ndarray, " candidates"]:
-        """1 - R2 on held-out rows, or on the training rows where none are held out."""
+        """1 - R2 on held-out rows, or on the training rows if none are held out."""
         return errors_of(self.candidates)
 
     @property
@@ -129,7 +130,7 @@ class ParetoFront:
 
     @property
     def leading(self) -> Bool[np.ndarray, " candidates"]:
-        """Whether a candidate is the best of its size."""
+        """True for the best candidate of each size."""
         return np.diff(self.sizes, prepend=-1.0) > 0
 
     def __repr__(self) -> str:
@@ -149,7 +150,7 @@ class ParetoFront:
 
     @property
     def _figure(self) -> str:
-        """What is told of every candidate."""
+        """Heading of the figure of merit in tables."""
         return "R2" if self.problem is not None else "deviance"
 
     @property
@@ -160,14 +161,14 @@ class ParetoFront:
 
 
 def errors_of(candidates: Sequence[Candidate]) -> Float[np.ndarray, " candidates"]:
-    """1 - R2 on held-out rows, or on the training rows where none are held out."""
+    """1 - R2 on held-out rows, or on the training rows if none are held out."""
     return np.array([1.0 - candidate.r2 for candidate in candidates])
 
 
 def fit_support(problem: RegressionRows, equation: str, terms: Sequence[str]) -> Candidate:
-    """Fit one given support of one equation to the training rows; no bootstrap stands behind it.
+    """Fit one given support of one equation to the training rows, without bootstraps.
 
-    Raises ValueError for an unknown term, or terms that depend on each other on these rows.
+    Raises ValueError for an unknown term, or terms that are linearly dependent on these rows.
     """
     mask = np.zeros((1, len(problem.library)), dtype=np.bool_)
     mask[0, [problem.library.index(name) for name in terms]] = True
@@ -180,7 +181,7 @@ def fit_support(problem: RegressionRows, equation: str, terms: Sequence[str]) ->
 def fit_supports(
     problem: RegressionRows, equation: str, masks: Bool[np.ndarray, "supports terms"]
 ) -> list[Candidate]:
-    """Fit given supports, as `fit_support`; coefficients of dependent terms are NaN."""
+    """Fit given supports as in `fit_support`; coefficients of dependent terms are NaN."""
     unknown = np.full(len(masks), np.nan)
     nothing = np.full((len(problem.library) + 1, len(problem.library)), np.nan)
     return _candidates(problem, Supports(equation, masks, unknown, nothing))
@@ -189,10 +190,10 @@ def fit_supports(
 def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1) -> ParetoFront:
     """Fit every support on all training rows and keep the `depth` best of each size.
 
-    "Best" is by held-out rows, as in the thesis, or by the training rows where none are held out.
-    A size whose best does not beat a smaller one is left out, and so are supports whose terms
-    depend on each other. With noise in the library a wrong support can lead the true one of its
-    size by a hair; a depth of 3 keeps both for a better judge.
+    "Best" is by held-out rows, as in the thesis, or by the training rows if none are held out.
+    A size whose best support does not beat all smaller sizes is left out, and so are supports
+    with linearly dependent terms. With noise in the library a wrong support can score slightly
+    better than the true one of the same size; a depth of 3 keeps both for a later selection.
     """
     n_terms = len(problem.library)
     equation = problem.equations.index(supports.equation)
@@ -219,7 +220,7 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
 def front_order(
     sizes: Int[np.ndarray, " candidates"], errors: Float[np.ndarray, " candidates"], *, depth: int
 ) -> list[int]:
-    """The `depth` of least error of each size whose best beats all smaller sizes, in order."""
+    """Indices of the front: the `depth` best of each size whose best beats all smaller sizes."""
     if depth < 1:
         raise ValueError(f"depth must be at least 1: {depth} came")
     front: list[int] = []
@@ -233,7 +234,7 @@ def front_order(
 
 
 def _candidates(problem: RegressionRows, supports: Supports) -> list[Candidate]:
-    """Every support fitted to the training rows and scored on both kinds of rows."""
+    """Candidates fitted to the training rows, and scored on both training and held-out rows."""
     equation = problem.equations.index(supports.equation)
     coef = _fit(problem, equation, supports.masks)
     coef_SI = problem.coef_SI(coef, equation)
@@ -256,9 +257,9 @@ def _candidates(problem: RegressionRows, supports: Supports) -> list[Candidate]:
 def _explain(
     problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
 ) -> Float[np.ndarray, " supports"]:
-    """By how much each support lowers the target's squares on the rows that judge.
+    """Reduction of the target's sum of squares by each support, on the rows used for scoring.
 
-    From Gram matrices alone; NaN where terms depend on each other.
+    Computed from Gram matrices only; NaN for linearly dependent terms.
     """
     train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
@@ -269,7 +270,7 @@ def _explain(
 def _best_of_each_size(
     sizes: Int[np.ndarray, " supports"], explained: Float[np.ndarray, " supports"], depth: int
 ) -> Int[np.ndarray, " best"]:
-    """Indices of the supports of least error, by number of terms."""
+    """Indices of the `depth` supports of least error of each size, ordered by size."""
     order = np.lexsort((-explained, sizes))
     order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
     _, first, count = np.unique(sizes[order], return_index=True, return_counts=True)
@@ -283,7 +284,10 @@ def _cloud(
     sizes: Int[np.ndarray, " supports"],
     explained: Float[np.ndarray, " supports"],
 ) -> Cloud:
-    """Errors of all supports; the squares about the mean are not zero, or no R2 was taken."""
+    """Sizes and errors of all supports.
+
+    The sum of squares about the mean is not zero here: `r2` would have raised before.
+    """
     held_out = problem.test.any()
     y = problem.test_target(equation) if held_out else problem.train_target(equation)
     errors = (y @ y - explained) / np.square(y - y.mean()).sum()
@@ -294,9 +298,9 @@ def _cloud(
 def _fit(
     problem: RegressionRows, equation: int, masks: Bool[np.ndarray, "supports terms"]
 ) -> Float[np.ndarray, "supports terms"]:
-    """Least squares on the training rows, in scaled columns.
+    """Least-squares coefficients of every support on the training rows, in scaled columns.
 
-    The Gram matrix squares the condition of the rows, so its solution is refined against the
+    The Gram matrix squares the condition number of the rows, so its solution is refined with the
     residuals of the rows themselves (Bjorck 1996, Numerical Methods for Least Squares, 2.9.3).
     """
     gram = problem.train_gram
@@ -314,7 +318,7 @@ def _r2(
     target: Float[np.ndarray, " rows"],
     coef: Float[np.ndarray, "supports terms"],
 ) -> Float[np.ndarray, " supports"]:
-    """R2 of every support on some rows; NaN where there are none."""
+    """R2 of every support on the given rows; NaN if there are none."""
     if not len(target):
         return np.full(len(coef), np.nan)
     return r2(truth=target, prediction=coef @ theta.T)

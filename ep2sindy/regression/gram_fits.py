@@ -1,4 +1,4 @@
-"""Compiled least squares on supports, from Gram matrices alone.
+"""Compiled least squares on supports, from Gram matrices only.
 
 xx: (terms, terms) is a Gram matrix of columns in comparable units; a mask: (terms,) of bool is a
 support.
@@ -8,10 +8,10 @@ import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
 
-# A column counts as dependent on others when what they leave of its square falls below this.
+# A column counts as dependent on others if their residual of its square falls below this share.
 DEPENDENT = 1e-11
 
-# What is left of a target's square below this share of it is rounding.
+# A residual of the target's square below this share counts as rounding.
 ROUNDING = 1e-15
 
 
@@ -45,7 +45,7 @@ def solve(xx, rhs, active, n_active, out):
 
 @compiled
 def independent_terms(xx):
-    """Mask of a maximal independent set, earlier terms first."""
+    """Mask of a maximal independent set of terms; earlier terms take precedence."""
     n_terms = len(xx)
     mask = np.zeros(n_terms, dtype=np.bool_)
     lower = np.zeros((n_terms, n_terms))
@@ -69,7 +69,7 @@ def independent_terms(xx):
 
 @compiled
 def _fill_active(masks, m, active):
-    """Fill in the terms of one mask; how many they are."""
+    """Write the indices of the terms of one mask into `active`; returns their number."""
     n_active = 0
     for j in range(masks.shape[1]):
         if masks[m, j]:
@@ -80,7 +80,7 @@ def _fill_active(masks, m, active):
 
 @compiled
 def solve_masks(xx, rhs, masks):
-    """Solve xx coef = rhs on each support; NaN where its columns depend on each other.
+    """Solve xx coef = rhs on each support; NaN if its columns are linearly dependent.
 
     rhs, masks and the returned coef: (masks, terms); coef is zero outside the support.
     """
@@ -88,7 +88,7 @@ def solve_masks(xx, rhs, masks):
     coef = np.zeros((n_masks, n_terms))
     solution = np.empty(n_terms)
     active = np.empty(n_terms, dtype=np.int64)
-    for m in range(n_masks):  # loops: fancy indices would take seconds more to compile
+    for m in range(n_masks):  # loops, since fancy indices would take seconds longer to compile
         n_active = _fill_active(masks, m, active)
         if solve(xx, rhs[m], active, n_active, solution):
             for i in range(n_active):

@@ -1,4 +1,4 @@
-"""The regression problem target = theta coef: its rows, their split, and its Gram matrices."""
+"""Regression problem target = theta coef: rows, their split, and Gram matrices."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
 
-ROW_BLOCK = 512  # rows whose pair products are held at once: they stay in the cache
+ROW_BLOCK = 512  # rows whose pair products are held at once, few enough to fit in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Grams:
-    """Weighted sums of products of scaled columns: all that least squares needs of the rows.
+    """Gram matrices: weighted sums of products of scaled columns, all that least squares needs.
 
-    One per draw of row weights. xx: (draws, terms, terms), xy: (draws, equations, terms),
-    yy: (draws, equations).
+    There is one set per draw of row weights. xx: (draws, terms, terms), xy: (draws, equations,
+    terms), yy: (draws, equations).
     """
 
     xx: Float[np.ndarray, "draws terms terms"]
@@ -36,11 +36,12 @@ class Grams:
 
 @dataclass(frozen=True, eq=False)
 class NoisyRows:
-    """How the training rows of one equation follow from noisy samples x.
+    """Dependence of the training rows of one equation on the noisy samples x.
 
-    Targets are slope @ x[state], terms are mean @ library(x); both sparse, (rows, samples).
-    values: (samples, variables), the library's variables and then states that it lacks;
-    smoothed: an estimate of their true values; noise_std: of their independent noise.
+    Targets are slope @ x[state], terms are mean @ library(x); both matrices are sparse, (rows,
+    samples). values: (samples, variables), the library's variables, then states that it lacks.
+    smoothed: an estimate of their true values. noise_std: standard deviation of their independent
+    noise.
     """
 
     mean: csr_array
@@ -56,11 +57,10 @@ class RegressionRows:
     """Rows of library terms and targets, in SI units, ready for a search.
 
     theta: (rows, terms). target: (rows, equations).
-    groups: (rows,), rows that share samples share a number, and stay together in a split or a
-    bootstrap. test: (rows,), true for held-out rows.
-    trajectories: what the rows were made from; draws of neighbours never cross from one to the
-    next. noisy: where the noise of the samples can be followed into the training rows, how; then
-    there is one equation.
+    groups: (rows,), group numbers; rows that share samples belong to one group, and stay together
+    in a split or a bootstrap. test: (rows,), true for held-out rows.
+    trajectories: source of the rows; draws of neighbours never cross from one to the next.
+    noisy: dependence of the training rows on noisy samples, if known; then there is one equation.
     Raises ValueError for values that are not finite or fewer training rows than terms.
     """
 
@@ -131,13 +131,13 @@ class RegressionRows:
         return self.test_rows[:, len(self.library) + equation]
 
     def coef_scale(self, equation: int) -> Float[np.ndarray, " terms"]:
-        """What takes coefficients of scaled columns to SI."""
+        """Factors that convert coefficients of scaled columns to SI."""
         return self.target_scale[equation] / self.theta_scale
 
     def coef_SI(
         self, coef: Float[np.ndarray, "*draws terms"], equation: int
     ) -> Float[np.ndarray, "*draws terms"]:
-        """Coefficients of scaled columns in SI; apart from rounding, times `coef_scale`."""
+        """Convert coefficients of scaled columns to SI; equals coef * coef_scale up to rounding."""
         return coef * self.target_scale[equation] / self.theta_scale
 
     @cached_property
@@ -149,9 +149,9 @@ class RegressionRows:
         return self._grams((self.test_rows.T @ self.test_rows)[None])
 
     def check_grams(self, n_draws: int) -> None:
-        """Raise ValueError where the Gram matrices of so many draws are more than memory holds."""
+        """Raise ValueError if the Gram matrices of `n_draws` draws exceed the memory."""
         n_columns = self.train_rows.shape[1]
-        each = 8.0 * 5.0 * n_columns**2  # whole, and what is scaled of it
+        each = 8.0 * 5.0 * n_columns**2  # the whole matrix and its scaled copies
         products_of_rows = 3.0 * 4.0 * n_columns**2 * min(ROW_BLOCK, len(self.train_rows))
         check_memory(
             each * n_draws + products_of_rows,
@@ -161,10 +161,10 @@ class RegressionRows:
         )
 
     def resampled_grams(self, weights: Float[np.ndarray, "draws train"]) -> Grams:
-        """Gram matrices of the training rows, each row counted `weights` times, per draw.
+        """Gram matrices of the training rows for each draw, each row counted `weights` times.
 
         All draws share the products of pairs of columns, so each draw is one row of a matrix
-        product; blocks of rows keep those products small.
+        product. Rows are processed in blocks to keep these products small.
         """
         self.check_grams(len(weights))
         rows = self.train_rows
@@ -182,7 +182,7 @@ class RegressionRows:
 
     def _scaled(self, rows: np.ndarray) -> np.ndarray:
         index, n = np.flatnonzero(rows), len(self.library)
-        # Filled in place: joining narrow arrays side by side takes ten times as long.
+        # Filled in place: concatenating narrow arrays side by side takes ten times as long.
         scaled = np.empty((len(index), n + len(self.equations)))
         scaled[:, :n], scaled[:, n:] = self.theta[index], self.target[index]
         scaled /= np.concatenate([self.theta_scale, self.target_scale])
@@ -198,8 +198,8 @@ class RegressionRows:
 
 
 def _column_norms(values: np.ndarray) -> np.ndarray:
-    """L2 norms without overflow at densities to high powers."""
-    columns = np.abs(values.T, order="C")  # each in one stretch of memory
+    """L2 norms of columns, without overflow for high powers of densities."""
+    columns = np.abs(values.T, order="C")  # each column contiguous in memory
     largest = zero_to_one(columns.max(axis=1))
     columns /= largest[:, None]
     return zero_to_one(largest * np.sqrt(np.einsum("cr,cr->c", columns, columns)))
@@ -207,9 +207,10 @@ def _column_norms(values: np.ndarray) -> np.ndarray:
 
 @runtime_checkable
 class Formulation(Protocol):
-    """Turns trajectories into regressions: one, or one per equation where rows differ.
+    """Interface that turns trajectories into regressions: one, or one per equation if rows differ.
 
-    smoother: of the samples' derivative, if any; figures of derivatives take it too.
+    smoother: smoother for the derivative of the samples, if any; figures of derivatives use it,
+    too.
     """
 
     @property

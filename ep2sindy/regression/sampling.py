@@ -1,4 +1,4 @@
-"""Samples at unequal steps: stretches without gaps, and even grids inside them."""
+"""Sampling at unequal steps: division into stretches without gaps, and even grids in them."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from scipy.sparse import csr_array
 
 from ep2sindy.data.numbers import rounding_s
 
-# Deviation from an even grid, in steps, that is taken for rounding of the recorded times: a sample
-# so far off is wrong by a twentieth of what the signal changes in a step.
+# Largest deviation from an even grid, in steps, that is attributed to rounding of the recorded
+# times. The error of such a sample is a twentieth of the signal's change in a step.
 ROUNDED = 0.05
 
-# Longest step, in median steps, that is interpolated; a longer one is a gap. Times at random have
-# such a gap once in 1000 samples, and losses at random of 30 % never; at 5, times at random fall
-# into stretches of some 30 samples, and Lorenz was never found.
+# Longest step, in median steps, that is interpolated; a longer one is a gap. Random times have
+# such a gap once in 1000 samples, random losses of 30 % never. With a limit of 5, random times are
+# divided into stretches of about 30 samples, and Lorenz was never found.
 LONGEST_STEP = 10.0
 
-MIN_SAMPLES = 20  # of a stretch between gaps: fewer say nothing of their own noise
+MIN_SAMPLES = 20  # least samples of a stretch between gaps; fewer do not determine their noise
 
 
 def is_even(t: Float[np.ndarray, " samples"]) -> bool:
-    """Whether times lie on an even grid but for rounding."""
+    """Return true if the times lie on an even grid, apart from rounding."""
     step = (t[-1] - t[0]) / (len(t) - 1)
     off = np.abs(t - t[0] - step * np.arange(len(t))).max()
     return bool(off <= max(ROUNDED * step, rounding_s(t)))
@@ -52,9 +52,9 @@ def stretches(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
 def even_grid(
     t: Float[np.ndarray, " samples"],
 ) -> tuple[Float[np.ndarray, " points"], csr_array]:
-    """An even grid of about the median step, and (points, samples) that interpolates on to it.
+    """Even grid with about the median step, and the matrix (points, samples) that interpolates.
 
-    Straight lines between samples: weights are not negative, so noise is never amplified.
+    Interpolation is linear: weights are not negative, so noise is never amplified.
     """
     n_steps = max(1, round(float((t[-1] - t[0]) / np.median(np.diff(t)))))
     grid = np.linspace(t[0], t[-1], n_steps + 1)
@@ -71,6 +71,9 @@ def even_grid(
 def one_about_each(
     t: Float[np.ndarray, " samples"], middle: Float[np.ndarray, " windows"]
 ) -> Int[np.ndarray, " kept"]:
-    """Of windows about increasing times, the first of those that are nearest to the same sample."""
+    """Indices of windows to keep: the first of all windows nearest to the same sample.
+
+    middle: increasing times of the middles of the windows.
+    """
     nearest = np.searchsorted(0.5 * (t[1:] + t[:-1]), middle)
     return np.flatnonzero(np.diff(nearest, prepend=-1) > 0)

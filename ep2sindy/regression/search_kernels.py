@@ -1,7 +1,7 @@
-"""Compiled kernels that work on Gram matrices alone: lasso paths, thresholding, subsets, fits.
+"""Compiled searches on Gram matrices: lasso paths, thresholding, best subsets.
 
-In every kernel xx: (terms, terms) is a Gram matrix of columns in comparable units and
-xy: (terms,) their products with one target; a mask: (terms,) of bool is a support.
+In every kernel, xx: (terms, terms) is a Gram matrix of columns in comparable units, and
+xy: (terms,) holds their products with one target. A mask: (terms,) of bool is a support.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from ep2sindy.runtime.compilation import compiled
 
 @compiled
 def _next_event(coef, slope, correlation, drift, level, active, n_active, barred):
-    """First knot as the lasso's penalty falls from `level`: step, term, joins or leaves."""
+    """Next knot of the lasso path below the penalty `level`: step, term, and whether it joins."""
     step, term, joins = level, -1, False
     is_active = np.zeros(len(coef), dtype=np.bool_)
     for i in range(n_active):
@@ -34,9 +34,9 @@ def _next_event(coef, slope, correlation, drift, level, active, n_active, barred
 
 @compiled
 def lasso_supports(xx, xy, max_terms):
-    """Every support on the exact lasso path, from the empty one to `max_terms` or all terms.
+    """All supports on the exact lasso path, from the empty one to `max_terms` or all terms.
 
-    Homotopy in the penalty with terms joining and leaving (Osborne, Presnell & Turlach 2000,
+    Homotopy in the penalty, in which terms join and leave (Osborne, Presnell & Turlach 2000,
     doi:10.1093/imanum/20.3.389; Efron et al. 2004, doi:10.1214/009053604000000067).
     """
     n_terms = len(xy)
@@ -52,7 +52,7 @@ def lasso_supports(xx, xy, max_terms):
     while level > floor and n_masks < limit:
         drift = _drift(xx, slope, active, n_active)
         if left >= 0:
-            barred[left] = True  # at this very knot it would come straight back
+            barred[left] = True  # it would rejoin at this same knot
         step, term, joins = _next_event(
             coef, slope, correlation, drift, level, active, n_active, barred
         )
@@ -74,7 +74,7 @@ def lasso_supports(xx, xy, max_terms):
             left = term
         signs[active[:n_active]] = np.sign(correlation[active[:n_active]])
         if not solve(xx, signs, active, n_active, slope):
-            barred[term] = True  # it repeats what is active: the path goes on without it
+            barred[term] = True  # it depends on the active terms; the path continues without it
             n_active = _leave(active, n_active, term)
             solve(xx, signs, active, n_active, slope)
             continue
@@ -87,7 +87,7 @@ def lasso_supports(xx, xy, max_terms):
 
 @compiled
 def _drift(xx, slope, active, n_active):
-    """How fast each term's correlation falls along the path."""
+    """Rate at which each term's correlation decreases along the path."""
     drift = np.zeros(len(xx))
     for i in range(n_active):
         for j in range(len(xx)):
@@ -99,7 +99,7 @@ def _drift(xx, slope, active, n_active):
 def adaptive_lasso_supports(xx, xy, gamma, max_terms):
     """Supports on the path of the lasso with penalties |b_ols|^-gamma (Zou 2006).
 
-    Scaling each column by |b_ols|^gamma makes it a plain lasso. A term that depends on earlier
+    Scaling each column by |b_ols|^gamma makes this a plain lasso. A term that depends on earlier
     ones has no least-squares coefficient of its own and never joins.
     """
     everything = independent_terms(xx).reshape(1, -1)
@@ -119,7 +119,7 @@ def _leave(active, n_active, term):
 
 @compiled
 def thresholded_supports(xx, xy, thresholds):
-    """Sequentially thresholded least squares, iterated to its end, for every threshold."""
+    """Supports by sequentially thresholded least squares, iterated to convergence per threshold."""
     n_terms = len(xy)
     masks = np.zeros((len(thresholds), n_terms), dtype=np.bool_)
     start = independent_terms(xx)
@@ -141,7 +141,7 @@ def thresholded_supports(xx, xy, thresholds):
 
 @compiled
 def _sweep(source, target, j, size):
-    """Remove from rows and columns after j what column j explains of them."""
+    """Eliminate column j: remove its contribution from the rows and columns after j."""
     for a in range(j + 1, size):
         ratio = source[a, j] / source[j, j]
         for b in range(a, size):
@@ -151,16 +151,16 @@ def _sweep(source, target, j, size):
 
 @compiled
 def _join(total, residual, rounding, n_problems):
-    """Carry the product of residuals on by one: as a logarithm, or plainly if it is the only."""
+    """Multiply the product of residuals by one more, in logarithms; plain if there is only one."""
     return residual if n_problems == 1 else total + np.log(max(residual, rounding))
 
 
 @compiled
 def _least_residual(matrices, first, size, smallest, scratch):
-    """The same when every column from `first` on is used: a bound for a whole subtree."""
+    """Product of residuals if all columns from `first` on are used: a bound for a subtree."""
     total = 0.0
     for p in range(len(matrices)):
-        for a in range(first, size):  # slices would take seconds more to compile
+        for a in range(first, size):  # slices would take seconds longer to compile
             for b in range(first, size):
                 scratch[a, b] = matrices[p, a, b]
         for j in range(first, size - 1):
@@ -172,7 +172,7 @@ def _least_residual(matrices, first, size, smallest, scratch):
 
 @compiled
 def _offer(residual, chosen, n_chosen, best, best_masks):
-    """Keep a subset among the best of its size, sorted by residual."""
+    """Insert a subset into the list of the best of its size, sorted by residual, if it is."""
     rank = best.shape[1]
     while rank > 0 and residual < best[n_chosen, rank - 1]:
         rank -= 1
@@ -192,7 +192,7 @@ def _offer(residual, chosen, n_chosen, best, best_masks):
 
 @compiled
 def _root(xx, xy, yy, depth):
-    """Gram matrices of columns and target, with room for `depth` steps down, and what is zero."""
+    """Gram matrices of columns and target, room for `depth` levels, and the bounds for zero."""
     n_problems, n_terms = xy.shape
     levels = np.zeros((depth + 1, n_problems, n_terms + 1, n_terms + 1))
     smallest = np.empty((n_problems, n_terms + 1))
@@ -209,7 +209,7 @@ def _root(xx, xy, yy, depth):
 
 @compiled(inline="always")  # a call would cost the search 5 %
 def _eliminate(levels, level, j, smallest):
-    """Choose column j: the next level holds what it leaves of the columns after it."""
+    """Choose column j: write the residual Gram matrices of later columns to the next level."""
     for p in range(len(smallest)):
         here, below = levels[level, p], levels[level + 1, p]
         if here[j, j] > smallest[p, j]:
@@ -224,13 +224,13 @@ def _eliminate(levels, level, j, smallest):
 def best_subsets(xx, xy, yy, max_terms, n_best):
     """The `n_best` supports of least residual of every size up to max_terms, proven best.
 
-    One support serves several problems, each with its own coefficients: what is least is the
-    product of their residuals (for one problem, the residual), so that no scale of a target
-    counts. A problem in which a column depends on those chosen keeps its residual.
-    Depth first over subsets with the residual Gram matrices carried along, so a leaf costs one
-    division; a branch is cut when even all of its columns together leave more than the best
-    known (Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231).
-    xx: (problems, terms, terms), columns ordered with the most telling first for early cuts;
+    One support serves several problems, each with its own coefficients. The product of their
+    residuals is minimised (for one problem, the residual), so the scales of the targets do not
+    matter. If a column depends on those already chosen in a problem, its residual is unchanged.
+    The search is depth first over subsets. Residual Gram matrices are kept at every level, so a
+    leaf costs one division. A branch is cut if all of its columns together leave a larger
+    residual than the best known (Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231).
+    xx: (problems, terms, terms), the most informative columns first, for early cuts;
     xy: (problems, terms); yy: (problems,).
     Returns (supports, terms) of bool, the empty support first.
     """
@@ -271,7 +271,7 @@ def _search(levels, smallest, best, best_masks):
             continue
         following[level] = j + 1
         residual, adds = 0.0, False
-        for p in range(n_problems):  # in place: views would cost more than the work
+        for p in range(n_problems):  # indexed directly: views would cost more than the arithmetic
             left, pivot = levels[level, p, n_terms, n_terms], levels[level, p, j, j]
             if pivot > smallest[p, j]:
                 left -= levels[level, p, j, n_terms] ** 2 / pivot

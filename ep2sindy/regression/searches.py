@@ -1,4 +1,4 @@
-"""Search: which supports are worth a fit. Works on Gram matrices alone."""
+"""Searches that propose supports to be fitted; they use Gram matrices only."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ep2sindy.trust.memory import check_memory
 
 @runtime_checkable
 class Search(Protocol):
-    """Turns one equation's Gram matrix into candidate supports.
+    """Interface that turns the Gram matrix of one equation into candidate supports.
 
-    xx: (terms, terms) and xy: (terms,) of columns with unit norm, yy the target's square. A
-    column of zeros is a term that is not at hand, and may not appear.
+    xx: (terms, terms) and xy: (terms,) of columns with unit norm; yy: squared norm of the target.
+    A column of zeros is a term that is not available, and must not appear in a support.
     """
 
     def supports(
@@ -36,9 +36,9 @@ class Search(Protocol):
 class AdaptiveLasso:
     """All supports on the exact path of the adaptive lasso.
 
-    Each coefficient is penalised by |b_ols|^-gamma. The path is piecewise linear and needs the
-    Gram matrix alone; it does not depend on the units of the columns.
-    max_terms: stop the path there, or None for all terms.
+    Each coefficient is penalised by |b_ols|^-gamma. The path is piecewise linear and needs only
+    the Gram matrix; it does not depend on the units of the columns.
+    max_terms: number of terms at which the path stops; None for all terms.
     Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8.
     """
 
@@ -63,8 +63,8 @@ class AdaptiveLasso:
 class STLSQ:
     """Sequentially thresholded least squares, over a sweep of thresholds.
 
-    Thresholds are shares of the norm of the target, on columns of unit norm, spaced evenly in
-    their logarithm; each is iterated until no term falls below it.
+    Thresholds are fractions of the norm of the target, for columns of unit norm, spaced evenly in
+    the logarithm. Each is iterated until no coefficient is below it.
     Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113.
     """
 
@@ -96,9 +96,9 @@ class STLSQ:
 class BestSubset:
     """The supports of least residual of every size, proven best by branch and bound.
 
-    The work grows with the number of subsets of up to max_terms terms: a library of 10 takes
-    a tenth of a millisecond, 20 terms with all sizes a tenth of a second.
-    n_best: how many of each size.
+    The work grows with the number of subsets of up to max_terms terms: a library of 10 terms
+    takes a tenth of a millisecond, 20 terms with all sizes a tenth of a second.
+    n_best: number of supports of each size.
     """
 
     max_terms: int = 6
@@ -123,11 +123,11 @@ class BestSubset:
         xy: Float[np.ndarray, "problems terms"],
         yy: Float[np.ndarray, " problems"],
     ) -> Bool[np.ndarray, "supports terms"]:
-        """Supports that serve several problems at once, coefficients free in each.
+        """Supports common to several problems, with separate coefficients in each.
 
-        The best leave the least product of residuals: for Gaussian errors of a variance of
-        their own in every problem, that is the largest likelihood when all have as many rows. No
-        weight is needed, since the scale of one problem multiplies all products alike.
+        The best supports minimise the product of residuals. If every problem has Gaussian errors
+        of its own variance and the same number of rows, this maximises the likelihood. No
+        weights are needed, since the scale of one problem multiplies all products alike.
         """
         depth = min(self.max_terms, xy.shape[1])
         check_memory(
@@ -135,7 +135,7 @@ class BestSubset:
             f"Gram matrices of {xy.shape[1]} terms at each of {depth} sizes",
             way_out="lower max_terms, take fewer terms, or a lower degree",
         )
-        # Branches are cut sooner when the columns closest to the targets come first.
+        # Branches are cut sooner if the columns closest to the targets come first.
         order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
         found = best_subsets(
             xx.take(order, axis=1).take(order, axis=2),

@@ -1,4 +1,4 @@
-"""Splits: which groups of rows are held out."""
+"""Splits that choose the held-out groups of rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool
 
 @runtime_checkable
 class Split(Protocol):
-    """Chooses the held-out groups of one trajectory; groups are numbered along time."""
+    """Interface that chooses the held-out groups of one trajectory; groups are in time order."""
 
     def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]: ...
 
@@ -30,8 +30,11 @@ class RandomSplit:
 
 @dataclass(frozen=True)
 class BlockSplit:
-    """Hold out contiguous blocks of each trajectory: neighbours of a time series are alike, so
-    random rows would let the model see the answers."""
+    """Hold out contiguous blocks of each trajectory.
+
+    Neighbours in a time series are correlated, so randomly held-out rows would resemble training
+    rows.
+    """
 
     test_fraction: float = 0.25
     n_blocks: int = 20

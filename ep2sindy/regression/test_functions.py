@@ -1,4 +1,4 @@
-"""Windows over samples, and the weights that integrate a signal against test functions in them."""
+"""Test functions on windows of samples, and the weights that integrate a signal against them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ EDGE = 1e-10
 class WindowRows:
     """Test functions phi on stretches of one trajectory, ordered by their first sample.
 
-    mean: (windows, samples), sparse; mean @ values is the integral of phi * values over that of
-    phi. slope: the same for a derivative, by parts: slope @ x is the integral of phi * x',
-    without differencing x, over that of phi.
+    mean: (windows, samples), sparse; mean @ values is the integral of phi * values divided by
+    that of phi. slope: the same for a derivative; slope @ x is the integral of phi * x' divided
+    by that of phi, computed by parts without differencing x.
     """
 
     mean: csr_array
@@ -38,7 +38,7 @@ class WindowRows:
 
 @runtime_checkable
 class WindowFunctions(Protocol):
-    """What the alternatives share: windows for one sampled signal."""
+    """Interface of the test functions: windows for one sampled signal."""
 
     def windows(
         self,
@@ -53,8 +53,8 @@ class WindowFunctions(Protocol):
 class Boxes:
     """The thesis's test functions: 1 over `n_windows` random windows of `n_points` samples.
 
-    Integrals by the trapezoidal rule; what is left of the derivative is x at the ends. Two
-    points give the difference quotient and the mean of two samples: the differential form.
+    Integrals use the trapezoidal rule; that of the derivative is the difference of x at the ends.
+    Two points give the difference quotient and the mean of two samples: the differential form.
     Steps may be unequal.
     Source: the thesis, Eqs. 10 and 11.
     """
@@ -98,11 +98,11 @@ class Bumps:
 
     half_width_s: half the length of a window, in s, or None to take it from the spectrum of
     each state: the change point between signal and noise lies `tau_hat` standard deviations into
-    the tail of the bump's own spectrum (see `spectral_half_width`). The source takes 2; narrower
-    bumps keep more of the fast parts, and let in noise that smooth states and the covariance
-    of the rows can bear.
-    overlap: windows follow one another at half_width / overlap. The power p makes phi fall to
-    1e-10 at the edge, so that the trapezoidal rule is as good as exact.
+    the tail of the bump's own spectrum (see `spectral_half_width`). The source takes 2. Narrower
+    bumps keep more of the fast components, and admit more noise, which smoothed states and the
+    covariance of the rows can handle.
+    overlap: successive windows are half_width / overlap apart. The power p makes phi fall to
+    1e-10 at the edge, so that the trapezoidal rule is practically exact.
     Source: Messenger & Bortz 2021, doi:10.1137/20M1343166.
     """
 
@@ -129,9 +129,11 @@ class Bumps:
         *,
         rng: np.random.Generator,
     ) -> WindowRows:
-        """Unequal steps are interpolated on to an even grid, by weights that the rows take over.
+        """Weights of all windows over one signal.
 
-        Then there is one window about a sample at most: more would depend on each other.
+        Samples at unequal steps are interpolated onto an even grid; the interpolation weights
+        become part of the rows. Then at most one window is centred about each sample, since more
+        would depend on each other.
         Raises ValueError for windows that do not fit the trajectory.
         """
         if is_even(t):
@@ -152,7 +154,7 @@ class Bumps:
         s = np.arange(-half_width, half_width + 1) / half_width
         phi = (1.0 - s**2) ** power
         fall = s * (1.0 - s**2) ** (power - 1.0)
-        # Scaled so that a straight line has its own slope however few samples a bump spans.
+        # Scaled so that the slope of a straight line is exact however few samples a bump spans.
         fall /= fall @ s * half_width * dt_s
         first = np.arange(0, len(x) - 2 * half_width, max(1, half_width // self.overlap))
         inside = first[:, None] + np.arange(2 * half_width + 1)
@@ -174,16 +176,17 @@ class Bumps:
 
 
 def bump_power(half_width: Any) -> Any:
-    """Power p that makes (1 - s^2)^p fall to EDGE one sample inside the edge; two or more."""
+    """Power p for which (1 - s^2)^p falls to EDGE one sample inside the edge; two or more."""
     edge = 1.0 - (1.0 - 1.0 / np.asarray(half_width)) ** 2
     return np.maximum(2.0, np.ceil(np.log(EDGE) / np.log(edge)))
 
 
 def spectral_half_width(x: Float[np.ndarray, " samples"], *, tau_hat: float) -> int:
-    """Half-width in samples of the narrowest bump whose spectrum stays below the signal's end.
+    """Half-width in samples of the narrowest bump whose spectrum lies below the change point.
 
     The spectrum of (1 - s^2)^p is close to a Gaussian of standard deviation
-    n sqrt(2p + 3) / (2 pi half_width) bins, `tau_hat` of which must lie below the change point.
+    n sqrt(2p + 3) / (2 pi half_width) bins; `tau_hat` standard deviations must lie below the
+    change point between signal and noise.
     """
     n = len(x)
     widths = np.arange(2, max(3, (n - 1) // 4))
@@ -193,15 +196,16 @@ def spectral_half_width(x: Float[np.ndarray, " samples"], *, tau_hat: float) -> 
 
 
 def spectral_change_point(x: Float[np.ndarray, " samples"]) -> int:
-    """Frequency bin where the cumulated amplitude spectrum bends most: signal, then noise.
+    """Frequency bin that separates signal from noise, where the cumulated spectrum bends most.
 
-    The bend is where two chords, from the first and to the last bin, leave the least squares.
+    The cumulated amplitude spectrum is approximated by two chords that meet at the bend; the bend
+    with the least sum of squares is chosen.
     """
     total = np.cumsum(np.abs(np.fft.rfft(x - x.mean())))
     bins = np.arange(len(total))
     if len(bins) < 3:
         return 1
-    # Two hundred corners, closer together where the bins are few, tell the bend well enough.
+    # Two hundred trial corners, denser at low bins, locate the bend well enough.
     corners = np.unique(np.geomspace(1, len(bins) - 2, 200).astype(int))
     misfit = [
         np.square(total - np.interp(bins, [0, c, bins[-1]], total[[0, c, -1]])).sum()
@@ -219,7 +223,7 @@ def _check_width(n_points: int, n_samples: int, name: str) -> None:
 
 
 def _rows(columns: np.ndarray, weights: np.ndarray, n_samples: int) -> csr_array:
-    """One sparse row per window: `weights` (windows, width) at the samples `columns`."""
+    """Sparse matrix with one row per window: `weights` (windows, width) at samples `columns`."""
     n_windows, width = columns.shape
     starts = np.arange(0, n_windows * width + 1, width)
     return csr_array((weights.ravel(), columns.ravel(), starts), shape=(n_windows, n_samples))

@@ -1,7 +1,7 @@
-"""The weak form: regress integrals against test functions, so that no noise is differentiated.
+"""Weak form: regression of integrals against test functions, so that no noise is differentiated.
 
-`WeightedWeak` makes the rows white under the whole library. Inputs that are known exactly, because
-they were set and not measured, have no noise to be followed.
+`WeightedWeak` whitens the rows under the whole library. Inputs that are known exactly, because
+they were set and not measured, are treated as free of noise.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 from ep2sindy.signals.smoothers import Smoother
 
-MAX_SEGMENTS = 20  # pieces of a trajectory that are held out or resampled as one
+MAX_SEGMENTS = 20  # most segments of a trajectory; each is held out or resampled as a whole
 
 
 @dataclass(frozen=True)
 class Weak:
     """Regress mean derivatives over windows on mean library terms over the same windows.
 
-    test_functions: `Bumps`, of a width of its own for every state, or `Boxes`, the thesis's.
+    test_functions: `Bumps`, with a separate width for every state, or `Boxes`, as in the thesis.
     smooth_library: evaluate the terms on smoothed samples (the default) or on raw ones. The
     left-hand side always comes from the raw samples.
-    split: holds out segments of time, each two windows long or longer, if there is room; a
-    window that reaches into both kinds is dropped, so that no training row shares a sample with
-    a held-out one.
-    errors_in_variables: carry the noise of the samples to the rows, so that criteria and the
-    last fit can weight them by their covariance (see the module of that name). For Bumps only:
-    Boxes may be more than there are samples, and then depend on each other.
-    exact_inputs: inputs without noise, which are neither smoothed nor corrected; None takes those
-    that are switched, held or constant, or of less noise than 0.1 % of their deviation.
+    split: holds out segments of time, each at least two windows long if there is room. A window
+    that reaches into both kinds of segments is dropped, so that no training row shares a sample
+    with a held-out one.
+    errors_in_variables: propagate the noise of the samples to the rows, so that criteria and the
+    final fit can weight them by their covariance (see `regression.whitening`). For Bumps only:
+    Boxes may outnumber the samples, and then depend on each other.
+    exact_inputs: inputs without noise, which are neither smoothed nor corrected. None takes inputs
+    that are switched, held or constant, or whose noise is below 0.1 % of their standard deviation.
     """
 
     test_functions: WindowFunctions = field(default_factory=Bumps)
@@ -71,7 +71,7 @@ class Weak:
         *,
         rng: np.random.Generator,
     ) -> tuple[RegressionRows, ...]:
-        """One regression per state, since every state has windows of its own.
+        """Assemble one regression per state, since every state has its own windows.
 
         Raises ValueError as `Differential.assemble` does, and for windows that do not fit.
         """
@@ -104,7 +104,7 @@ class Weak:
     def _smooth(
         self, run: Trajectory, names: Sequence[str], library: Library
     ) -> tuple[np.ndarray, KalmanEstimate | None]:
-        """Samples for the library, and what the Kalman smoother says of them, where asked."""
+        """Samples for the library, and their Kalman estimate if it is needed."""
         t, values = run.t, run.columns(names)
         kalman = self.smoother if isinstance(self.smoother, KalmanSmoother) else None
         if kalman is None and self.errors_in_variables:
@@ -155,10 +155,11 @@ class Weak:
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """One stretch without gaps on its way to rows: its terms, its windows per state, its segments.
+    """Terms, windows of each state, and segments of one stretch of samples without gaps.
 
     names: the library's variables, then states that it lacks.
-    segment, held_out: (samples,), which piece of the time a sample is in, and if that is held out.
+    segment: (samples,), number of the time segment that holds the sample. held_out: (samples,),
+    true if that segment is held out.
     """
 
     run: Trajectory
@@ -170,7 +171,7 @@ class _Sampled:
     held_out: Bool[np.ndarray, " samples"]
 
     def rows(self, state: int) -> _Rows:
-        """The windows that lie in one kind of segment, and which kind."""
+        """Windows that lie entirely in training segments, or entirely in held-out ones."""
         windows = self.windows[state]
         first, last = windows.first, windows.last
         n_held_out = np.append(0, np.cumsum(self.held_out))
@@ -186,7 +187,7 @@ class _Sampled:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Rows of one state on one trajectory; segment: (rows,), where a window has its middle."""
+    """Rows of one state on one trajectory; segment: (rows,), that of the middle of the window."""
 
     mean: csr_array
     slope: csr_array
@@ -195,13 +196,13 @@ class _Rows:
 
 
 def _pieces(run: Trajectory) -> list[Trajectory]:
-    """The stretches of a trajectory between its gaps, each with rows of its own."""
+    """Stretches of a trajectory between its gaps; each one gets its own rows."""
     parts = stretches(run.t)
     return [run] if parts == [(0, run.n_samples)] else [run.window(*part) for part in parts]
 
 
 def _stack(blocks: Iterable[csr_array]) -> csr_array:
-    """Windows of all trajectories, over the samples of all trajectories."""
+    """Block-diagonal matrix of the windows of all trajectories over all their samples."""
     return block_diag(list(blocks), format="csr")
 
 
@@ -224,14 +225,15 @@ def _noisy_rows(
 
 @dataclass(frozen=True)
 class WeightedWeak:
-    """Weak rows that are white under the whole library: the sharpest rows for a search in noise.
+    """Weak rows that are whitened under the whole library: the best rows for a search in noise.
 
-    The rows of `weak` are weighted by their covariance and linearised about samples corrected by
-    `n_steps` steps with all terms, so that no support is favoured; then a support's residual says
-    how likely it is, and the true one leads its size far more often (docs/benchmark.md). Assumes
-    that the samples hold white noise, and that the library holds the law: fast dynamics that no
-    term follows would be taken for noise. Rows are in the unit of the derivative, up to a factor.
-    Raises ValueError for held-out rows, which have no part in the weights.
+    The rows of `weak` are weighted by their covariance, and linearised about samples corrected in
+    `n_steps` steps with all terms, so that no support is favoured. The residual of a support then
+    measures its likelihood, and the true support is the best of its size far more often
+    (docs/benchmark.md). The noise of the samples is assumed white, and the law in the library:
+    fast dynamics that no term describes would be taken for noise. Rows are in the unit of the
+    derivative, up to a factor.
+    Raises ValueError for held-out rows, which the weights do not include.
     """
 
     weak: Weak = field(default_factory=lambda: Weak(split=RandomSplit(0.0)))
@@ -250,7 +252,7 @@ class WeightedWeak:
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]:
-        """One regression per state, as `Weak.assemble` gives it, with white rows."""
+        """Assemble one regression per state, as in `Weak.assemble`, with whitened rows."""
         problems = self.weak.assemble(trajectories, library, rng=rng)
         return tuple(self._weigh(problem) for problem in problems)
 
@@ -264,7 +266,7 @@ class WeightedWeak:
         theta, target = problem.train_theta[:, everything], problem.train_target(0)
         coef[everything] = np.linalg.lstsq(theta, target)[0]
         white = whitened_rows(problem, everything, coef, n_steps=self.n_steps)
-        # White rows are many standard deviations long; back to about the unit of the derivative.
+        # Whitened rows are in standard deviations; rescale to about the unit of the derivative.
         size = 1.0 / np.linalg.norm(white.target)
         return replace(
             problem,
@@ -274,13 +276,14 @@ class WeightedWeak:
         )
 
 
-# Less noise than this share of an input's own deviation is lost beside that of any state.
+# Noise below this share of an input's standard deviation is negligible beside that of any state.
 NEGLIGIBLE = 1e-3
 
-# Noise above half a step of its digits lets a record repeat its last value less often than this.
+# Share of steps without change above which an input counts as held. A record whose noise exceeds
+# half its resolution repeats its last value less often.
 HELD = 0.5
 
-MAX_LEVELS = 8  # that a switch has; a record of noise has more, however coarse its digits
+MAX_LEVELS = 8  # most levels of a switched input; a noisy record has more, however coarse
 
 
 def exact_columns(
@@ -289,10 +292,10 @@ def exact_columns(
     declared: Sequence[str] | None,
     noise_std: Float[np.ndarray, " variables"] | None,
 ) -> Bool[np.ndarray, " variables"]:
-    """Which of some variables are exact: never a state, and of the inputs those declared.
+    """Mask of the variables that are exact: the declared inputs, and never a state.
 
-    None declared: inputs that are switched, held or constant, or of negligible noise as far as
-    that was estimated.
+    declared: None takes inputs that are switched, held or constant, or have negligible noise if
+    the noise was estimated.
     Raises ValueError for a declared name that is no input.
     """
     unknown = [name for name in declared or () if name not in run.input_names]
@@ -312,6 +315,6 @@ def exact_columns(
 
 
 def is_switched(samples: Float[np.ndarray, " samples"]) -> bool:
-    """Whether a signal holds its value over most steps, or jumps between a few levels."""
+    """Return true if a signal holds its value over most steps, or jumps between a few levels."""
     held = np.mean(np.diff(samples) == 0.0)
     return bool(held >= HELD) or len(np.unique(samples)) <= MAX_LEVELS

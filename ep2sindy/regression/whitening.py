@@ -1,4 +1,4 @@
-"""Rows weighed by the covariance that the noise of the samples gives them."""
+"""Whitening of rows by the covariance that the noise of the samples causes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.regression.rows import NoisyRows, RegressionRows
 
-# No sample is moved by more standard deviations of its noise: a wrong model would never end.
+# Largest correction of a sample, in standard deviations of its noise; with a wrong model the
+# corrections would otherwise grow without limit.
 LARGEST_CORRECTION = 4.0
 
-# Added to the variance of every row: a share of the mean variance, since rows of overlapping
-# windows are nearly dependent, and the square of what rounding leaves of the target.
+# Added to the variance of every row: RIDGE times the mean variance, since rows of overlapping
+# windows are nearly dependent, and the square of the rounding error of the target.
 RIDGE = 1e-8
 
 ROUNDING = 1e-8
 
-# What the misfit per row may be above the least so far: at 20 % noise whole steps have raised it by
-# 6 and brought it back with the next; those that run away raise it by 14 to 1600.
+# Largest rise of the misfit per row above the least so far. At 20 % noise whole steps have raised
+# it by 6, and the next step brought it back; diverging steps raise it by 14 to 1600.
 RISE = 10.0
 
 MAX_HALVED = 6
@@ -32,12 +33,12 @@ MAX_HALVED = 6
 
 @dataclass(frozen=True, eq=False)
 class WhitenedRows:
-    """Training rows of one equation, linearised about corrected samples, of unit variance.
+    """Training rows of one equation, linearised about corrected samples, with unit variance.
 
     theta: (rows, terms) and target: (rows,), combined so that target - theta coef is white
     with variance 1 for the true coefficients. Columns and target are scaled by the regression's
-    theta_scale and target_scale. corrected: (samples, variables), the samples less the noise
-    that the residuals reveal.
+    theta_scale and target_scale. corrected: (samples, variables), the samples minus the noise
+    estimated from the residuals.
     """
 
     theta: Float[np.ndarray, "rows terms"]
@@ -52,13 +53,13 @@ def whitened_rows(
     *,
     n_steps: int = 2,
 ) -> WhitenedRows:
-    """Weigh the rows of one equation by their covariance under the model that `terms` spans.
+    """Whiten the rows of one equation by their covariance under the model with these terms.
 
-    The residuals depend on the noise of the samples through target and terms alike; to first
-    order they are M e, with covariance M Sigma M^T. Each step is one of Gauss-Newton for the
-    coefficients and samples that are most likely together: fit the coefficients with weights,
-    move the samples by the most likely noise, linearise again. Without the move, the noise in
-    the terms would bias the coefficients. A step that goes too far is halved.
+    The residuals depend on the noise of the samples through both target and terms; to first
+    order they are M e, with covariance M Sigma M^T. Each step is a Gauss-Newton step to the jointly
+    most likely coefficients and samples: fit the coefficients with weights, correct the samples by
+    the most likely noise, linearise again. Without the correction, the noise in the terms would
+    bias the coefficients. A step that raises the misfit too far is halved.
     coef: (terms,), a first guess in scaled columns.
     Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance;
     Britt & Luecke 1973, Technometrics 15, 233, for the steps.
@@ -81,9 +82,9 @@ def whitened_rows(
 def _following(
     problem: RegressionRows, rows: _Linearised, terms: Bool[np.ndarray, " terms"], *, limit: float
 ) -> _Linearised | None:
-    """One step of Gauss-Newton, or halves of it until the misfit falls; None if it never does.
+    """One Gauss-Newton step, halved until the misfit decreases; None if it never does.
 
-    limit: the misfit that a whole step may reach.
+    limit: largest misfit allowed after a whole step.
     """
     coef = rows.fit(terms)
     x = keep_inside(problem.library, rows.correct(coef), rows.x)
@@ -102,11 +103,11 @@ def _following(
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """Whitened rows about some samples x and coefficients, and the way back to the samples.
+    """Whitened rows, linearised about samples x and coefficients, with their noise model.
 
     x: (samples, variables). coef: (terms,), in scaled columns.
     drifted: the terms at x plus their change from x to the raw samples, to first order.
-    noise: one sparse (rows, samples) per variable, from its unit noise to the residuals.
+    noise: one sparse (rows, samples) matrix per variable, from its unit noise to the residuals.
     """
 
     x: Float[np.ndarray, "samples variables"]
@@ -126,7 +127,11 @@ class _Linearised:
         *,
         noisy: bool = True,
     ) -> _Linearised:
-        """noisy: the samples hold what noise the rows cannot reveal, unlike smoothed ones."""
+        """Linearise and whiten the rows about samples x and coefficients.
+
+        noisy: true if x still holds the noise that the rows cannot determine, unlike smoothed
+        samples.
+        """
         rows, library = problem.noisy, problem.library
         assert rows is not None
         n_variables = len(library.variables)
@@ -155,16 +160,16 @@ class _Linearised:
 
     @property
     def misfit(self) -> float:
-        """-2 log likelihood of the rows, but for a constant.
+        """-2 log likelihood of the rows, up to a constant.
 
-        The residuals alone would not do: large coefficients make much of the noise, and with it
-        small white residuals.
+        The residuals alone are not sufficient: large coefficients amplify the modelled noise, and
+        thereby reduce the whitened residuals.
         """
         residual = self.target - self.drifted @ self.coef
         return float(residual @ residual + 2.0 * np.log(self.factor[0]).sum())
 
     def fit(self, terms: Bool[np.ndarray, " terms"]) -> Float[np.ndarray, " terms"]:
-        """Coefficients of the chosen terms; the rows at x are instruments for the noisy ones."""
+        """Coefficients of the chosen terms; the terms at x are instruments for the noisy terms."""
         coef = np.zeros(len(terms))
         theta, drifted = self.theta[:, terms], self.drifted[:, terms]
         scale = column_norms(theta)
@@ -176,7 +181,7 @@ class _Linearised:
         return coef
 
     def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "samples variables"]:
-        """The samples less their most likely noise."""
+        """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
         noise = np.stack([m.T @ weighted for m in self.noise], axis=1)
         limited = np.clip(noise, -LARGEST_CORRECTION, LARGEST_CORRECTION)
@@ -186,10 +191,11 @@ class _Linearised:
 def _lift(
     problem: RegressionRows, x: Float[np.ndarray, "samples variables"]
 ) -> Float[np.ndarray, "samples terms"]:
-    """What the noise left in samples adds to terms with functions on average, to second order.
+    """Mean change of terms with functions by the noise left in the samples, to second order.
 
-    sin(x + e) is on average sin(x) exp(-s^2/2), which weights do not see. Products of variables
-    are taken as they are. Left is what the rows do not reveal, of s^2 one part in every row.
+    For example, sin(x + e) is on average sin(x) exp(-s^2/2), a bias that weighting does not
+    correct. Products of variables are not changed. The share of the noise variance s^2 that is left
+    in the samples is one minus the number of rows per sampled value.
     """
     rows, library = problem.noisy, problem.library
     assert rows is not None
@@ -209,13 +215,13 @@ def _lift(
 
 
 def _times(matrix: csr_array, columns: np.ndarray) -> csr_array:
-    """Multiply every column of a sparse matrix by a number."""
+    """Multiply each column of a sparse matrix by its own number."""
     data = matrix.data * columns[matrix.indices]
     return csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def _banded_cholesky(covariance: csr_array) -> np.ndarray:
-    """Lower factor of a banded matrix: windows are ordered, and distant ones do not meet."""
+    """Lower Cholesky factor of the covariance, banded since distant windows do not overlap."""
     entries = covariance.tocoo()
     row, column = entries.coords
     below = row >= column
@@ -226,7 +232,7 @@ def _banded_cholesky(covariance: csr_array) -> np.ndarray:
 
 
 def _solve(factor: np.ndarray, values: np.ndarray, *, transposed: bool = False) -> np.ndarray:
-    """L^-1 values, or L^-T values, for the banded factor L."""
+    """Solve with the banded factor L: returns L^-1 values, or L^-T values if transposed."""
     columns = values.reshape(len(values), -1)
     solution, info = dtbtrs(factor, columns, uplo="L", trans="T" if transposed else "N")
     assert info == 0

@@ -1,4 +1,4 @@
-"""Signals: smoothed samples and derivatives, spectra, and what describes an oscillation."""
+"""Signals: smoothing, derivatives, spectra, and the description of oscillations."""
 
 from ep2sindy._stubs import attach
 

@@ -1,4 +1,4 @@
-"""What a record repeats: its period, its waveform over one period, and how two records compare."""
+"""Period and waveform of a record that repeats itself, and distances between two records."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
 
-MIN_PERIODS = 3.0  # of a record that can be said to repeat
+MIN_PERIODS = 3.0  # fewest periods in a record that counts as repeating
 
-MIN_VISIBLE = 0.1  # of the variance of any state, noise included: noise alone has lines, too
+# Least share of the variance of some state, noise included, that the waveform must explain:
+# noise alone has spectral lines, too.
+MIN_VISIBLE = 0.1
 
-MIN_SHARE = 0.5  # of the variance that the waveform must explain, for a record to have a period
+MIN_SHARE = 0.5  # least share of the variance that the waveform explains if there is a period
 
 MAX_HARMONICS = 16
 
-SAMPLES_PER_HARMONIC = 2.5  # of its period, at least: two would be the Nyquist limit
+SAMPLES_PER_HARMONIC = 2.5  # least number per period of a harmonic; the Nyquist limit is two
 
-PERIODS_TRACKED = 8.0  # that an instant's phase is taken from: breathing wanders over tens of them
+# Length of the window from which the phase at one instant is estimated, in periods. The phase of
+# the breathing mode wanders over tens of periods.
+PERIODS_TRACKED = 8.0
 
-N_SHIFTS = 720  # of one waveform over another, before the best is refined
+N_SHIFTS = 720  # trial shifts of one waveform over another, before the best one is refined
 
 N_QUANTILES = 256
 
@@ -35,9 +39,10 @@ BANDS_PER_OCTAVE = 3
 class Cycle:
     """A record that repeats: states = mean + Re sum_k harmonics[k - 1] exp(i k phase).
 
-    phase: (samples,) in rad, of the fundamental, followed along the record.
+    phase: (samples,) in rad, phase of the fundamental, followed along the record.
     mean: (n_states,); harmonics: (n_harmonics, n_states), in the states' units.
-    share: of the states' variance, pooled, white noise left out, that the waveform explains.
+    share: fraction of the pooled variance of the states, without white noise, that the waveform
+    explains.
     """
 
     frequency_Hz: float
@@ -48,7 +53,7 @@ class Cycle:
 
     @property
     def std(self) -> Float[np.ndarray, " n_states"]:
-        """Of the waveform: what a state's standard deviation is without noise."""
+        """Standard deviation of the waveform of each state, so without noise."""
         return np.sqrt(0.5 * np.square(np.abs(self.harmonics)).sum(axis=0))
 
     @property
@@ -56,7 +61,7 @@ class Cycle:
         return float((self.phase[-1] - self.phase[0]) / (2.0 * np.pi))
 
     def waveform(self, phase: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points n_states"]:
-        """The states over a period, at phases in rad."""
+        """States of the periodic waveform at the given phases, in rad."""
         order = np.arange(1, len(self.harmonics) + 1)
         return self.mean + (np.exp(1j * np.outer(phase, order)) @ self.harmonics).real
 
@@ -67,16 +72,18 @@ def find_cycle(
     *,
     n_harmonics: int | None = None,
 ) -> Cycle | None:
-    """The period and waveform of a record; None where it has none.
+    """Period and waveform of a record; None if the record is not periodic.
 
-    t: (samples,) in s. The period is that of the state whose spectrum has the sharpest line; its
-    phase is followed by demodulation, its slope sharpened until the waveform, a Fourier series in
-    it, fits all samples best: white noise averages out. n_harmonics: None takes as many as the
-    samples bear (BIC). None is returned for fewer than three periods, or where the waveform
-    explains less than half of the variance: chaos, noise, a transient.
+    The period is that of the state whose spectrum has the sharpest line. The phase of this state
+    is followed by demodulation. The slope of the phase is then adjusted until the waveform, a
+    Fourier series in the phase, fits all samples best; white noise averages out.
+
+    t: (samples,) in s. n_harmonics: None chooses as many as the samples support (BIC).
+    Returns None for fewer than three periods, or if the waveform explains less than half of the
+    variance, as for chaos, noise or a transient.
     """
     spread = states.std(axis=0)
-    # Rounding on a state that rests is no oscillation.
+    # Rounding errors of a constant state are no oscillation.
     if not (spread > 1e-9 * np.abs(states).max(axis=0)).any():
         return None
     scaled = (states - states.mean(axis=0)) / zero_to_one(spread)
@@ -111,7 +118,7 @@ def find_cycle(
 def _phase(
     t: np.ndarray, scaled: np.ndarray, leader: int, rough_Hz: float, most: int
 ) -> np.ndarray:
-    """Phase at every sample, from a rough frequency of the leading state, by up to `most` terms."""
+    """Phase at every sample, from a rough frequency of the leading state, with `most` harmonics."""
     phase = 2.0 * np.pi * rough_Hz * (t - t[0])
     for _ in range(3):
         phase = _sharpen(t, phase, scaled, 1)
@@ -132,9 +139,9 @@ def _line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
 
 
 def white_variance(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
-    """Variance of the white noise in samples of x: what the upper half of the spectrum goes on as.
+    """Variance of the white noise in samples of x, from the upper half of the spectrum.
 
-    The median of the power there: lines of a signal do not move it.
+    The noise floor is the median power there, which spectral lines of a signal hardly change.
     """
     return _white_variance(*power_spectrum(t, x))
 
@@ -147,17 +154,18 @@ def _white_variance(frequency: np.ndarray, power: np.ndarray) -> float:
 def phase_along(
     t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], frequency_Hz: float
 ) -> Float[np.ndarray, " samples"]:
-    """Phase in rad of the component of x near a frequency, at every sample, without jumps.
+    """Unwrapped phase in rad, at every sample, of the component of x near a frequency.
 
-    x is demodulated, and averaged over eight periods, or half the record if that is less, under
-    a Hann window; where the window reaches beyond an end, the phase goes on at the frequency.
+    x is demodulated and averaged under a Hann window of eight periods, or of half the record if
+    that is shorter. Where the window reaches beyond an end of the record, the phase is continued
+    at the given frequency.
     """
     straight = 2.0 * np.pi * frequency_Hz * (t - t[0])
     return straight + _drift(t, x, straight)
 
 
 def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
-    """Phase of x beyond a straight one, smooth over the periods that it is taken from."""
+    """Phase of x minus a phase linear in time, smoothed over the averaging window."""
     slow = (x - x.mean()) * np.exp(-1j * straight)
     even = t
     if not is_uniform(t):
@@ -173,7 +181,7 @@ def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
 
 
 def _moving_average(x: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """`scipy.signal.fftconvolve(x, window, "same")`: loading that module takes half a second."""
+    """Same as `scipy.signal.fftconvolve(x, window, "same")`, whose import takes half a second."""
     length = len(x) + len(window) - 1
     fast = fft.next_fast_len(length)
     whole = fft.ifft(fft.fft(x, fast) * fft.fft(window, fast), fast)
@@ -182,9 +190,9 @@ def _moving_average(x: np.ndarray, window: np.ndarray) -> np.ndarray:
 
 
 def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
-    """A phase whose slope in time is changed so that the series of this order fits best.
+    """Change the slope of the phase in time so that the Fourier series of this order fits best.
 
-    One Gauss-Newton step: what the slope explains of what the series leaves.
+    One Gauss-Newton step: the residual of the series is regressed on the change of slope.
     """
     basis, triangle = np.linalg.qr(_columns(phase, order))
     known = basis.T @ scaled
@@ -198,12 +206,15 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
     direction -= basis @ (basis.T @ direction)
     size = float(np.square(direction).sum())
     change = float((direction * (scaled - basis @ known)).sum()) / size if size > 0.0 else 0.0
-    # Half a period over the record: more is another line of the spectrum.
+    # At most half a period over the record: a larger change would reach another spectral line.
     return phase + float(np.clip(change, -np.pi, np.pi)) * since
 
 
 def _columns(phase: np.ndarray, order: int) -> np.ndarray:
-    """A constant, then cosine and sine of every order: (samples, 1 + 2 order)."""
+    """Columns of the Fourier series: constant, then cosine and sine of each harmonic.
+
+    Returns (samples, 1 + 2 order).
+    """
     turns = np.exp(1j * np.outer(phase, np.arange(1, order + 1)))
     columns = np.empty((len(phase), 1 + 2 * order))
     columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real, turns.imag
@@ -211,7 +222,7 @@ def _columns(phase: np.ndarray, order: int) -> np.ndarray:
 
 
 def _most_harmonics(n_samples: int, n_periods: float) -> int:
-    """As many as the samples of a period can tell apart, and their number determine."""
+    """Largest number of harmonics that the samples per period and their total number allow."""
     by_period = n_samples / n_periods / SAMPLES_PER_HARMONIC
     return int(np.clip(min(by_period, (n_samples - 1) // 4), 1, MAX_HARMONICS))
 
@@ -219,11 +230,12 @@ def _most_harmonics(n_samples: int, n_periods: float) -> int:
 def _series(
     phase: np.ndarray, scaled: np.ndarray, most: int, *, chosen: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Constant, then cosine and sine of every order, (1 + 2 n, n_states); squares that are left.
+    """Fourier coefficients of the states, and the residual sum of squares of each state.
 
-    chosen: whether BIC chooses how many of them, up to `most`.
+    Coefficients: constant, then cosine and sine of each harmonic, (1 + 2 n, n_states).
+    chosen: if true, BIC chooses the number of harmonics, up to `most`.
     """
-    # The columns are ordered, so one factorisation holds the fits of every number of harmonics.
+    # The columns are ordered, so one factorisation gives the fits of every number of harmonics.
     basis, triangle = np.linalg.qr(_columns(phase, most))
     known = basis.T @ scaled
     whole = np.square(scaled).sum(axis=0)
@@ -237,7 +249,10 @@ def _series(
 
 
 def best_shift(data: Cycle, other: Cycle) -> float:
-    """Phase in rad to add to the other's, for its waveform to lie on the data's: all states."""
+    """Phase in rad to add to `other` so that its waveform best overlaps the data's.
+
+    One shift serves all states.
+    """
     ours, theirs, order = _side_by_side(data, other)
     overlap = ((np.conj(ours) * theirs) / np.square(zero_to_one(data.std))).sum(axis=1)
     shifts = 2.0 * np.pi * np.arange(N_SHIFTS) / N_SHIFTS
@@ -250,9 +265,9 @@ def best_shift(data: Cycle, other: Cycle) -> float:
 
 
 def waveform_errors(data: Cycle, other: Cycle) -> Float[np.ndarray, " n_states"]:
-    """RMS difference of two waveforms, in the data's standard deviations, at the best shift.
+    """RMS difference of two waveforms at the best shift, in standard deviations of the data.
 
-    One shift for all states: a lag between them counts.
+    All states share one shift, so a wrong lag between states counts as an error.
     """
     ours, theirs, order = _side_by_side(data, other)
     turned = theirs * np.exp(1j * order * best_shift(data, other))[:, None]
@@ -261,7 +276,7 @@ def waveform_errors(data: Cycle, other: Cycle) -> Float[np.ndarray, " n_states"]
 
 
 def _side_by_side(data: Cycle, other: Cycle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Harmonics of both, as many, and their orders."""
+    """Harmonics of both cycles, zero-padded to the same number, and their orders."""
     n = max(len(data.harmonics), len(other.harmonics))
     ours, theirs = (np.pad(c.harmonics, ((0, n - len(c.harmonics)), (0, 0))) for c in (data, other))
     return ours, theirs, np.arange(1, n + 1)
@@ -270,7 +285,7 @@ def _side_by_side(data: Cycle, other: Cycle) -> tuple[np.ndarray, np.ndarray, np
 def distribution_distances(
     data: Float[np.ndarray, "samples n_states"], other: Float[np.ndarray, "_ n_states"]
 ) -> Float[np.ndarray, " n_states"]:
-    """Wasserstein distance of each state's distribution to the data's, in standard deviations."""
+    """Wasserstein distance of each state's distribution from the data's, in standard deviations."""
     levels = (np.arange(N_QUANTILES) + 0.5) / N_QUANTILES
     apart = np.quantile(other, levels, axis=0) - np.quantile(data, levels, axis=0)
     return np.abs(apart).mean(axis=0) / zero_to_one(data.std(axis=0))
@@ -281,9 +296,9 @@ def spectrum_distance(
     data: Float[np.ndarray, "samples n_states"],
     other: Float[np.ndarray, "samples n_states"],
 ) -> float:
-    """Share of the power that two records of the same times have in different bands, 0 to 1.
+    """Fraction of the power that lies in different frequency bands in two records, 0 to 1.
 
-    Bands are thirds of octaves; the mean over the states.
+    Both records have the same times. Bands are thirds of octaves. Returns the mean over the states.
     """
     apart = []
     for ours, theirs in zip(data.T, other.T, strict=True):

@@ -1,4 +1,4 @@
-"""One signal as the states of a system: with its growth rate, its derivative, or its past."""
+"""Embeddings: states made of one signal and its growth rate, its derivative or its past."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from ep2sindy.signals.kalman import LOG10_RATIO_MIN, KalmanSmoother
 from ep2sindy.signals.log_smoother import LogSmoother, ratio_bound
 from ep2sindy.signals.trace import Trace
 
-# Harmonics of the period that the smoothers follow: what is faster counts as noise. Two states
-# have no more to say; pulses of ions in transit, ten times faster, spoil the derivative.
+# Number of harmonics that the smoothers follow; faster components count as noise. Two states
+# cannot describe more. Ion-transit oscillations, ten times faster, would spoil the derivative.
 HARMONICS = 7.0
 
-DROWNED = 0.5  # of the signal's standard deviation: noise from which no derivative is taken
+# Noise level, in standard deviations of the signal, above which no derivative is taken.
+DROWNED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Embedded:
-    """A signal as a trajectory of states, and the equations among them that are known exactly.
+    """A signal as a trajectory of states, with the equations that are known exactly.
 
-    relations, terms: as `discover` takes them. noise_std: of the signal, in its unit, with what is
-    faster than the smoother follows.
+    relations, terms: in the form that `discover` takes. noise_std: standard deviation of the noise
+    in the signal, in its unit; it includes components faster than the smoother follows.
     """
 
     run: Trajectory
@@ -43,9 +44,9 @@ class Embedded:
 
 @runtime_checkable
 class Embedding(Protocol):
-    """What the alternatives share.
+    """Interface of the embeddings.
 
-    says: in words. names: of the states that are made of a signal, the signal first.
+    says: description in words. names: names of the states made of a signal, the signal first.
     """
 
     @property
@@ -60,7 +61,7 @@ class Embedding(Protocol):
 class LogRate:
     """A positive signal x and its growth rate g = d ln x / dt, so that x' = x g is known.
 
-    harmonics: of the period that are followed.
+    harmonics: number of harmonics of the period that the smoother follows.
     """
 
     harmonics: float = HARMONICS
@@ -119,9 +120,11 @@ class Rate:
 
 @dataclass(frozen=True)
 class Delays:
-    """A signal and itself a part of a period before: no derivative, but no known equation either.
+    """A signal and its own delayed value.
 
-    share: of the period.
+    This embedding needs no derivative, but no equation is known beforehand either.
+
+    share: delay as a fraction of the period.
     """
 
     share: float = 0.25
@@ -153,7 +156,7 @@ class Delays:
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """An embedding and why it was taken, in words."""
+    """An embedding, its result, and the reason for choosing it, in words."""
 
     embedding: Embedding
     reason: str
@@ -161,9 +164,9 @@ class Chosen:
 
 
 def embed(signal: Trace, embedding: Embedding | None = None) -> Chosen:
-    """A signal as states; None chooses by the signal's sign and noise.
+    """Embed a signal as states; None chooses the embedding by the signal's sign and noise.
 
-    Raises ValueError where a set embedding does not suit the signal.
+    Raises ValueError if the given embedding does not suit the signal.
     """
     if embedding is not None:
         return Chosen(embedding, "set", embedding.embed(signal))
@@ -181,7 +184,7 @@ def embed(signal: Trace, embedding: Embedding | None = None) -> Chosen:
 
 
 def _smooth(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Signal, derivative and noise, by the Kalman smoother, no finer than so many harmonics."""
+    """Kalman-smoothed signal, its derivative, and the noise; follows at most `harmonics`."""
     column = signal.x[:, None]
     found = KalmanSmoother().estimate(signal.t, column)
     step_s = float(np.ptp(signal.t)) / (len(signal.t) - 1)
@@ -192,7 +195,7 @@ def _smooth(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, fl
 
 
 def _finest_s(signal: Trace, harmonics: float) -> float:
-    """The time in which the last harmonic turns by one radian."""
+    """Time in which the highest harmonic advances by one radian, in s."""
     return signal.period_s / (2.0 * np.pi * harmonics)
 
 
@@ -210,7 +213,7 @@ def _trajectory(
 
 
 def _other(signal: str, name: str) -> str:
-    """The name of the second state, unless the signal bears it."""
+    """Name of the second state, changed if the signal already has that name."""
     return name if name != signal else f"{name}_rate"
 
 

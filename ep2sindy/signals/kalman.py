@@ -1,4 +1,4 @@
-"""Smooth and differentiate noisy samples with a Kalman smoother that finds the noise itself."""
+"""Kalman smoother that smooths and differentiates noisy samples and estimates their noise."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.kernels import likelihood, smooth
 
-# From a memory of some 200 samples to interpolation.
+# The range extends from a memory of about 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
 
-# Below what data can tell: over 1000 samples the most likely one scatters by 0.03 and more.
+# Finer than data can determine: over 1000 samples the most likely ratio scatters by 0.03 or more.
 LOG10_RATIO_TOLERANCE = 0.01
 
-# Three samples start the filter; two more are the least that can tell noise from signal.
+# Three samples start the filter; at least two more are needed to tell noise from signal.
 MIN_SAMPLES = 5
 
 
 @dataclass(frozen=True, eq=False)
 class KalmanEstimate:
-    """What the smoother makes of samples in u, column by column.
+    """Result of the Kalman smoother for samples in u, column by column.
 
     smoothed: in u; derivative: in u/s.
-    noise_std: of the white noise in the samples, in u.
-    log10_ratio: of process to measurement noise, with the mean step as the unit of time.
+    noise_std: standard deviation of the white noise in the samples, in u.
+    log10_ratio: log10 of the ratio of process to measurement noise, with the mean step as the
+    unit of time.
     """
 
     smoothed: Float[np.ndarray, "samples columns"]
@@ -43,11 +44,11 @@ class KalmanEstimate:
 
 @dataclass(frozen=True)
 class KalmanSmoother:
-    """A twice integrated Wiener process seen through white noise, on whatever steps there are.
+    """Smoother for a twice integrated Wiener process with white noise; steps may be unequal.
 
-    Its mean given all samples is the quintic smoothing spline. Each column has a ratio of
-    process to measurement noise of its own: the most likely one, unless log10_ratio sets it for
-    all. Nothing is assumed of the beginning, so a parabola passes unchanged.
+    The mean of the process given all samples is the quintic smoothing spline. Each column has its
+    own ratio of process to measurement noise: the most likely one, unless log10_ratio sets it for
+    all columns. The initial state is diffuse, so a parabola passes unchanged.
     Raises ValueError for a log10_ratio outside [-14, 4].
     Source: Wahba 1978, doi:10.1111/j.2517-6161.1978.tb01050.x; Durbin & Koopman 2012,
     doi:10.1093/acprof:oso/9780199641178.001.0001.
@@ -62,10 +63,12 @@ class KalmanSmoother:
     def estimate(
         self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
     ) -> KalmanEstimate:
-        """Smooth every column; `smooth` and `derivative` give parts of this, at its full cost.
+        """Smooth every column and estimate its derivative and noise.
 
-        t: (samples,) in s. A column that never changes comes back as it is: without noise or
-        derivative, and with the smoothest ratio unless one is set.
+        `smooth` and `derivative` return parts of this result, each at the full cost.
+
+        t: (samples,) in s. A constant column is returned unchanged: its noise and derivative are
+        zero, and its ratio is the smoothest one unless log10_ratio is set.
         Raises ValueError for fewer than five samples.
         """
         steps, step_s = _unit_steps(t, values)
@@ -105,13 +108,13 @@ class KalmanSmoother:
 def most_likely_ratio(
     steps: Float[np.ndarray, " steps"], values: Float[np.ndarray, "samples 1"]
 ) -> float:
-    """log10 of the ratio under which one column is most likely, within [-14, 4].
+    """log10 of the noise ratio of greatest likelihood for one column, within [-14, 4].
 
     The likelihood may be flat or have several maxima: a grid of whole decades finds the
-    highest, a bounded search between its neighbours refines it.
+    highest one, and a bounded search between its neighbours refines it.
     """
 
-    from scipy.optimize import minimize_scalar  # for those alone who estimate it
+    from scipy.optimize import minimize_scalar  # imported only when the ratio is estimated
 
     def misfit(log10_ratio: float) -> float:
         return -likelihood(steps, values, 10.0**log10_ratio)[0][0]
@@ -125,7 +128,7 @@ def most_likely_ratio(
         method="bounded",
         options={"xatol": LOG10_RATIO_TOLERANCE},
     )
-    # The search never tries the bounds themselves.
+    # The bounded search never tries the bounds themselves, so the grid point may be better.
     return float(found.x if found.fun < misfits[best] else decades[best])
 
 

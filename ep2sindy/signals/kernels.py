@@ -1,11 +1,12 @@
-"""Compiled Kalman smoother of the twice integrated Wiener process, exact from diffuse beginnings.
+"""Compiled Kalman smoother of the twice integrated Wiener process, with exact diffuse start.
 
-In every kernel steps: (samples - 1,) are time steps of order one, values: (samples, columns).
-The state at a sample is (signal, slope, bend); its third derivative is white noise of density
-`ratio` where the measurement noise has variance one. All columns share one ratio, so the gains,
-which do not depend on the values, are worked out once.
+In every kernel, steps: (samples - 1,) are time steps of order one, and values: (samples, columns).
+The state at a sample is (signal, slope, bend), where bend is the second derivative. The third
+derivative of the signal is white noise of density `ratio`, in units in which the measurement noise
+has variance one. All columns share one ratio, so the gains, which do not depend on the values,
+are computed once.
 
-Loops in place of array expressions and slices: those take seconds more to compile.
+The kernels use loops because array expressions and slices take seconds longer to compile.
 """
 
 from typing import NamedTuple
@@ -14,17 +15,18 @@ import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
 
-# Values scaled to unit range carry rounding of this variance: less noise cannot be told apart.
+# Variance of the rounding errors of values scaled to unit range; less noise cannot be detected.
 ROUNDING = np.finfo(np.float64).eps ** 2
 
 
 class Gains(NamedTuple):
-    """What the filter weighs with, once for all columns.
+    """Kalman gains and covariances, the same for all columns.
 
-    parabola: (3, 3), from the first three samples to the state at the third.
-    gain: (samples, 3); variance: (samples,) of the innovations; both from the fourth sample on.
+    parabola: (3, 3), maps the first three samples to the state at the third.
+    gain: (samples, 3), Kalman gains; variance: (samples,), variances of the innovations. Both are
+    filled from the fourth sample on.
     slope_cov: (samples, 3), covariance of the slope at a sample with the state there, given the
-    samples so far; at the first two samples with the state at the third.
+    samples so far; at the first two samples, covariance with the state at the third.
     """
 
     parabola: np.ndarray
@@ -35,7 +37,7 @@ class Gains(NamedTuple):
 
 @compiled
 def _parabola(h1, h2):
-    """State at the third sample of the parabola through the first three."""
+    """Matrix from the first three samples to the state of their parabola at the third."""
     both = h1 + h2
     state = np.zeros((3, 3))
     state[0, 2] = 1.0
@@ -47,7 +49,7 @@ def _parabola(h1, h2):
 
 @compiled
 def _signal_cov(a, b):
-    """Covariance of a process of unit density, `a` and `b` after it left a known parabola."""
+    """Covariance of a process of unit density, at times `a` and `b` after it left a parabola."""
     low, lag = min(a, b), abs(a - b)
     return low**5 / 20.0 + lag * low**4 / 8.0 + lag**2 * low**3 / 12.0
 
@@ -62,15 +64,16 @@ def _slope_signal_cov(a, b):
 
 @compiled
 def _start(steps, ratio, slope_cov):
-    """Begin at the third sample, where three samples first determine the state.
+    """Start the filter at the third sample, where the samples first determine the state.
 
-    Looking back from there, the signal leaves the state's own parabola as a process of the
-    same law; with the measurement noise that is all the three samples can err by. Returns the
-    parabola and the state's covariance as L D L', (3,) and (3,); fills three rows of slope_cov.
+    Backwards in time from there, the signal departs from the state's parabola as a process of
+    the same law. This departure and the measurement noise are the only errors of the three
+    samples. Returns the parabola and the covariance of the state as L D L', (3,) and (3,);
+    fills three rows of slope_cov.
     """
     ages = (steps[0] + steps[1], steps[1], 0.0)
     parabola = _parabola(steps[0], steps[1])
-    # Errors of the first two samples, as two independent ones; the third errs by noise alone.
+    # Errors of the first two samples, decorrelated; the third sample has measurement noise only.
     first = 1.0 + ratio * _signal_cov(ages[0], ages[0])
     shared = ratio * _signal_cov(ages[0], ages[1]) / first
     second = 1.0 + ratio * (_signal_cov(ages[1], ages[1]) - shared * _signal_cov(ages[0], ages[1]))
@@ -94,10 +97,10 @@ def _start(steps, ratio, slope_cov):
 
 @compiled
 def _predict(h, ratio, lower, diagonal):
-    """F P F' + Q over a step h, from and to P = L D L', by weighted Gram-Schmidt.
+    """Propagate the covariance P = L D L' to F P F' + Q over a step h by weighted Gram-Schmidt.
 
-    Nothing is subtracted but projections, so samples far closer together than the mean step
-    cost few digits; F P F' itself would lose them all (Bierman 1977, Factorization Methods for
+    Only projections are subtracted, so samples far closer together than the mean step cost few
+    digits; computing F P F' directly would lose them all (Bierman 1977, Factorization Methods for
     Discrete Sequential Estimation).
     """
     (l10, l20, l21), (d0, d1, d2) = lower, diagonal
@@ -125,7 +128,7 @@ def _predict(h, ratio, lower, diagonal):
 
 @compiled
 def gains(steps, ratio):
-    """Run the filter's covariances over all samples."""
+    """Kalman gains and covariances of the filter over all samples."""
     n_samples = len(steps) + 1
     gain, variance = np.zeros((n_samples, 3)), np.ones(n_samples)
     slope_cov = np.empty((n_samples, 3))
@@ -134,7 +137,7 @@ def gains(steps, ratio):
         lower, (d0, d1, d2) = _predict(steps[k - 1], ratio, lower, diagonal)
         l10, l20, l21 = lower
         variance[k] = d0 + 1.0
-        d0 /= variance[k]  # a measured signal changes nothing else of L D L'
+        d0 /= variance[k]  # measuring the signal changes no other entry of L D L'
         diagonal = (d0, d1, d2)
         gain[k, 0], gain[k, 1], gain[k, 2] = d0, l10 * d0, l20 * d0
         slope_cov[k, 0] = l10 * d0
@@ -145,7 +148,7 @@ def gains(steps, ratio):
 
 @compiled
 def _filter(steps, values, known):
-    """Innovations, and the slopes as far as the samples up to each one tell."""
+    """Innovations, and filtered slopes: each given the samples up to it."""
     n_samples, n_columns = values.shape
     innovation, slope = np.empty((n_samples, n_columns)), np.empty((n_samples, n_columns))
     state = np.zeros((3, n_columns))
@@ -176,10 +179,10 @@ def _filter(steps, values, known):
 
 @compiled
 def likelihood(steps, values, ratio):
-    """Log-likelihood (columns,) of the samples after the third, and the noise variance at it.
+    """Log-likelihood (columns,) of the samples after the third, and the noise variance (columns,).
 
-    The variance (columns,) of the measurement noise is profiled out; a constant that depends on
-    neither values nor ratio is left out.
+    The variance of the measurement noise is profiled out: its most likely value is returned. A
+    constant that depends on neither the values nor the ratio is left out.
     """
     known = gains(steps, ratio)
     innovation, _ = _filter(steps, values, known)
@@ -198,16 +201,16 @@ def likelihood(steps, values, ratio):
 
 @compiled
 def smooth(steps, values, ratio):
-    """Signal and slope per unit time, both (samples, columns), given all samples.
+    """Smoothed signal and slope per unit time, both (samples, columns), given all samples.
 
-    The signal is the values less the smoothed measurement noise, so no filtered state need be
-    kept (Durbin & Koopman 2012, section 4.5).
+    The signal is the values minus the smoothed measurement noise, so no filtered state need be
+    stored (Durbin & Koopman 2012, section 4.5).
     """
     known = gains(steps, ratio)
     innovation, slope = _filter(steps, values, known)
     n_samples, n_columns = values.shape
     signal = innovation  # row k is read before it is written
-    later = np.zeros((3, n_columns))  # what later samples say about the state, as a gradient
+    later = np.zeros((3, n_columns))  # gradient of the later samples' log-likelihood by the state
     r0, r1, r2 = later[0], later[1], later[2]
     for k in range(n_samples - 1, 2, -1):
         h, weight = steps[k - 1], 1.0 / known.variance[k]

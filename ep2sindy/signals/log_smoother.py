@@ -1,4 +1,4 @@
-"""Smooth a positive signal in its logarithm: noise is additive, growth rates are what is smooth."""
+"""Smoother for positive signals: the logarithm is smooth, and the noise is additive."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from scipy.optimize import minimize_scalar
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.arrays import read_only
 
-# Of process to measurement noise, with the mean step as the unit of time and the signal's mean as
-# that of the signal: from a memory of some 30 samples to interpolation.
+# Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
+# time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -9.0, 8.0
 
-LOG10_RATIO_TOLERANCE = 0.05  # below what data can tell
+LOG10_RATIO_TOLERANCE = 0.05  # finer than data can determine
 
 MIN_SAMPLES = 8
 
 MAX_ITER, TOLERANCE = 50, 1e-9
 
-ROUNDING = 1e-24  # of samples of order one, squared: less noise cannot be told apart
+ROUNDING = 1e-24  # squared rounding error of samples of order one; less noise is not detectable
 
-FLOOR = 1e-3  # of the signal's mean: where the logarithm of a sample begins at least
+FLOOR = 1e-3  # lower bound, in means of the signal, on samples whose logarithm starts the search
 
 
 @dataclass(frozen=True, eq=False)
 class LogEstimate:
-    """What is left of a positive signal without its noise.
+    """Smoothed logarithm and growth rate of a positive signal, with its noise.
 
-    log: natural logarithm of the smoothed signal, its unit left out; rate: derivative of that, in
-    1/s. noise_std: of the white noise in the samples, in their unit. log10_ratio: of process to
-    measurement noise.
+    log: natural logarithm of the smoothed signal in its unit. rate: time derivative of `log`, in
+    1/s. noise_std: standard deviation of the white noise in the samples, in their unit.
+    log10_ratio: log10 of the ratio of process to measurement noise.
     """
 
     log: Float[np.ndarray, " samples"]
@@ -53,15 +53,15 @@ class LogEstimate:
 
 @dataclass(frozen=True)
 class LogSmoother:
-    """A positive signal seen through additive white noise, its logarithm a smooth process.
+    """Smoother for a positive signal with additive white noise and a smooth logarithm.
 
-    The logarithm is a twice integrated Wiener process, as in `KalmanSmoother`, and the samples are
-    its exponential plus noise of one standard deviation. A sample at a trough that is no higher
-    than the noise says little of the logarithm there, and counts as little; it may be zero or
-    negative. The mode of the posterior is found by Gauss and Newton's method; the ratio of process
+    The logarithm is a twice integrated Wiener process, as in `KalmanSmoother`; the samples are
+    its exponential plus noise of constant standard deviation. A sample in a trough no higher than
+    the noise says little about the logarithm there and has little weight; it may be zero or
+    negative. The mode of the posterior is found by the Gauss-Newton method; the ratio of process
     to measurement noise is the most likely one (Laplace's approximation).
-    finest_s: memory of the process, at least, where the signal is at its mean: what is faster
-    counts as noise. None leaves it to the data.
+    finest_s: least memory of the process, in s, where the signal is at its mean; faster
+    components count as noise. None leaves it to the data.
     Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 3.4.
     """
 
@@ -74,7 +74,7 @@ class LogSmoother:
     def estimate(
         self, t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
     ) -> LogEstimate:
-        """Smooth samples of a signal that is positive but for noise; steps may be unequal.
+        """Smooth samples of a signal that is positive apart from noise; steps may be unequal.
 
         Raises ValueError for fewer than eight samples, or a mean that is not positive.
         """
@@ -93,7 +93,7 @@ class LogSmoother:
 
 
 def ratio_bound(finest_s: float | None, step_s: float) -> float:
-    """The largest log10_ratio under which a process remembers a time or more."""
+    """Largest log10_ratio at which the memory of the process is at least finest_s."""
     if finest_s is None:
         return LOG10_RATIO_MAX
     bound = 6.0 * np.log10(step_s / finest_s)
@@ -102,7 +102,11 @@ def ratio_bound(finest_s: float | None, step_s: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Mode:
-    """log: (samples,); squares: of what is left and of the roughness; misfit: -2 log likelihood."""
+    """Mode of the posterior for one ratio.
+
+    log: (samples,). squares: residual sum of squares plus roughness penalty. misfit: -2 log
+    likelihood.
+    """
 
     log: np.ndarray
     squares: float
@@ -110,9 +114,10 @@ class _Mode:
 
 
 def _most_likely(y: np.ndarray, penalty: np.ndarray, highest: float) -> tuple[float, _Mode]:
-    """A grid of decades down from the highest ratio, then a bounded search around the best.
+    """Ratio of greatest likelihood, and the mode of the posterior for it.
 
-    y: in units of its mean. Each mode is sought from where the last was found.
+    A grid of decades down from the highest ratio is followed by a bounded search around the best.
+    y: in units of its mean. Each search for a mode starts from the previous mode.
     """
     decades = np.arange(highest, LOG10_RATIO_MIN - 1.0, -1.0)
     modes, log = [], np.log(np.maximum(y, FLOOR))
@@ -155,15 +160,17 @@ def _mode(y: np.ndarray, penalty: np.ndarray, log10_ratio: float, log: np.ndarra
 
 
 def _squares(y: np.ndarray, prior: np.ndarray, log: np.ndarray) -> float:
-    with np.errstate(over="ignore"):  # a step too far: it is halved
+    with np.errstate(over="ignore"):  # a step that is too long overflows, and is then halved
         return float(np.square(y - np.exp(log)).sum() + log @ _times(prior, log))
 
 
 def _roughness(t: np.ndarray) -> np.ndarray:
-    """Integral of the squared third derivative as a matrix of the samples: its lower diagonals.
+    """Lower diagonals of the matrix of the integral of the squared third derivative.
 
-    t: (samples,) in mean steps. From divided differences, each over a third of its four samples'
-    span. Returns (4, samples).
+    The matrix is a quadratic form of the samples. It is built from third divided differences, each
+    weighted by a third of the span of its four samples.
+
+    t: (samples,) in mean steps. Returns (4, samples).
     """
     n = len(t)
     four = np.stack([t[k : n - 3 + k] for k in range(4)])
@@ -180,14 +187,14 @@ def _roughness(t: np.ndarray) -> np.ndarray:
 
 
 def _with_weights(diagonals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The matrix with weights added to its diagonal."""
+    """Banded matrix with weights added to its main diagonal."""
     found = diagonals.copy()
     found[0] += weights
     return found
 
 
 def _times(diagonals: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """A symmetric banded matrix times a vector."""
+    """Product of a symmetric banded matrix and a vector."""
     product = diagonals[0] * x
     for k in range(1, len(diagonals)):
         product[k:] += diagonals[k, :-k] * x[:-k]

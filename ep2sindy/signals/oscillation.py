@@ -1,8 +1,8 @@
-"""Whether a record oscillates: one measure, and the bounds that each use sets.
+"""Test whether a record oscillates, with bounds that depend on the use.
 
-Two related questions have measures of their own. `attractor.find_cycle` asks whether a record
-repeats one waveform, which chaos does not though it oscillates; `operating.map` asks what a model
-does that runs from a start, and has a fixed point and the stability of its cycle to judge by.
+Two related questions have their own measures. `attractor.find_cycle` tests whether a record
+repeats one waveform; chaos oscillates but does not repeat. `operating.map` classifies the run of a
+model from a start, and can also use its fixed point and the stability of its cycle.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.signals.spectrum import peak, power_spectrum
 
-PEAK_WIDTH = 0.05  # of the frequency, or two bins if these are more, to either side of a peak
+PEAK_WIDTH = 0.05  # half-width of a peak, as a share of its frequency; two bins at least
 
-DIED_OUT = 0.1  # of a record's spread: what varies less in the second half has died out
+DIED_OUT = 0.1  # a run whose spread in the second half is below this share of the data's died out
 
 
 class Oscillation(StrEnum):
-    """What a record does, as tables and summaries have it; `oscillating`, or why it says nothing.
+    """Behaviour of a record, as tables and summaries name it.
 
-    steady: it hardly varies. decaying: it varied much more before. no dominant frequency: its
-    spectrum has no peak, or it is too short. transit: it oscillates, faster than what is looked
-    for. no period: it oscillates without repeating a waveform. diverged: it broke off.
+    Either `oscillating`, or the reason why the record does not count as such. steady: it hardly
+    varies. decaying: it varied much more before. no dominant frequency: its spectrum has no peak,
+    or it is too short. transit: it oscillates faster than the mode of interest. no period: it
+    oscillates without repeating a waveform. diverged: the run ended early.
     """
 
     OSCILLATING = "oscillating"
@@ -40,12 +41,13 @@ class Oscillation(StrEnum):
 
 @dataclass(frozen=True)
 class OscillationBounds:
-    """What counts as an oscillation.
+    """Bounds that a record must satisfy to count as oscillating.
 
-    The record is cut into `n_blocks` of time, and the last is looked at. spread: least standard
-    deviation of every state, in means. lasting: least share of the first block's standard deviation
-    that is left. min_periods: of the whole record. min_peak: share of the first state's power at
-    its dominant frequency. max_Hz: highest dominant frequency.
+    The record is cut into `n_blocks` of time, and the last one is tested. spread: least standard
+    deviation of every state, in units of its mean. lasting: least ratio of the last block's
+    standard deviation to the first block's. min_periods: least number of periods in the whole
+    record. min_peak: least share of the first state's power at its dominant frequency. max_Hz:
+    highest dominant frequency.
     """
 
     spread: float
@@ -56,11 +58,11 @@ class OscillationBounds:
     max_Hz: float = np.inf
 
 
-# Any record. Fewer than four periods may be a drift. White noise has a tenth of its power near the
-# highest peak at most, the thruster's breathing two thirds.
+# Bounds for any record. Fewer than four periods may be a drift. White noise has at most a tenth of
+# its power near the highest peak, the thruster's breathing mode two thirds.
 RECORDED = OscillationBounds(spread=0.01, lasting=0.5, min_periods=4.0, min_peak=0.2)
-# A simulated current after its transient: without noise, so that a peak needs no proof, but some
-# sets of parameters oscillate for long and die in the end.
+# Bounds for a simulated current after its transient. It has no noise, so no peak is required, but
+# with some parameters it oscillates for a long time and finally decays.
 SIMULATED = OscillationBounds(spread=0.02, lasting=0.7, n_blocks=4)
 
 
@@ -69,7 +71,7 @@ def oscillation(
     states: Float[np.ndarray, "samples n_states"],
     bounds: OscillationBounds = RECORDED,
 ) -> Oscillation:
-    """Say whether a record oscillates; the first bound that it does not keep is the answer."""
+    """Classify a record by the first bound that it violates; `oscillating` if it violates none."""
     blocks = np.array_split(states, bounds.n_blocks)
     if (relative_spread(blocks[-1]) < bounds.spread).any():
         return Oscillation.STEADY
@@ -89,7 +91,7 @@ def oscillation(
 def relative_spread(
     states: Float[np.ndarray, "samples n_states"],
 ) -> Float[np.ndarray, " n_states"]:
-    """Standard deviation of every state over the size of its mean."""
+    """Standard deviation of every state divided by the absolute value of its mean."""
     return states.std(axis=0) / np.maximum(np.abs(states.mean(axis=0)), np.finfo(float).tiny)
 
 
@@ -98,7 +100,7 @@ def has_decayed(
     earlier: Float[np.ndarray, "_ n_states"],
     share: float,
 ) -> Bool[np.ndarray, " n_states"]:
-    """Whether every state varies by less than a share of what it did earlier, or elsewhere."""
+    """For each state: is its standard deviation below `share` times that of `earlier`?"""
     below: np.ndarray = states.std(axis=0) < share * earlier.std(axis=0)
     return below
 
@@ -106,5 +108,5 @@ def has_decayed(
 def relative_amplitude(
     mean: Float[np.ndarray, " n_states"], std: Float[np.ndarray, " n_states"]
 ) -> float:
-    """Root mean square over the states of standard deviation over the size of the mean."""
+    """Root mean square over the states of standard deviation divided by absolute mean."""
     return float(np.sqrt(np.square(std / zero_to_one(np.abs(mean))).mean()))

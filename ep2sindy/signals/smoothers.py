@@ -1,4 +1,4 @@
-"""Smooth sampled states and differentiate them."""
+"""Smoothers that smooth sampled states and differentiate them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ep2sindy.signals.spectrum import is_uniform
 
 @runtime_checkable
 class Smoother(Protocol):
-    """What the alternatives share: smoothed samples, and their time derivative."""
+    """Interface of the smoothers: smoothed samples, and their time derivative."""
 
     def smooth(
         self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
@@ -28,7 +28,7 @@ class Smoother(Protocol):
 def difference(
     t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
 ) -> Float[np.ndarray, "samples columns"]:
-    """Second-order differences, exact for parabolas, on unequal steps and at the ends too."""
+    """Second-order finite differences, exact for parabolas, also at unequal steps and the ends."""
     if len(t) < 3:
         raise ValueError(f"second-order differences need three samples or more: {len(t)} came")
     return np.gradient(values, t, axis=0, edge_order=2)
@@ -36,7 +36,7 @@ def difference(
 
 @dataclass(frozen=True)
 class NoSmoothing:
-    """Take the samples as they are: for data without noise."""
+    """Use the samples unchanged, for data without noise."""
 
     def smooth(
         self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
@@ -51,11 +51,11 @@ class NoSmoothing:
 
 @dataclass(frozen=True)
 class SavitzkyGolay:
-    """Least-squares polynomial of `order` over `window` samples, at every sample.
+    """Fit a least-squares polynomial of `order` over `window` samples around every sample.
 
     The derivative is the second-order difference of the smoothed samples (the thesis's
-    "smoothed finite difference"). Near the ends the first and the last full window serve, so
-    nothing wraps around; on unequal steps the polynomial is fitted to the actual times.
+    "smoothed finite difference"). Near the ends the first and the last full window are used, so
+    nothing wraps around. With unequal steps the polynomial is fitted to the actual times.
     Raises ValueError unless window is odd and above order.
     Source: Savitzky & Golay 1964, doi:10.1021/ac60214a047.
     """
@@ -80,7 +80,7 @@ class SavitzkyGolay:
                 "shorten the window or join more data"
             )
         if is_uniform(t):
-            from scipy.signal import savgol_filter  # half a second that a weak form does not need
+            from scipy.signal import savgol_filter  # import takes 0.5 s; weak forms do not need it
 
             return savgol_filter(values, self.window, self.order, axis=0, mode="interp")
         return self._smooth_unequal(t, values)
@@ -91,7 +91,7 @@ class SavitzkyGolay:
         return difference(t, self.smooth(t, values))
 
     def _smooth_unequal(self, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Fit each sample's own window, the nearest full one at the ends, in scaled time."""
+        """Fit the window around each sample in scaled time; the nearest full one at the ends."""
         first = np.clip(np.arange(len(t)) - self.window // 2, 0, len(t) - self.window)
         window_t = sliding_window_view(t, self.window)[first] - t[:, None]
         window_t = window_t / np.abs(window_t).max(axis=1, keepdims=True)

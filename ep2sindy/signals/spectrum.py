@@ -10,11 +10,11 @@ from scipy import fft
 
 from ep2sindy.data.numbers import rounding_s
 
-STEP_TOLERANCE = 1e-6  # relative spread of steps below which sampling counts as uniform
+STEP_TOLERANCE = 1e-6  # largest relative spread of steps in uniform sampling
 
 
 def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
-    """Whether all time steps agree to rounding of the recorded times."""
+    """Return true if all time steps agree to the rounding of the recorded times."""
     steps = np.diff(t)
     return bool(np.ptp(steps) <= max(STEP_TOLERANCE * steps.mean(), 2 * rounding_s(t)))
 
@@ -22,10 +22,10 @@ def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
 def power_spectrum(
     t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
 ) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]]:
-    """One-sided power density of x, mean removed, Hann window.
+    """One-sided power spectral density of x, with the mean removed and a Hann window.
 
-    t: (samples,) in s; unequal steps are first resampled to their mean (cubic).
-    Returns frequencies in Hz and power in u^2/Hz.
+    t: (samples,) in s. Samples at unequal steps are first resampled at the mean step (cubic).
+    Returns frequencies in Hz and power density in u^2/Hz.
     """
     if not is_uniform(t):
         from scipy.interpolate import make_interp_spline
@@ -37,21 +37,21 @@ def power_spectrum(
 
 
 def _periodogram(x: np.ndarray, rate_Hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """`scipy.signal.periodogram` of a Hann window: loading that module takes half a second."""
+    """Same as `scipy.signal.periodogram` with a Hann window, whose import takes half a second."""
     window = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, len(x) + 1)[:-1])
-    strength = np.cumsum(window**2)[-1]  # one after the other, for SciPy's last digit
+    strength = np.cumsum(window**2)[-1]  # summed in order, to match SciPy to the last digit
     transform = fft.rfft((x - x.mean()) * (window * (1.0 / np.sqrt(strength * rate_Hz))))
     power = transform.real**2 + transform.imag**2
     paired = len(power) - 1 + len(x) % 2
-    power[1:paired] *= 2.0  # the negative frequencies
+    power[1:paired] *= 2.0  # add the negative frequencies
     return fft.rfftfreq(len(x), 1.0 / rate_Hz), power
 
 
 def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
     """Frequency in Hz of the highest spectral peak, refined between bins.
 
-    A parabola through the log power of the peak and its neighbours: for a Hann window and a
-    pure tone the error is below 2 % of a bin. Zero for a signal that does not change.
+    A parabola is fitted to the log power of the peak bin and its neighbours. For a Hann window
+    and a pure tone the error is below 2 % of a bin. Zero for a constant signal.
     """
     return peak(*power_spectrum(t, x))
 
@@ -59,19 +59,19 @@ def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
 def steps_in(
     periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
 ) -> float:
-    """Number of time steps that so many periods take, not rounded; the median over records."""
+    """Number of time steps in the given number of periods, not rounded; median over records."""
     return float(np.median(periods / (np.asarray(frequency_Hz) * np.asarray(dt_s))))
 
 
 def samples_in(
     periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
 ) -> int:
-    """Number of samples from the first to the last of so many periods; the median over records."""
+    """Number of samples in the given number of periods, both ends included; median over records."""
     return round(steps_in(periods, frequency_Hz=frequency_Hz, dt_s=dt_s)) + 1
 
 
 def peak(frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"]) -> float:
-    """Frequency in Hz of the highest peak of a power spectrum: see `dominant_frequency`."""
+    """Frequency in Hz of the highest peak of a power spectrum; see `dominant_frequency`."""
     if len(power) < 4 or power.max() <= 0.0:
         return 0.0
     k = int(np.clip(np.argmax(power[1:]) + 1, 2, len(power) - 2))

@@ -1,4 +1,4 @@
-"""How far parts of one record are apart: no run of a model can be asked to lie closer to it."""
+"""Distances between parts of one record: a lower limit for the distance of a model run to it."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from jaxtyping import Float
 from ep2sindy.signals.attractor import distribution_distances, spectrum_distance
 from ep2sindy.signals.spectrum import dominant_frequency
 
-N_PARTS, TURNS = 4, 2.0  # parts of a record, and turns that each must hold; else there are two
+# Number of parts of a record, and periods that each part must hold; otherwise there are two parts.
+N_PARTS, TURNS = 4, 2.0
 
 
 def quarter_distances(
     t: Float[np.ndarray, " samples"], states: Float[np.ndarray, "samples n_states"]
 ) -> tuple[Float[np.ndarray, " n_states"], float]:
-    """Mean distance of distributions, by state, and of spectra, between quarters of a record.
+    """Mean distances between quarters of a record: of distributions, by state, and of spectra.
 
-    Twice what two whole records of the same motion are apart, if their parts are independent.
-    Between halves where quarters hold less than two turns of the fastest state.
+    If the quarters are independent, the distance is twice that between two whole records of the
+    same motion. Halves are compared if a quarter holds less than two periods of the fastest state.
     """
     fastest_Hz = max(dominant_frequency(t, column) for column in states.T)
     n_parts = N_PARTS if fastest_Hz * (t[-1] - t[0]) >= N_PARTS * TURNS else 2

@@ -1,4 +1,4 @@
-"""One measured signal, checked and made ready: does it oscillate, and how finely is it sampled?"""
+"""Checks and preparation of one measured signal: oscillation, sampling, drift."""
 
 from __future__ import annotations
 
@@ -13,27 +13,28 @@ from ep2sindy.runtime.arrays import read_only
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
 from ep2sindy.signals.spectrum import dominant_frequency
 
-MIN_PERIODS = 6.0  # of a record: what a free run is judged on
+MIN_PERIODS = 6.0  # fewest periods in a record on which a free run can be judged
 
-# Samples to a period that say all of a breathing mode; more cost time, and follow the noise.
+# Samples per period that resolve a breathing mode; more samples cost time and follow the noise.
 ENOUGH_SAMPLES = 100
 
-DRIFT = 1.0  # of a standard deviation over the record: more is said
+DRIFT = 1.0  # in standard deviations over the record; a larger drift is reported
 
-# Of the signal's standard deviation: what the waveform's must be. In white noise, too, a line can
-# be followed that has some.
+# Least standard deviation of the waveform, as a share of the signal's. A cycle found in white noise
+# also has some.
 MIN_VISIBLE = 0.5
 
-# A sample may lie below zero by so many standard deviations of the noise, and so many samples may,
-# where the signal is positive but for noise.
+# Limits for a signal that is positive apart from noise: how far a sample may lie below zero, in
+# standard deviations of the noise, and the share of samples that may.
 NOISE_BELOW, SHARE_BELOW = 6.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A signal that oscillates, at six periods or more.
+    """An oscillating signal of at least six periods.
 
-    x: (samples,) in `unit`. done: what was done to the samples, in words; advice: what might be.
+    x: (samples,) in `unit`. done: processing already applied to the samples, in words. advice:
+    processing that is recommended.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -65,11 +66,11 @@ def from_one_signal(
     decimate: int | str | None = None,
     detrend: bool = False,
 ) -> Trace:
-    """One variable of a run as a trace.
+    """Make a trace of one variable of a run.
 
-    signal: None takes the only state. decimate: means over so many samples take their place;
-    "auto" leaves a hundred to a period. detrend: a straight line is taken out: a positive signal
-    is divided by it, another less it, and the mean stays.
+    signal: None takes the only state. decimate: number of samples that are replaced by their
+    mean; "auto" leaves a hundred per period. detrend: remove a straight line and keep the mean; a
+    positive signal is divided by the line, from any other signal the line is subtracted.
     Raises ValueError for a signal that does not oscillate, under six periods, or a wrong setting.
 
     >>> t = np.linspace(0.0, 1e-3, 2001)
@@ -111,7 +112,7 @@ def from_one_signal(
 
 
 def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> bool:
-    """Whether a signal is above zero at all times, but for white noise in its samples."""
+    """Return true if the signal is positive at all times, apart from white noise in its samples."""
     lowest = float(x.min())
     if lowest > 0.0:
         return True
@@ -121,7 +122,7 @@ def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples
 
 
 def _cycle(t: np.ndarray, x: np.ndarray, name: str) -> Cycle:
-    """The cycle of a signal that has one, over six periods or more."""
+    """Cycle of a signal; ValueError if there is none or fewer than six periods."""
     cycle = find_cycle(t, x[:, None])
     if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
         cycle = None
@@ -145,7 +146,7 @@ def _cycle(t: np.ndarray, x: np.ndarray, name: str) -> Cycle:
 
 
 def _means(values: np.ndarray, factor: int) -> np.ndarray:
-    """Over `factor` samples each; what is left over at the end is dropped."""
+    """Means over `factor` consecutive samples; an incomplete group at the end is dropped."""
     n = len(values) // factor
     return values[: n * factor].reshape(n, factor).mean(axis=1)
 
@@ -155,7 +156,7 @@ def _line(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _drift(t: np.ndarray, x: np.ndarray) -> float:
-    """Rise of the straight line over the record, in standard deviations."""
+    """Rise of the fitted straight line over the record, in standard deviations."""
     line = _line(t, x)
     return float((line[-1] - line[0]) / x.std())
 

@@ -1,4 +1,4 @@
-"""Example systems, whose equations are known."""
+"""Example systems with known equations."""
 
 from ep2sindy._stubs import attach
 

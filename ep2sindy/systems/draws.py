@@ -1,4 +1,4 @@
-"""Random draws of known systems, as the thesis's benchmark makes them.
+"""Random draws of known systems, as in the benchmark of the thesis.
 
 Source: the thesis, appendix, II-E and III-C.
 """
@@ -44,8 +44,8 @@ def _lorenz(rng: np.random.Generator) -> Draw:
     return Draw(lorenz(), rng.uniform([-15.0, -15.0, 10.0], [15.0, 15.0, 40.0]))
 
 
-# The thesis draws the Van der Pol oscillator's mu and starts it at (1, 1); it does not say where
-# it starts the others: these ranges are ours.
+# The thesis draws the Van der Pol oscillator's mu and starts it at (1, 1). It does not state the
+# starts of the other systems, so these ranges are our choice.
 DRAWS: Mapping[str, Callable[[np.random.Generator], Draw]] = {
     "oscillator": _oscillator,
     "lotka_volterra": _lotka_volterra,
@@ -57,10 +57,11 @@ DRAWS: Mapping[str, Callable[[np.random.Generator], Draw]] = {
 def realization(
     name: str, noise: float, number: int, *, n_trajectories: int = 1, seed: int = 0
 ) -> tuple[System, list[Trajectory]]:
-    """One draw of a system and noisy trajectories of it; every noise level sees the same draw.
+    """One draw of a system with noisy trajectories; the draw is the same for every noise level.
 
-    noise: standard deviation of the white noise, in RMS of each state. n_trajectories: beyond
-    the first they start where other draws would; the Van der Pol oscillator in [-2, 2]^2.
+    noise: standard deviation of the white noise, in RMS of each state. n_trajectories: the first
+    trajectory starts at the draw's own start; the others start at those of further draws, or in
+    [-2, 2]^2 for the Van der Pol oscillator.
     """
     check_systems([name])
     rng = np.random.default_rng([seed, list(DRAWS).index(name), number])

@@ -1,10 +1,10 @@
-"""A synthetic (time, z, r) field of three regions with known equations: the truth for regimes.
+"""Synthetic (time, z, r) field of three regions with known equations, to test regime detection.
 
-Densities at every grid point follow equations whose coefficients pass smoothly from those of one
-region to those of the next; velocities and the ionization rate are given. Supports and
-magnitudes are those that the thesis reports for a Hall thruster's channel (VI-VII): neutrals
-come in at a constant rate near the anode and in proportion to their density downstream, and
-radial convection acts near the walls alone.
+Densities at every grid point follow equations whose coefficients change smoothly from one region
+to the next; velocities and the ionization rate are given. Supports and magnitudes are those that
+the thesis reports for a Hall thruster's channel (VI-VII): the neutral source is constant near
+the anode and proportional to the neutral density downstream, and radial convection acts only
+near the walls.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ REGIONS: Mapping[str, Equations] = {
     },
 }
 
-# A point with more than this share of one region's coefficients counts as inside the region.
+# A point where one region's share of the coefficients exceeds this counts as inside the region.
 INSIDE = 0.95
 
 
@@ -52,8 +52,8 @@ INSIDE = 0.95
 class RegionField:
     """A field and the equations that made it.
 
-    field: n_i, n_n, u_iz, u_ir, R_ion over (time, z, r), in SI. share: (region, z, r), how much of
-    each region's coefficients a point has; they sum to 1. library: the terms of the equations.
+    field: n_i, n_n, u_iz, u_ir, R_ion over (time, z, r), in SI. share: (region, z, r), weight of
+    each region's coefficients at a point; weights sum to 1. library: the terms of the equations.
     """
 
     field: xr.Dataset
@@ -62,16 +62,16 @@ class RegionField:
 
     @property
     def labels(self) -> xr.DataArray:
-        """(z, r): number of the region that has the greatest share of a point."""
+        """Number of the region with the greatest share at each point, (z, r)."""
         return self.share.argmax("region")
 
     @property
     def inside(self) -> xr.DataArray:
-        """(z, r): whether a point is away from the transitions."""
+        """True at points away from the transitions, (z, r)."""
         return self.share.max("region") > INSIDE
 
     def noisy(self, noise: float, *, rng: np.random.Generator | int) -> RegionField:
-        """The same with white noise of `noise` times the RMS of each variable at each point."""
+        """Copy with white noise of `noise` times the RMS of each variable at each point."""
         rng = np.random.default_rng(rng)
         if noise < 0.0:
             raise ValueError(f"noise must be zero or more: {noise} came")
@@ -96,10 +96,10 @@ def three_regions(
 ) -> RegionField:
     """Integrate the blended equations at every point of a thruster's channel.
 
-    regions: equations by region, in the order near the anode, downstream, near the walls; all
-    three the same make a field of one regime. transition: width of the passage from one region to
-    the next (the scale of a logistic function), as a share of the channel's length and gap.
-    Runge-Kutta of order four, one step per sample, inputs exact at half steps.
+    regions: equations by region, in the order near the anode, downstream, near the walls. Three
+    identical sets make a field of one regime. transition: width of the transition between regions
+    (the scale of a logistic function), as a share of the channel's length and gap.
+    Integrated by fourth-order Runge-Kutta, one step per sample, inputs exact at half steps.
     Raises ValueError unless there are three regions and two points or more along every axis.
     """
     if len(regions) != 3 or min(n_z, n_r, n_samples) < 2 or not min(dt_s, transition) > 0.0:
@@ -138,7 +138,7 @@ def three_regions(
 def _shares(
     z: Float[np.ndarray, " points"], r: Float[np.ndarray, " points"], transition: float
 ) -> Float[np.ndarray, "3 points"]:
-    """Parts of the anode's, the exit's and the walls' equations; z, r from 0 to 1."""
+    """Weights of the anode's, the exit's and the walls' equations; z, r from 0 to 1."""
     downstream = expit((z - 0.45) / transition)
     wall = expit((np.abs(r - 0.5) - 0.3) / transition)
     return np.stack([(1.0 - wall) * (1.0 - downstream), (1.0 - wall) * downstream, wall])
@@ -147,10 +147,10 @@ def _shares(
 def _inputs(
     t: Float[np.ndarray, " times"], z: Float[np.ndarray, " points"], r: Float[np.ndarray, " points"]
 ) -> Float[np.ndarray, "times points inputs"]:
-    """u_iz, u_ir in m/s and R_ion in m^3/s: the 14 kHz mode, and a tone of its own for each.
+    """Inputs u_iz, u_ir in m/s and R_ion in m^3/s: the 14 kHz mode plus one tone for each input.
 
-    The tones have no common period, so no input is a function of another. Radial speeds change
-    sign between the walls; they do not vanish in the middle, where only the tone is left.
+    The tones have no common period, so no input is a function of another. The radial velocity
+    changes sign between the walls; in the middle only its tone is left.
     """
 
     def tone(f_Hz: float, phase: float) -> Float[np.ndarray, "times points"]:
@@ -169,7 +169,7 @@ def _integrate(
     inputs: Float[np.ndarray, "half_times points inputs"],
     dt_s: float,
 ) -> Float[np.ndarray, "samples points states"]:
-    """Densities at every sample, all points together; inputs come at half steps."""
+    """Densities at every sample, integrated at all points together; inputs are at half steps."""
     n_samples, n_points = (len(inputs) + 1) // 2, len(coef)
 
     def slope(x: np.ndarray, u: np.ndarray) -> np.ndarray:

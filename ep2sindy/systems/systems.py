@@ -1,4 +1,4 @@
-"""Synthetic systems with known coefficients: the truth that searches are judged by."""
+"""Synthetic systems with known coefficients, against which searches are tested."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ep2sindy.model.solve import Border, solve_stages
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A known model and how the thesis samples it (appendix, II-E).
+    """A known model, with the sampling that the thesis uses (appendix, II-E).
 
     initial: (n_states,), the state at t = 0.
     """
@@ -35,7 +35,7 @@ class System:
         noise: float = 0.0,
         rng: np.random.Generator | int | None = None,
     ) -> Trajectory:
-        """Integrate to 1e-10 and add white noise of `noise` times each state's RMS.
+        """Integrate with tolerance 1e-10, and add white noise of `noise` times each state's RMS.
 
         Raises ValueError for negative noise, or noise without an rng.
         """
@@ -54,7 +54,7 @@ class System:
 
 @dataclass(frozen=True)
 class _Start:
-    """A system and where it starts: equal where all that decides the integration is."""
+    """A system and its start, used as a cache key: equal if the integration would be the same."""
 
     key: tuple[object, ...]
     system: System = field(compare=False)
@@ -68,7 +68,7 @@ class _Start:
         return _Start(key, system, initial)
 
 
-@lru_cache(maxsize=64)  # realizations differ in their noise, and seldom in what it falls on
+@lru_cache(maxsize=64)  # realizations often differ only in the noise added to one trajectory
 def _integrated(
     start: _Start,
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]]:
@@ -107,7 +107,7 @@ def lotka_volterra(*, a: float = 2 / 3, b: float = 1.0, c: float = 1.0, d: float
 
 
 def van_der_pol(*, mu: float = 2.0) -> System:
-    """x' = mu (x - x^3/3 - y), y' = x / mu: the Lienard form."""
+    """x' = mu (x - x^3/3 - y), y' = x / mu (Lienard form)."""
     equations = {"x": {"x": mu, "y": -mu, "x^3": -mu / 3.0}, "y": {"x": 1.0 / mu}}
     return _system("Van der Pol", equations, 3, [1.0, 1.0], 20.0, 50.0)
 
@@ -123,7 +123,7 @@ def lorenz(*, sigma: float = 10.0, rho: float = 28.0, beta: float = 8 / 3) -> Sy
 
 
 def pendulum(*, length: float = 1.0, gravity: float = 9.81) -> System:
-    """theta' = w, w' = -(gravity / length) sin(theta): in rad, let go at 2 rad, for 20 s."""
+    """theta' = w, w' = -(gravity / length) sin(theta), in rad; released at 2 rad, for 20 s."""
     equations = {"theta": {"w": 1.0}, "w": {"sin(theta)": -gravity / length}}
     return _system("pendulum", equations, 1, [2.0, 0.0], 20.0, 100.0, ["sin"])
 

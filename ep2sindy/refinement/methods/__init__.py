@@ -1,1 +1,1 @@
-"""Ways to minimise the distance of integrated windows from the data."""
+"""Methods that minimise the distance of integrated windows from the data."""

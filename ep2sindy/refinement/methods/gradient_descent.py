@@ -1,4 +1,4 @@
-"""Integral least squares by gradients from autograd."""
+"""Integral least squares by torch optimisers, with gradients from autograd."""
 
 from __future__ import annotations
 
@@ -28,10 +28,12 @@ LBFGS: Optimizer = partial(torch.optim.LBFGS, line_search_fn="strong_wolfe")
 
 @dataclass(frozen=True)
 class GradientDescent:
-    """A torch optimiser through torchdiffeq's `rk4`, by plain reverse mode.
+    """Minimise by a torch optimiser, with reverse-mode gradients through torchdiffeq's `rk4`.
 
-    optimizer: makes one from parameters, such as `partial(torch.optim.Adam, lr=1e-2)`.
-    It has converged when the last `patience` steps gained less than `tolerance` of the loss.
+    optimizer: function from parameters to an optimiser, such as
+    `partial(torch.optim.Adam, lr=1e-2)`.
+    The fit has converged when the last `patience` steps reduced the loss by less than a share
+    `tolerance`.
     """
 
     optimizer: Optimizer = LBFGS
@@ -44,7 +46,7 @@ class GradientDescent:
         return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
 
     def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
-        """Set `n_substeps` instead."""
+        """Return None: the step is not halved automatically; set `n_substeps` instead."""
         return
 
     def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
@@ -89,9 +91,9 @@ class GradientDescent:
         *,
         observe: Callable[[float], None],
     ) -> bool:
-        """Train every parameter of a module, and the starts where they ask for a gradient.
+        """Train every parameter of a module, and the starts if they require a gradient.
 
-        data: (windows, samples, n_states). Returns whether the loss has settled.
+        data: (windows, samples, n_states). Returns true if the loss has converged.
         """
         parameters = [*ode.parameters(), *([start] if start.requires_grad else [])]
         optimizer = self.optimizer(parameters)
@@ -123,7 +125,7 @@ class GradientDescent:
 def trajectories(
     ode: ODE, drive: Drive, start: torch.Tensor, n_samples: int, n_substeps: int = 1
 ) -> torch.Tensor:
-    """(windows, samples, n_states) from starts (windows, n_states), differentiable."""
+    """Trajectories (windows, samples, n_states) from starts (windows, n_states), differentiable."""
     ode.drive = drive
     last = n_samples - 1
     t = torch.arange(n_samples, dtype=torch.float64, device=start.device)

@@ -1,4 +1,4 @@
-"""Multiple shooting: one node per sample, all steps at once, condensed Gauss-Newton."""
+"""Multiple shooting by condensed Gauss-Newton: one node per sample, all steps at once."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from ep2sindy.refinement.problem import (
     residual_weights,
 )
 
-# A direction of the scalings counts as absent below this share of the strongest.
+# Directions of the scalings weaker than this share of the strongest are dropped.
 RANK = 1e-12
 
 
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Gauss-Newton on nodes and scalings together, windows growing from stage to stage.
+    """Gauss-Newton on nodes and scalings together, in stages with growing blocks.
 
     Each iteration integrates every step of every window in one call, with tangents, and solves
-    for the scalings with each block's start eliminated by QR. A stage cuts the windows into
-    blocks with starts of their own: `first_block` samples, then `growth` times as many, up to
-    the whole window. A stage that fails leaves the scalings as they were.
-    Points have step lengths of their own and leave once they have converged. Points that a law
-    ties move together: a step is as long as the point that bears least lets it be, and all have
-    converged, or failed, when every one has, or any one.
-    limit: largest change of a scaling per iteration, relative to it or to one.
-    Converged: the relative change of every scaling is below `tolerance`, the defects too.
+    for the scalings, with each block's start eliminated by QR. A stage cuts the windows into
+    blocks with their own starts: `first_block` samples, then `growth` times as many, up to
+    the whole window. A stage that fails leaves the scalings unchanged.
+    Each point has its own step length and leaves once it has converged. Points tied by a law
+    move together: the point with the shortest allowed step sets the step of all. They have
+    converged when every point has, and failed when any point has.
+    limit: largest change of a scaling per iteration, relative to the scaling or to one, whichever
+    is larger. tolerance: convergence requires the relative change of every scaling, and the
+    defects, to be below it.
     Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7.
     """
 
@@ -68,7 +69,7 @@ class MultipleShooting:
     def finer(
         self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray
     ) -> RefinementFit | None:
-        """Some points of a fit again from where they are, with half the time step."""
+        """Continue some points of a fit from their present state, with half the time step."""
         step = fit.step.halved()
         if step is None:
             return None
@@ -84,7 +85,7 @@ class MultipleShooting:
         )
 
     def blocks(self, window: int) -> list[int]:
-        """Of the stages before the whole window, in samples."""
+        """Block lengths, in samples, of the stages before the whole window."""
         blocks, size = [], float(self.first_block)
         while size < window:
             blocks.append(round(size))
@@ -100,7 +101,7 @@ class MultipleShooting:
         tolerance: float,
         max_iter: int,
     ) -> RefinementFit:
-        """Iterate at one block size; points leave once they have converged or failed."""
+        """Iterate with one block length; points leave once they have converged or failed."""
         for _ in range(max_iter):
             active = np.flatnonzero(~state.finished & state.finite)
             if not active.size:
@@ -116,7 +117,7 @@ class MultipleShooting:
         block: int,
         tolerance: float,
     ) -> RefinementFit:
-        """One Gauss-Newton step of the active points; those that fail stay where they are."""
+        """One Gauss-Newton step of the active points; points that fail stay unchanged."""
         theta, scaling, nodes = state.theta, state.scaling.copy(), state.nodes.copy()
         finished, finite = state.finished.copy(), state.finite.copy()
         maps = step_maps(problem, state.step, scaling, nodes, active)
@@ -149,7 +150,7 @@ class MultipleShooting:
 
 
 def _keep_finite(before: RefinementFit, after: RefinementFit, data: np.ndarray) -> RefinementFit:
-    """What a stage gave where it stayed finite; elsewhere the scalings it began with."""
+    """Result of a stage; points that did not stay finite get back their initial scalings."""
     lost = ~after.finite
     scaling, nodes = after.scaling.copy(), after.nodes.copy()
     scaling[lost], nodes[lost] = before.scaling[lost], data[lost]
@@ -173,7 +174,7 @@ def tell(
     relative: np.ndarray,
     defect: np.ndarray,
 ) -> None:
-    """Let whoever watches know of an iteration, point by point."""
+    """Report an iteration to the observer, point by point."""
     for i, point in enumerate(points):
         problem.observe(
             Iteration(
@@ -194,7 +195,7 @@ def step_maps(
     nodes: np.ndarray,
     points: np.ndarray,
 ) -> np.ndarray:
-    """The one-step maps of some points."""
+    """One-step maps of the given points."""
     system, drive = problem.system, problem.one_step
     if len(points) < len(nodes):
         index = torch.tensor(points, device=problem.device)
@@ -212,7 +213,7 @@ def newton_step(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Change of the unknowns, of the scalings (points, free) and of the nodes, by least squares.
 
-    The unknowns are theta where a law ties the points, else the scalings.
+    The unknowns are theta if a law ties the points, otherwise the scalings.
     NaN at points whose tangents overflow.
     """
     nodes, data, n_start = state.nodes[active], problem.data[active], problem.n_start
@@ -227,11 +228,11 @@ def newton_step(
 
 
 def least_change(triangles: np.ndarray, law: LawMap | None = None) -> np.ndarray:
-    """Unknowns that minimise the condensed residuals of all blocks, or NaN.
+    """Change of the unknowns that minimises the condensed residuals of all blocks, or NaN.
 
     triangles: (points, windows, blocks, size, size), by scaling. Without a law the unknowns are
-    the scalings, (points, free), each point by itself. With one they are theta, of all points:
-    H = sum_p spread_p^T R_p^T R_p spread_p, by QR of each R_p and then of all.
+    the scalings, (points, free), and each point is solved separately. With a law they are theta,
+    common to all points: H = sum_p spread_p^T R_p^T R_p spread_p, by QR of each R_p, then of all.
     """
     size = triangles.shape[-1]
     rows = triangles[..., :-1, :].reshape(len(triangles), -1, size)
@@ -244,9 +245,9 @@ def least_change(triangles: np.ndarray, law: LawMap | None = None) -> np.ndarray
 
 
 def least_squares(rows: np.ndarray) -> np.ndarray:
-    """The minimisers of |A x + b|, (problems, unknowns), of rows [A | b], or NaN.
+    """Minimisers of |A x + b|, (problems, unknowns), for rows [A | b], or NaN.
 
-    Of least norm, where rows leave a direction free.
+    The solution has the least norm if the rows do not determine a direction.
     """
     size = rows.shape[-1]
     joined: np.ndarray = np.linalg.qr(rows, mode="r")  # type: ignore[assignment]
@@ -260,7 +261,7 @@ def least_squares(rows: np.ndarray) -> np.ndarray:
 
 
 def largest_defect(maps: np.ndarray, nodes: np.ndarray, block: int) -> np.ndarray:
-    """Largest gap between a step's end and the next node inside any block, (points,)."""
+    """Largest gap, inside any block, between the end of a step and the next node, (points,)."""
     gaps = np.abs(maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2))
     inside = np.arange(1, nodes.shape[2]) % block != 0
     return gaps[..., inside].max(axis=(1, 2, 3))
@@ -274,9 +275,10 @@ def step_share(
     *,
     limit: float,
 ) -> np.ndarray:
-    """Share of a step, (points,), that moves no scaling by more than `limit` of it or of one.
+    """Largest allowed fraction of a step, (points,).
 
-    Nor a node by more than a range of the data.
+    It changes no scaling by more than `limit` times the larger of the scaling and one, and no
+    node by more than the range of the data.
     """
     by_scaling = np.abs(change) / (limit * np.maximum(np.abs(scaling), 1.0))
     reach = np.ptp(data, axis=(1, 2))

@@ -1,4 +1,4 @@
-"""Integral least squares without gradients, by the simplex of Nelder and Mead."""
+"""Integral least squares without gradients, by the Nelder-Mead simplex."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ CUBIC = np.arange(3, -1, -1)  # powers, as a window batch stores them
 
 @dataclass(frozen=True)
 class NelderMead:
-    """The thesis's way, for comparison: a simplex on the scalings, scipy's odeint per window.
+    """Method of the thesis, for comparison: Nelder-Mead on the scalings, odeint per window.
 
-    Starts must come from the data: their number is beyond a simplex.
+    Initial states must come from the data; they are too many for a simplex.
     Source: thesis II-F.
     """
 
@@ -40,7 +40,7 @@ class NelderMead:
         return join([self._fit_point(problem.take(p), p) for p in range(len(problem.odes))])
 
     def finer(self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray) -> None:
-        """odeint chooses its own steps."""
+        """Return None: odeint chooses its own steps."""
         return
 
     def _fit_point(self, problem: RefinementProblem, point: int) -> RefinementFit:
@@ -73,7 +73,7 @@ class NelderMead:
 
 
 def window_paths(problem: RefinementProblem, scaling: np.ndarray) -> np.ndarray:
-    """Trajectories by scipy's odeint, window after window, from the data: NaN where it fails."""
+    """Trajectories by scipy's odeint, window by window, from the data; NaN where it fails."""
     ode, batch = problem.odes[0], problem.batches[0]
     basis, offset = (part.detach().cpu().numpy() for part in ode.linear_parts())
     matrix = basis @ scaling + offset
