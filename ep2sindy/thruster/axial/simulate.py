@@ -71,9 +71,8 @@ def simulate(
     coldest_T_e_eV: lower bound of T_e, like the 1.5 eV of HallThruster.jl; the energy balance then
     lacks the added heat. initial: `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of
     another run, given as its Dataset or NetCDF file. cache: folder in which this simulation is
-    kept, or from which it is read if it is there. Its file name holds a hash of all parameters and
-    of this package's source text, so that a changed formula never returns an old result. Both ways
-    return the same values.
+    kept, or from which it is read, with the same values. Its file name holds a hash of all
+    parameters and of this package's source text: a changed formula never returns an old result.
 
     Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
     (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the
