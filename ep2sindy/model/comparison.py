@@ -21,7 +21,7 @@ from ep2sindy.signals.attractor import (
 from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
 from ep2sindy.signals.stationarity import quarter_distances
 
-LONG = 8.0  # least periods in a record for its first half to be left out as a transient
+LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
 REPEATS = 0.9  # least share of the variance that the waveform of a cycle explains; chaos: 0.5-0.75
 # Factor on the distance between the spectra of quarters: quarters lack the slow bands, in which a
 # record that does not repeat itself varies most.

@@ -13,7 +13,7 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.model.rollout import Equations
 from ep2sindy.runtime.screen import N_LINES, cut, wrap
 
-MAX_TERMS = 40  # most terms shown of one equation in a notebook
+MAX_TERMS = 40  # largest number of terms shown per equation in a notebook
 
 
 @runtime_checkable

@@ -18,7 +18,7 @@ from ep2sindy.runtime.compilation import compiled
 
 FINISHED, LOOK, CROSSED, FAILED = 0, 1, 2, 3  # reasons for which `advance` returns
 
-SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0  # limits on the ratio of successive steps
+SAFETY, MIN_FACTOR, MAX_FACTOR = 0.9, 0.2, 10.0  # safety factor, and bounds on the step ratio
 EXPONENT = -1.0 / 8.0  # power of the error in the step size; the error estimate is of order seven
 
 
@@ -173,7 +173,7 @@ def advance(equations, scheme, times, out, y, slope, t, h, place, calls, limit, 
     n = len(y)
     slopes, shape = np.empty((16, n)), np.empty((7, n))
     at, room, columns = np.empty(n), np.empty(n), np.ones(n + equations[4].shape[2] + 1)
-    for i in range(n):  # array expressions take seconds more to compile
+    for i in range(n):  # array expressions take seconds longer to compile
         slopes[0, i] = slope[i]
     inside = _room(y, blow_up) >= 0.0
     while t < times[-1]:

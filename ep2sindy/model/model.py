@@ -222,7 +222,7 @@ class SparseModel:
         )
 
     def text(self, *, digits: int = 3) -> str:
-        """One line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
+        """Text with one line per equation: `n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n`."""
         return "\n".join(equation_text(s, self.terms(s), digits=digits) for s in self.states)
 
     def sympy(self) -> dict[str, sympy.Expr]:
@@ -230,7 +230,7 @@ class SparseModel:
         return {state: sum_sympy(self.terms(state)) for state in self.states}
 
     def latex(self, *, digits: int = 3) -> str:
-        """An `aligned` block with one equation per line."""
+        """LaTeX `aligned` block with one equation per line."""
         terms = {state: self.terms(state) for state in self.states}
         return equations_latex(terms, digits=digits)
 

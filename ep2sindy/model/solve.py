@@ -192,7 +192,7 @@ def _implicit(
     rest = Counted(rhs.rates, rhs.border, rhs.budget, rhs.clock, rhs.deadline)
     try:
         found = _scipy_stage(rest, IMPLICIT, np.append(at, t[t > at]), state, blow_up, rtol)
-    except (ValueError, np.linalg.LinAlgError):  # slopes that are not finite
+    except (ValueError, np.linalg.LinAlgError):  # raised for slopes that are not finite
         text = f"the equations are stiff, and overflow, at t = {at:.6g} s"
         return Solved(before.t, before.y, True, text)
     ended = _outcome(found, rest, blow_up, bound, rhs.clock() - began)

@@ -141,7 +141,7 @@ def _backwards(
     if cycle is None or not cycle.multipliers.all():
         return None
     inverse = 1.0 / cycle.multipliers
-    states = np.roll(cycle.states[::-1], 1, axis=0)  # the same state first
+    states = np.roll(cycle.states[::-1], 1, axis=0)  # reversed, with the same first state
     return LimitCycle(cycle.period_s, states, np.append(inverse[0], inverse[:0:-1]))
 
 
@@ -292,7 +292,7 @@ def _check_reach(
         raise ValueError(f"spread must be two positive factors, the lower first: {spread} came")
 
 
-# Closed orbits of a free model: Newton's method on the return after one period.
+# Closed orbits of a model without inputs, by Newton's method on the return after one period.
 
 
 # Relative tolerances of the integrations: from the start, during Newton's method, and for the

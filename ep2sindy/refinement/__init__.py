@@ -1,4 +1,4 @@
-"""Refinement: coefficients fitted to integrated trajectories; only this package uses PyTorch."""
+"""Refinement: coefficients fitted to integrated trajectories; PyTorch is used only here."""
 
 from ep2sindy._stubs import attach
 

@@ -216,7 +216,7 @@ def _known_and_whole(
 
 
 class _Scaled(nn.Module):
-    """A correction times a typical rate, so that its output and weights are of order one."""
+    """Correction times a typical rate, so that its output and weights are of order one."""
 
     rate: torch.Tensor
 

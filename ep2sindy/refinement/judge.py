@@ -23,7 +23,7 @@ WIDE = 0.5  # relative standard error at which the 95 % interval of a coefficien
 
 CLOSED = 1e-9  # largest gap, in std, between the steps of one trajectory
 
-CLOSING_STEPS = 10  # most Newton steps to close the gaps
+CLOSING_STEPS = 10  # largest number of Newton steps to close the gaps
 
 # A step counts as fine enough if the bias that it causes in a scaling is below the larger of these:
 # a share of the standard error, and a share of the scaling.

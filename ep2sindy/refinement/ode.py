@@ -302,7 +302,7 @@ def augment(odes: Sequence[ODE]) -> Augmented:
     )
 
 
-NEWTON_STEPS = 20  # most Newton steps for two implicit half steps, started from one whole step
+NEWTON_STEPS = 20  # Newton steps at most for two implicit half steps, started from a whole step
 
 
 @runtime_checkable

@@ -15,7 +15,7 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_
 
 PERIODS = 1.5  # default length of a window, in periods of the dominant frequency
 
-MIN_SAMPLES = 5  # least samples in a window; fewer do not determine the dynamics
+MIN_SAMPLES = 5  # fewest samples in a window; fewer do not determine the dynamics
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,7 @@ def _unit_columns(
     values: Float[np.ndarray, "rows columns"],
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " columns"]]:
     """Columns divided by their L2 norms, and the norms; the norm of a zero column is set to 1."""
-    # Unlike squares, hypot does not overflow at densities to high powers.
+    # Unlike squares, hypot does not overflow for high powers of densities.
     norms = zero_to_one(np.hypot.reduce(np.abs(values), axis=0))
     return values / norms, norms
 

@@ -19,7 +19,7 @@ ROUNDED = 0.05
 # divided into stretches of about 30 samples, and Lorenz was never found.
 LONGEST_STEP = 10.0
 
-MIN_SAMPLES = 20  # least samples of a stretch between gaps; fewer do not determine their noise
+MIN_SAMPLES = 20  # fewest samples in a stretch between gaps; fewer do not determine their noise
 
 
 def is_even(t: Float[np.ndarray, " samples"]) -> bool:

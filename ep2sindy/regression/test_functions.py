@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from ep2sindy.regression.sampling import even_grid, is_even, one_about_each
 
-# A bump is this large, relative to its centre, at the first sample inside its edge.
+# Value of a bump, relative to its centre, at the first sample inside its edge.
 EDGE = 1e-10
 
 

@@ -25,7 +25,7 @@ from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 from ep2sindy.signals.smoothers import Smoother
 
-MAX_SEGMENTS = 20  # most segments of a trajectory; each is held out or resampled as a whole
+MAX_SEGMENTS = 20  # segments of a trajectory at most; each is held out or resampled as a whole
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ NEGLIGIBLE = 1e-3
 # half its resolution repeats its last value less often.
 HELD = 0.5
 
-MAX_LEVELS = 8  # most levels of a switched input; a noisy record has more, however coarse
+MAX_LEVELS = 8  # levels of a switched input at most; a noisy record has more, however coarse
 
 
 def exact_columns(

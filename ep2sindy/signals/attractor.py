@@ -22,7 +22,7 @@ MIN_SHARE = 0.5  # least share of the variance that the waveform explains if the
 
 MAX_HARMONICS = 16
 
-SAMPLES_PER_HARMONIC = 2.5  # least number per period of a harmonic; the Nyquist limit is two
+SAMPLES_PER_HARMONIC = 2.5  # fewest samples per period of a harmonic; the Nyquist limit is two
 
 # Length of the window from which the phase at one instant is estimated, in periods. The phase of
 # the breathing mode wanders over tens of periods.
@@ -198,7 +198,7 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
     known = basis.T @ scaled
     series = np.linalg.solve(triangle, known)
     orders = np.arange(1, order + 1)
-    slope = np.zeros_like(series)  # the derivative by the phase
+    slope = np.zeros_like(series)  # derivative of the series by the phase
     slope[1::2] = orders[:, None] * series[2::2]
     slope[2::2] = -orders[:, None] * series[1::2]
     since = (t - t.mean()) / (t[-1] - t[0])
@@ -211,10 +211,7 @@ def _sharpen(t: np.ndarray, phase: np.ndarray, scaled: np.ndarray, order: int) -
 
 
 def _columns(phase: np.ndarray, order: int) -> np.ndarray:
-    """Columns of the Fourier series: constant, then cosine and sine of each harmonic.
-
-    Returns (samples, 1 + 2 order).
-    """
+    """Constant, then cosine and sine of each harmonic: (samples, 1 + 2 order)."""
     turns = np.exp(1j * np.outer(phase, np.arange(1, order + 1)))
     columns = np.empty((len(phase), 1 + 2 * order))
     columns[:, 0], columns[:, 1::2], columns[:, 2::2] = 1.0, turns.real, turns.imag

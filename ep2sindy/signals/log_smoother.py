@@ -137,7 +137,7 @@ def _most_likely(y: np.ndarray, penalty: np.ndarray, highest: float) -> tuple[fl
 
 
 def _mode(y: np.ndarray, penalty: np.ndarray, log10_ratio: float, log: np.ndarray) -> _Mode:
-    """The most likely logarithm under one ratio, by damped Gauss-Newton steps."""
+    """Most likely logarithm for one ratio, by damped Gauss-Newton steps."""
     prior = penalty * 10.0**-log10_ratio
     squares = _squares(y, prior, log)
     for _ in range(MAX_ITER):

@@ -18,7 +18,7 @@ from ep2sindy.signals.spectrum import peak, power_spectrum
 
 PEAK_WIDTH = 0.05  # half-width of a peak, as a share of its frequency; two bins at least
 
-DIED_OUT = 0.1  # a run whose spread in the second half is below this share of the data's died out
+DIED_OUT = 0.1  # a run has died out if its late spread is below this share of the data's
 
 
 class Oscillation(StrEnum):
@@ -100,7 +100,7 @@ def has_decayed(
     earlier: Float[np.ndarray, "_ n_states"],
     share: float,
 ) -> Bool[np.ndarray, " n_states"]:
-    """For each state: is its standard deviation below `share` times that of `earlier`?"""
+    """True for each state whose standard deviation is below `share` times that of `earlier`."""
     below: np.ndarray = states.std(axis=0) < share * earlier.std(axis=0)
     return below
 

@@ -1,4 +1,4 @@
-"""Distances between parts of one record: a lower limit for the distance of a model run to it."""
+"""Distances between parts of one record; no model run can be expected to lie closer to it."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from ep2sindy.refinement.problem import (
     residual_weights,
 )
 
-CUBIC = np.arange(3, -1, -1)  # powers, as a window batch stores them
+CUBIC = np.arange(3, -1, -1)  # powers of a cubic, in the order of a window batch
 
 
 @dataclass(frozen=True)
