@@ -138,8 +138,7 @@ def refine(
     see `RefinementSettings`.
     points_per_batch: number of models integrated together, few enough to fit in the processor's
     cache; thousands on a GPU. A model that has converged leaves its batch. Models may differ in
-    their terms; each model in a batch costs as much as the largest one. progress: True shows a
-    bar; see `Progress`.
+    their terms; each one in a batch costs as much as the largest. progress: see `Progress`.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
     terms, a constraint that leaves out one of its terms, or models that differ in their variables
     or the number of their windows. A failed fit is a result: see `status`.

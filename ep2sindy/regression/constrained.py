@@ -41,8 +41,7 @@ def constrained_fit(
     The covariance is that of the free coefficients, propagated through C; it is singular, and
     zero for fixed values. It treats all rows as independent, although the rows of two equations
     share the noise of samples. If all rows are whitened, their variance is 1; otherwise it is
-    that of the residuals. A coefficient at its bound is held there; it is zero, and has no
-    covariance.
+    that of the residuals. A coefficient at its bound is held there, at zero, without covariance.
 
     problems: as a formulation assembles them. The model has the constraint's states.
     signs: (state, term) -> +1 or -1, for coefficients that depend on exactly one free one.
