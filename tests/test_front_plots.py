@@ -30,7 +30,7 @@ def searched() -> tuple[ParetoFront, np.ndarray]:
 
 def drawn(front: ParetoFront, *, index: int = 1) -> Axes:
     scores = np.where(np.arange(len(front.candidates)) == index, 0.25, 1.0)
-    figure = front_figure({front.equation: front}, {front.equation: scores}, label="d_pareto")
+    figure = front_figure({front.equation: front.with_scores(scores)}, label="d_pareto")
     return figure.axes[0]
 
 
@@ -109,7 +109,7 @@ def test_many_equations_stand_in_rows_without_empty_panels(
 ) -> None:
     front, _ = searched
     names = [f"x_{k}" for k in range(7)]
-    scores = dict.fromkeys(names, np.arange(float(len(front.candidates))))
-    figure = front_figure(dict.fromkeys(names, front), scores, label="EBIC")
+    scored = front.with_scores(np.arange(float(len(front.candidates))))
+    figure = front_figure(dict.fromkeys(names, scored), label="EBIC")
     assert len(figure.axes) == 7
     assert figure.get_figwidth() < 20.0

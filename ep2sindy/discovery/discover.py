@@ -11,7 +11,13 @@ from jaxtyping import Float
 
 from ep2sindy.data.coerce import Runs, trajectories_of
 from ep2sindy.discovery.choice import NoiseTest, noise_test
-from ep2sindy.discovery.method import DiscoveryMethod, Known, TrajectorySearch, check_kind, old_name
+from ep2sindy.discovery.method import (
+    DiscoveryMethod,
+    Known,
+    TrajectorySearch,
+    check_kind,
+    method_given,
+)
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, relations_of
@@ -117,7 +123,7 @@ def discover(
     one more version.
     Raises ValueError for a relation or a term that the library or the states do not have.
     """
-    method = method or old_name(recipe) or TrajectorySearch()
+    method = method_given(method, recipe) or TrajectorySearch()
     trajectories = trajectories_of(runs)
     library = polynomial(trajectories[0].names, degree=2) if library is None else library
     check_kind("library", library, Library, "ep.polynomial(['x', 'y'], degree=2)")

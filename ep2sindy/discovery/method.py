@@ -31,7 +31,7 @@ from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import EBIC, Evidence
-from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates, selected
+from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
 M = TypeVar("M")
 
@@ -392,7 +392,7 @@ class Regression:
         """Supports alone, as a benchmark counts them."""
         fronts = [e.front for e in self.search_equations(runs, library, rng=rng)]
         scores = score_candidates(self.selection, fronts, library, runs)
-        chosen = [selected(*pair) for pair in zip(fronts, scores, strict=True)]
+        chosen = [f.with_scores(s).best for f, s in zip(fronts, scores, strict=True)]
         return Finding(
             kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
             selected={c.equation: frozenset(c.terms) for c in chosen},
@@ -402,13 +402,16 @@ class Regression:
 AnyMethod = TrajectorySearch | Regression
 
 
-def old_name(recipe: M | None) -> M | None:
-    """The argument `recipe`, with a warning that it is called method now."""
+def method_given(method: M | None, recipe: M | None) -> M | None:
+    """The method, also by its old name `recipe`, which warns; ValueError for both at once."""
     if recipe is not None:
+        if method is not None:
+            raise ValueError("method and recipe are one argument, and both came: write method=...")
         warnings.warn(
             "recipe=... goes with the next version: write method=...", FutureWarning, stacklevel=4
         )
-    return recipe
+        return recipe
+    return method
 
 
 def check_kind(name: str, value: object, kind: type, example: str) -> None:

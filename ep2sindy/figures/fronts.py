@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -15,7 +14,6 @@ from matplotlib.ticker import MaxNLocator
 from ep2sindy.figures.style import COLOURS, GREY, hover_spot, legend_above, make_grid
 from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
-from ep2sindy.selection.rule import selected
 
 # Smaller errors are rounding or zero; they are drawn at FLOOR, on a labelled line.
 FLOOR = 1e-12
@@ -27,7 +25,6 @@ TERMS_A_LINE = 4  # terms per line of a title
 
 def front_figure(
     fronts: Mapping[str, ParetoFront],
-    scores: Mapping[str, Float[np.ndarray, " _candidates"]],
     *,
     label: str,
 ) -> Figure:
@@ -38,19 +35,19 @@ def front_figure(
 
     The supports that the search proposed are drawn light behind the front. Errors below FLOOR are
     drawn on a line at FLOOR, and errors above TOP as marks at the upper edge.
-    scores: by state, one per candidate; the lowest is selected. label: name of the scores.
+    label: name of the scores, of which the lowest is selected.
     """
     figure, axes = make_grid(len(fronts), width=4.4, height=3.5, extra=0.4)
     for ax, (state, front) in zip(axes, fronts.items(), strict=True):
-        chosen = selected(front, scores[state])
-        index = front.candidates.index(chosen)
+        index = front.candidates.index(front.best)
         if front.problem is None:
-            _draw_scores(ax, front, scores[state], index, label)
+            _draw_scores(ax, front, index, label)
         else:
             _draw_front(ax, front, index)
-        _add_hovers(ax, front, scores[state], label)
-        score = f"{_score_label(label)} = {scores[state][index]:.4g}"
-        ax.set_title(f"${latex_derivative(state)}$: {_write_terms(chosen)}\n{score}", fontsize=9)
+        _add_hovers(ax, front, label)
+        score = f"{_score_label(label)} = {front.best.score:.4g}"
+        terms = _write_terms(front.best)
+        ax.set_title(f"${latex_derivative(state)}$: {terms}\n{score}", fontsize=9)
     entries = {line.get_label(): line for ax in axes for line in ax.lines if _has_label(line)}
     shown = [entries[name] for name in _LAYERS if name in entries]
     legend_above(figure, shown, n_columns=2 if len(axes) == 1 else None, size=9.0)
@@ -79,13 +76,13 @@ def _draw_front(ax: Axes, front: ParetoFront, chosen: int) -> None:
         )  # fmt: skip
 
 
-def _draw_scores(ax: Axes, front: ParetoFront, scores: np.ndarray, chosen: int, label: str) -> None:
+def _draw_scores(ax: Axes, front: ParetoFront, chosen: int, label: str) -> None:
     """Draw the scores of runners-up, of the best of every size (line) and of the selected (star).
 
     The axis is linear near zero, where the best scores are. A candidate that cannot be run, such as
     an equation without terms, has no finite score and is drawn at the upper edge.
     """
-    _draw_candidates(ax, front, _finite(scores), chosen)
+    _draw_candidates(ax, front, _finite(front.scores), chosen)
     ax.set(ylabel=_score_label(label))
     ax.set_yscale("symlog", linthresh=1.0)
 
@@ -117,15 +114,15 @@ def _finite(scores: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(scores), scores, 10.0 * max(known.max(initial=1.0), 1.0))
 
 
-def _add_hovers(ax: Axes, front: ParetoFront, scores: np.ndarray, label: str) -> None:
+def _add_hovers(ax: Axes, front: ParetoFront, label: str) -> None:
     """Put an invisible spot over every candidate, whose hover text names it."""
     has_rows = front.problem is not None
-    heights = np.clip(front.errors, FLOOR, TOP) if has_rows else _finite(scores)
-    for each, height, score in zip(front.candidates, heights, scores, strict=True):
+    heights = np.clip(front.errors, FLOOR, TOP) if has_rows else _finite(front.scores)
+    for each, height in zip(front.candidates, heights, strict=True):
         terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
         text = f"{front.equation}' of {each.n_terms} terms: {terms}"
         error = f" | 1 - R2 = {height:.3g}" if has_rows else ""
-        hover_spot(ax, each.n_terms, height, f"{text}{error} | {label} = {score:.4g}")
+        hover_spot(ax, each.n_terms, height, f"{text}{error} | {label} = {each.score:.4g}")
 
 
 def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:

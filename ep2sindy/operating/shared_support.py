@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.discovery.choice import assemble_model, fit_last
-from ep2sindy.discovery.method import Regression, check_kind, old_name
+from ep2sindy.discovery.method import Regression, check_kind, method_given
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
@@ -78,7 +78,7 @@ def discover_shared(
     several points), no point, or points whose states, variables or units differ.
     Source of the idea, for thresholding: Rudy et al. 2019, doi:10.1137/18M1191944.
     """
-    method = method or old_name(recipe) or Regression()
+    method = method_given(method, recipe) or Regression()
     check_kind("method", method, Regression, "ep.Regression(search=ep.BestSubset())")
     search = _search_of(method)
     _check_points(points, library)

@@ -41,7 +41,7 @@ class Selection(Protocol):
 
 def selected(front: ParetoFront, scores: Float[np.ndarray, " candidates"]) -> Candidate:
     """The candidate of least score; of several, the one with fewest terms."""
-    return front.candidates[int(np.argmin(scores))]
+    return front.with_scores(scores).best
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,6 @@ from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
-from ep2sindy.selection.rule import selected
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.term_roles import Roles
 
@@ -163,13 +162,13 @@ def _inclusion(chosen: Candidate) -> dict[str, float]:
 
 
 def candidate_rows(front: ParetoFront) -> list[CandidateRow]:
-    chosen = selected(front, front.scores)
-    return [CandidateRow(each, each is chosen, each.coef_by_term) for each in front.candidates]
+    best = front.best
+    return [CandidateRow(each, each is best, each.coef_by_term) for each in front.candidates]
 
 
 def _chosen(result: LibraryResult, state: str) -> CandidateRow:
     found = result.discovery
-    chosen = selected(found.fronts[state], found.scores[state])
+    chosen = found.fronts[state].best
     return CandidateRow(chosen, True, found.model.terms(state), found.noise_test.left.get(state))
 
 

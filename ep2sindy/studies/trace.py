@@ -303,8 +303,7 @@ class Outcome:
         if has_waveform(held, rollout):
             drawn["waveform"] = partial(waveform_figure, held, rollout)
         fronts = {state: self.found.fronts[state] for state in self.searched}
-        scores = {state: self.found.scores[state] for state in self.searched}
-        drawn["front"] = partial(front_figure, fronts, scores, label=self.label)
+        drawn["front"] = partial(front_figure, fronts, label=self.label)
         return {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()}
 
     def sections(self) -> list[Section]:
