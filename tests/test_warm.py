@@ -53,6 +53,35 @@ def test_what_kernels_import_compiles_them_again_too() -> None:
     assert {"closures.py", "constants.py"} <= {path.name for path in compilation.sources()}
 
 
+@pytest.mark.parametrize("damage", ["renamed", "cut", "overwritten"])
+def test_an_index_that_cannot_be_read_is_made_again(
+    damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after an upgrade in place: the index of a kernel names a class that is no more."""
+    folder = tmp_path / "own"
+    folder.mkdir()
+    source = (
+        "from typing import NamedTuple\n"
+        "from ep2sindy.runtime.compilation import compiled\n"
+        "class State(NamedTuple):\n    x: float\n"
+        "@compiled\ndef double(state):\n    return 2.0 * state.x\n"
+        "print(double(State(1.5)))\n"
+    )
+    program = folder / "my_kernels.py"
+    program.write_text(source)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    call = [sys.executable, "-c", "import sys; sys.path.insert(0, sys.argv[1]); import my_kernels"]
+    command = [*call, str(folder)]
+    subprocess.run(command, env=environment, capture_output=True, check=True)
+    (index,) = (tmp_path / "cache").rglob("*.nbi")
+    if damage == "renamed":
+        program.write_text(source.replace("State", "OtherState"))
+    else:
+        index.write_bytes(index.read_bytes()[:-9] if damage == "cut" else b"not a pickle")
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert run.stdout == "3.0\n", run.stderr
+
+
 def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None:
     compilations.insert(0, False)
     warm.warm()

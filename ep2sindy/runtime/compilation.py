@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -40,6 +41,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     kept: Any = getattr(kernel._cache, "_cache_file", None)
     if hasattr(kept, "_source_stamp"):  # numba has no public interface for this
         kept._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+        kept._load_index = partial(_index_or_none, kept._load_index)
     if hasattr(kernel._cache, "save_overload"):
         kernel._cache.save_overload = partial(_keep_if_room, kernel._cache.save_overload)
     return kernel
@@ -84,6 +86,18 @@ def tell_each_kernel(tell: Callable[[str], None]) -> None:
     """
     _listen()
     _TOLD.append(tell)
+
+
+def _index_or_none(load: Callable[[], dict]) -> dict:
+    """Index of compiled kernels; empty if it cannot be read, so that they are compiled again.
+
+    An index holds the types of arguments. One of an earlier version may name a class that has been
+    renamed since, and numba reads it before it compares the stamp.
+    """
+    try:
+        return load()
+    except (AttributeError, ImportError, EOFError, pickle.UnpicklingError):
+        return {}
 
 
 def _keep_if_room(save: Callable, *compiled: Any) -> None:
