@@ -10,6 +10,7 @@ import pytest
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
+from ep2sindy.library.relations import constraint
 from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.operating.fit import SETTINGS, LeaveOneOut, OperatingFit, leave_one_out, operating_fit
@@ -20,6 +21,7 @@ from ep2sindy.operating.records import (
     check_records,
     interpolation_errors,
 )
+from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 
 STATES = ("x", "y")
 LIBRARY = polynomial(STATES, degree=3)
@@ -206,6 +208,19 @@ def test_a_record_must_hold_six_periods() -> None:
 def test_a_structure_must_name_every_state() -> None:
     with pytest.raises(ValueError, match=r"terms for each of \['x', 'y'\]"):
         operating_fit(records(), LIBRARY, {"x": ["x"]})
+
+
+def test_a_constraint_is_refused() -> None:
+    settings = replace(SETTINGS, constraint=constraint(LIBRARY, STRUCTURE))
+    with pytest.raises(ValueError, match="laws of the operating point take no constraint"):
+        operating_fit(records(), LIBRARY, STRUCTURE, settings=settings)
+
+
+def test_a_start_that_is_given_leaves_the_method_as_it_was_set() -> None:
+    poor = replace(law(), coef=1.2 * law().coef)
+    for method, status in ((None, "converged"), (MultipleShooting(max_iter=1), "max_iter")):
+        own = replace(fit(), settings=replace(fit().settings, method=method))
+        assert own.tied(own.functions(1), start=poor)[1].status == status
 
 
 def test_a_free_run_starts_where_the_states_move_least() -> None:

@@ -12,7 +12,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.judge import fit_and_judge
+from ep2sindy.refinement.judge import fit_and_judge, is_stationary
 from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.methods.nelder_mead import NelderMead
@@ -26,6 +26,23 @@ WINDOW, N_WINDOWS = 60, 4
 SETTINGS = RefinementSettings(n_windows=N_WINDOWS, window=WINDOW, n_reweights=0)
 BASIS = LAW.evaluate(np.array([[PARAMETERS[p][v] for v in LAW.variables] for p in POINTS]))
 TRUE_LAW = np.array([row for terms in TRUTH.values() for row in terms.values()])
+
+
+@pytest.mark.parametrize(
+    ("off", "change", "stationary"),
+    [
+        (1.0, 1e-2, False),  # one more step removes a part of the loss, and moves a scaling
+        (1.0, 1e-4, True),  # it removes some of the loss, but moves no scaling: a clean record
+        (1e-2, 1e-2, True),  # it moves a scaling without gain: one that the data do not determine
+    ],
+)
+def test_a_fit_is_stationary_in_its_loss_or_in_its_scalings(
+    off: float, change: float, stationary: bool
+) -> None:
+    rows = np.array([[[100.0 * off, 1.0]]])  # one window: derivative by the scaling, and residual
+    changed = np.array([change])
+    found = is_stationary(rows, changed, scaling_change=changed[None], scaling=np.ones((1, 1)))
+    assert found == stationary
 
 
 @cache

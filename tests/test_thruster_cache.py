@@ -1,5 +1,8 @@
 """Kept simulations: identical on reading back, never half-written, never answered from old code."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,6 +16,18 @@ from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 
 POINT = OperatingPoint(300.0, 5.0)
 BRIEF = {"duration_s": 3e-5, "warm_up_s": 0.0, "n_cells": 40, "progress": False}
+
+
+def test_a_file_depends_on_all_source_text_that_sets_its_content():
+    """Kept results carry the status of their record: its bounds stand in another room."""
+    imported = re.compile(r"^from (ep2sindy\.signals\.\w+) import", re.MULTILINE)
+    room = Path(cache.__file__).parent
+    names = {name for path in room.rglob("*.py") for name in imported.findall(path.read_text())}
+    files_named = {
+        room.parent.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names
+    }
+    assert names
+    assert files_named <= set(cache.SOURCES)
 
 
 def kept(folder):
@@ -92,7 +107,7 @@ def test_other_starts_have_another_file(tmp_path, small_runs, one, other):
 def test_changed_source_has_another_file(tmp_path, monkeypatch):
     simulate(Thruster(), POINT, cache=tmp_path / "kept", **BRIEF)
     (tmp_path / "closures.py").write_text("changed = True\n")
-    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    monkeypatch.setattr(cache, "SOURCES", [tmp_path])
     simulate(Thruster(), POINT, cache=tmp_path / "kept", **BRIEF)
     assert len(kept(tmp_path / "kept")) == 2
 

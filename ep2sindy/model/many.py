@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.model import kernels
+from ep2sindy.model.inputs import spline
 
 # Integration steps per sample. One step suffices for the true model of every noise-free system of
 # `systems`: its error stays below 1e-9 variances. The second step is for sparser samples.
@@ -48,10 +49,7 @@ class DrivenWindows:
         nodes = begins[:, None] + np.array([0.0, 0.5, 1.0])[:, None] * steps_s[:, None]
         drive = np.empty((0, *nodes.shape))
         if inputs:
-            from scipy.interpolate import make_interp_spline  # imported only for driven models
-
-            spline = make_interp_spline(run.t, run.columns(inputs), k=min(3, run.n_samples - 1))
-            drive = np.moveaxis(spline(nodes), -1, 0)
+            drive = np.moveaxis(np.asarray(spline(run.t, run.columns(inputs))(nodes)), -1, 0)
         return DrivenWindows(steps_s, drive, smoothed[starts].T)
 
     @staticmethod

@@ -30,7 +30,7 @@ from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.runtime.parallel import Serial, Workers, collect
 from ep2sindy.runtime.progress import Progress, as_progress
-from ep2sindy.signals.spectrum import samples_in
+from ep2sindy.signals.spectrum import samples_in_periods
 
 MOST = 10.0  # upper bound on the reported deviation, also used if there is none
 
@@ -52,7 +52,7 @@ def in_samples(
         return settings
     frequency_Hz = [record.cycle.frequency_Hz for record in records]
     dt_s = [record.run.dt_s for record in records]
-    wanted = samples_in(settings.periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
+    wanted = samples_in_periods(settings.periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
     window = min(wanted, *(record.run.n_samples // 2 for record in records))
     return replace(settings, window=window, periods=None)
 
@@ -88,12 +88,6 @@ class OperatingFit:
                 for f in self.fits
             ]
         )
-
-    @property
-    def own_runs(self) -> list[FreeRun]:
-        """Free runs of every point with its own coefficients; no law can be much better."""
-        pairs = zip(self.fits, self.records, strict=True)
-        return [free_run(fit.model, record.from_slowest) for fit, record in pairs]
 
     def without(self, number: int) -> OperatingFit:
         others = [k for k in range(len(self.records)) if k != number]
@@ -132,7 +126,9 @@ class OperatingFit:
         near = self.weighted(functions) if start is None else start
         settings = in_samples(self.settings, self.records)
         if start is not None and settings.window is not None:
-            method = MultipleShooting(first_block=settings.window, tolerance=1e-4)
+            method = settings.method or MultipleShooting()
+            if isinstance(method, MultipleShooting):  # refine_law says that no other will do
+                method = replace(method, first_block=settings.window, tolerance=1e-4)
             settings = replace(settings, method=method)
         found = refine_law(
             [fit.model for fit in self.fits],
@@ -178,10 +174,16 @@ def operating_fit(
     """Refine every record on its own with the same terms, from least squares of the derivative.
 
     settings: of these refinements and of the law's; windows have the same length in all records.
-    Raises ValueError for records whose parameters do not vary or whose states differ, or for an
-    unknown state or term.
+    Raises ValueError for records whose parameters do not vary or whose states differ, for an
+    unknown state or term, or for settings with a constraint.
     """
     check_records(records)
+    if settings.constraint is not None:
+        raise ValueError(
+            "laws of the operating point take no constraint: the structure says which terms an "
+            "equation has; leave `constraint` out of the settings, or refine models with it one "
+            "by one (ep.refine) or under a law (ep.refine_law)"
+        )
     states = list(records[0].run.state_names)
     if set(structure) != set(states):
         raise ValueError(f"a structure must have terms for each of {states}: {structure} came")

@@ -41,7 +41,7 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation, oscillation, relative_spread
-from ep2sindy.signals.spectrum import dominant_frequency, samples_in
+from ep2sindy.signals.spectrum import dominant_frequency, samples_in_periods
 
 MIN_BLOCKS = 5  # fewest blocks in a record: with fewer, draws differ too little from one another
 
@@ -206,7 +206,7 @@ def _refined(
     rng: np.random.Generator,
 ) -> Fitted:
     """The case's coefficients, refined so that integrated windows follow the data."""
-    samples = samples_in(study.refining.periods, frequency_Hz=1.0 / period_s, dt_s=run.dt_s)
+    samples = samples_in_periods(study.refining.periods, frequency_Hz=1.0 / period_s, dt_s=run.dt_s)
     settings = RefinementSettings(
         n_windows=study.refining.n_windows,
         window=int(np.clip(samples, MIN_SAMPLES, run.n_samples)),

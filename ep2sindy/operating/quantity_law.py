@@ -14,14 +14,11 @@ from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.quantities import PointResult
-from ep2sindy.operating.records import check_varying
+from ep2sindy.operating.records import check_varying, left_out_predictions
 from ep2sindy.runtime.arrays import read_only
 
 # Share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
-
-# A point with this leverage alone determines some coefficient: without it there is no law.
-FULL_LEVERAGE = 1.0 - 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +74,7 @@ def control_law(
     _check(values, parameters, library, max_terms)
     theta = library.evaluate(parameters)
     support = _best_support(values, theta, max_terms)
-    fitted, left_out = _predictions(values, theta[:, support])
+    fitted, left_out = left_out_predictions(values, theta[:, support])
     coef = _least_squares(values, theta[:, support])
     others = [np.delete(np.arange(len(values)), k) for k in range(len(values))]
     searched = [
@@ -120,20 +117,10 @@ def _best_support(values: np.ndarray, theta: np.ndarray, max_terms: int | None) 
     best, lowest = [0], np.inf
     for size in range(1, largest + 1):
         for support in map(list, combinations(range(n_terms), size)):
-            error = _rms(values - _predictions(values, theta[:, support])[1])
+            error = _rms(values - left_out_predictions(values, theta[:, support])[1])
             if max(error, floor) < lowest:
                 best, lowest = support, max(error, floor)
     return best
-
-
-def _predictions(values: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every point predicted by the fit to all, and by the fit to the others (infinite if none)."""
-    left, singular, _ = np.linalg.svd(_unit_columns(columns), full_matrices=False)
-    leverage = np.square(left).sum(axis=1)
-    fitted = left @ (left.T @ values)
-    if singular[-1] <= ROUNDING * singular[0] or leverage.max() > FULL_LEVERAGE:
-        return fitted, np.full(len(values), np.inf)
-    return fitted, values - (values - fitted) / (1.0 - leverage)
 
 
 def _predict_left_out(
@@ -147,10 +134,6 @@ def _predict_left_out(
 def _least_squares(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
     scale = column_norms(columns)
     return np.linalg.lstsq(columns / scale, values, rcond=None)[0] / scale
-
-
-def _unit_columns(columns: np.ndarray) -> np.ndarray:
-    return columns / column_norms(columns)
 
 
 def _rms(errors: np.ndarray) -> float:

@@ -10,13 +10,12 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.oscillation import Oscillation, relative_amplitude
 from ep2sindy.signals.spectrum import steps_in
-
-MIN_PERIODS = 6.0  # least in a record: windows of two, and a rest to compare a free run with
+from ep2sindy.signals.trace import MIN_PERIODS
 
 # Two cycles coexist if the relative amplitudes of the records, less a plane over the parameters,
 # form two groups. The gap between these must exceed the spread in a group by the factor APART, and
@@ -182,6 +181,28 @@ def most_central(records: Sequence[OperatingRecord]) -> OperatingRecord:
     return records[int(np.argmin(np.linalg.norm(off, axis=1)))]
 
 
+# A point with this leverage alone determines some coefficient: without it there is no fit.
+FULL_LEVERAGE = 1.0 - 1e-9
+
+# Smallest singular value of unit columns, relative to the largest, at which they are independent.
+INDEPENDENT = 1e-10
+
+
+def left_out_predictions(
+    values: Float[np.ndarray, "records ..."], basis: Float[np.ndarray, "records functions"]
+) -> tuple[Float[np.ndarray, "records ..."], Float[np.ndarray, "records ..."]]:
+    """Values at every point by the least-squares fit to all points, and by that to the others.
+
+    The second is infinite if one point is indispensable, or if the functions depend on each other.
+    """
+    left, singular, _ = np.linalg.svd(basis / column_norms(basis), full_matrices=False)
+    leverage = np.square(left).sum(axis=1)
+    fitted = left @ (left.T @ values)
+    if singular[-1] <= INDEPENDENT * singular[0] or leverage.max() > FULL_LEVERAGE:
+        return fitted, np.full_like(fitted, np.inf)
+    return fitted, values - ((values - fitted).T / (1.0 - leverage)).T
+
+
 def interpolation_errors(
     records: Sequence[OperatingRecord], basis: Float[np.ndarray, "records functions"]
 ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"]]:
@@ -192,12 +213,9 @@ def interpolation_errors(
     deviation over the states. They show how smoothly the records vary: no law of these functions
     can be much better.
     """
-    scaled = basis / zero_to_one(np.linalg.norm(basis, axis=0))
-    hat = scaled @ np.linalg.pinv(scaled)
     f = np.log([[record.cycle.frequency_Hz] for record in records])
     logs = np.hstack([f, np.log([record.cycle.std for record in records])])
-    left = (logs - hat @ logs) / np.maximum(1.0 - np.diag(hat), 1e-12)[:, None]
-    off = np.abs(np.expm1(-left))
+    off = np.abs(np.expm1(left_out_predictions(logs, basis)[1] - logs))
     return off[:, 0], off[:, 1:].max(axis=1)
 
 

@@ -168,10 +168,7 @@ def _judge_points(
     scaling = fit.scaling[points, : law.n_free]
     by_point = law.spread @ robust @ law.spread.transpose(0, 2, 1)
     error = np.sqrt(np.maximum(np.diagonal(by_point, axis1=1, axis2=2), 0.0))
-    gain = np.square(rows[..., :-1] @ change).sum()
-    share = gain / max(np.square(rows[..., -1]).sum(), 1e-300)
-    relative = np.abs(law.scaling(change) / scaling).max() if scaling.all() else np.inf
-    stationary = bool(min(share, relative) < STATIONARY)
+    stationary = is_stationary(rows, change, scaling_change=law.scaling(change), scaling=scaling)
     steps = zip(law.scaling(bias), by_point, scaling, strict=True)
     status = status_of(
         finite=bool(fit.finite[points].all() and np.isfinite(loss)),
@@ -274,10 +271,26 @@ def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndar
     error = fit.step.finer(problem.system, problem.one_step, fit.scaling, fit.nodes) - maps[:, :, 0]
     shifted = maps.copy()
     shifted[:, :, 0] = fit.nodes[:, :, 1:].transpose(0, 3, 1, 2) + error
-    n_start = fit.nodes.shape[-1] if problem.free_start else 0
-    window = fit.nodes.shape[2]
+    n_start, window = problem.n_start, fit.nodes.shape[2]
     condensed = condense(shifted, fit.nodes, fit.nodes, fit.weights, window, n_start)
     return condensed[..., n_start:, n_start:]
+
+
+def is_stationary(
+    rows: Float[np.ndarray, "windows size columns"],
+    change: Float[np.ndarray, " unknowns"],
+    *,
+    scaling_change: Float[np.ndarray, "points free"],
+    scaling: Float[np.ndarray, "points free"],
+) -> bool:
+    """Return true if one more Gauss-Newton step changes the loss, or all scalings, by very little.
+
+    rows: each window's condensed residuals by the unknowns, right-hand side last.
+    """
+    gain = np.square(rows[..., :-1] @ change).sum()
+    share = gain / max(np.square(rows[..., -1]).sum(), 1e-300)
+    relative = np.abs(scaling_change / scaling).max() if scaling.all() else np.inf
+    return bool(min(share, relative) < STATIONARY)
 
 
 def is_coarse(bias: np.ndarray, covariance: np.ndarray, scaling: np.ndarray) -> bool:

@@ -103,7 +103,7 @@ def refine_law(
         law = LawMap.of(free0, known, begin)
         problem = replace(problem, law=law)
         fit, (verdict,) = fit_and_judge(problem, method)
-    return _result(models, relations, problem, law, fit, verdict, known, tuple(history))
+    return _result(models, relations, law, fit, verdict, known, tuple(history))
 
 
 def _multiple_shooting(settings: RefinementSettings) -> MultipleShooting:
@@ -143,7 +143,6 @@ def _one_structure(
 def _result(
     models: Sequence[SparseModel],
     relations: Constraint,
-    problem: RefinementProblem,
     law_map: LawMap,
     fit: RefinementFit,
     verdict: RefinementVerdict,
@@ -166,8 +165,7 @@ def _result(
             spread = (relations.C @ np.kron(np.eye(n_free), row))[order]
             at_point = replace(at_point, covariance=spread @ robust @ spread.T)
         refined.append(at_point)
-    with np.errstate(over="ignore", invalid="ignore"):
-        loss = np.square(fit.nodes - problem.data).mean(axis=(1, 2, 3))
+    loss = verdict.window_loss.reshape(len(models), -1).mean(axis=1)
     return LawRefinement(
         coefficients=tuple(relations.coefficients[int(k)] for k in relations.free),
         law=law,

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.data.trajectory import Trajectory, read_only
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.ode import ODE, ONE_RUNGE_KUTTA, Augmented, Drive, Step, augment
@@ -24,6 +24,7 @@ from ep2sindy.refinement.windows import (
     cut_windows,
     dominant_window,
 )
+from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.progress import Advance, nothing
 
 Values = TypeVar("Values", bound=np.ndarray)

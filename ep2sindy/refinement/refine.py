@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import cast, overload
 
 import numpy as np
@@ -156,12 +155,12 @@ def refine(
     models, records = _by_model(model, trajectories)
     batches = settings.cut(models, records, np.random.default_rng(rng))
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
-        refine_chunk = partial(
-            _refine, settings=settings, callback=callback, device=device, advance=advance
-        )
         refinements: list[Refinement] = []
         for some in _chunks(len(models), points_per_batch):
-            refinements += refine_chunk(models[some], batches[some])
+            refinements += _refine(
+                models[some], batches[some],
+                settings=settings, callback=callback, device=device, advance=advance,
+            )  # fmt: skip
     return refinements[0] if isinstance(model, SparseModel) else refinements
 
 

@@ -140,13 +140,14 @@ def _each_once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def fingerprint(settings: str, *, sources: Path) -> str:
+def fingerprint(settings: str, *, sources: Path | Sequence[Path]) -> str:
     """Hash of settings and of the source code that uses them: sixteen hexadecimal digits.
 
-    sources: a Python file, or a folder of them. They are included so that results of an old
-    formula are not reused from disk after the formula has changed.
+    sources: Python files, or folders of them. They are included so that results of an old formula
+    are not reused from disk after the formula has changed.
     """
     digest = hashlib.sha256(settings.encode())
-    for source in [sources] if sources.is_file() else sorted(sources.rglob("*.py")):
-        digest.update(source.name.encode() + source.read_bytes())
+    for place in [sources] if isinstance(sources, Path) else sources:
+        for source in [place] if place.is_file() else sorted(place.rglob("*.py")):
+            digest.update(source.name.encode() + source.read_bytes())
     return digest.hexdigest()[:16]

@@ -40,7 +40,7 @@ from ep2sindy.selection.systems import (
     systems_of,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
-from ep2sindy.signals.spectrum import samples_in, steps_in
+from ep2sindy.signals.spectrum import samples_in_periods, steps_in
 
 MIN_WINDOWS = 30  # fewest windows to refine the winner on
 
@@ -172,7 +172,7 @@ class FreeRunScore:
         """Number of samples in a window."""
         frequency_Hz = [cycle.frequency_Hz for cycle in cycles]
         dt_s = [run.dt_s for run in records.runs]
-        return samples_in(self.window_periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
+        return samples_in_periods(self.window_periods, frequency_Hz=frequency_Hz, dt_s=dt_s)
 
     def _trials(
         self,

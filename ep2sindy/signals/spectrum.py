@@ -63,7 +63,7 @@ def steps_in(
     return float(np.median(periods / (np.asarray(frequency_Hz) * np.asarray(dt_s))))
 
 
-def samples_in(
+def samples_in_periods(
     periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
 ) -> int:
     """Number of samples in the given number of periods, both ends included; median over records."""

@@ -32,7 +32,7 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.kalman import KalmanSmoother
-from ep2sindy.signals.spectrum import samples_in
+from ep2sindy.signals.spectrum import samples_in_periods
 from ep2sindy.studies.study import Count
 from ep2sindy.studies.views import (
     coefficients,
@@ -336,7 +336,7 @@ def two_periods(run: Trajectory) -> int | None:
     cycle = find_cycle(run.t, run.states)
     if cycle is None or cycle.n_periods < 4.0:
         return None
-    return samples_in(2.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
+    return samples_in_periods(2.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
 
 
 def _refined(

@@ -14,8 +14,12 @@ from tqdm import tqdm
 from ep2sindy.data.fields import write_netcdf
 from ep2sindy.runtime.files import fingerprint, sweep, writing
 from ep2sindy.runtime.screen import in_line, on_screen
+from ep2sindy.signals import oscillation, spectrum
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.trust.checksum import verified, with_checksum
+
+# Source text on which a kept result depends: this room, and what sets the status of a record.
+SOURCES = [Path(__file__).parent, *(Path(str(each.__file__)) for each in (oscillation, spectrum))]
 
 
 def read_or_run(
@@ -28,13 +32,13 @@ def read_or_run(
 def keep(stem: Path, parameters: str, run: Callable[[], xr.Dataset]) -> xr.Dataset:
     """The result of `run`, read from a file named by a stem and a hash, or run and kept there.
 
-    The hash covers all parameters and this package's source text, so that a changed formula never
+    The hash covers all parameters and the source text of SOURCES, so that a changed formula never
     returns an old result. Both ways return the same values. The file states its parameters and
     holds a checksum. A file that does not match, or cannot be read, is reported, recomputed and
     replaced. Results appear under their final name only once complete. Raises OSError if the folder
     cannot be written, before anything runs.
     """
-    key = fingerprint(parameters, sources=Path(__file__).parent)
+    key = fingerprint(parameters, sources=SOURCES)
     path = stem.with_name(f"{stem.name}_{key}.nc")
     if path.exists():
         try:
