@@ -71,11 +71,20 @@ RENAMED = {
 # Old name -> what to write besides, where the new name is not called as the old one was.
 NOTES: dict[str, str] = {
     "refine_many": "which takes a list of models as well",
-    "refine_tied": "which takes RefinementSettings(window=..., n_windows=...)",
+    "refine_tied": "which takes RefinementSettings(window=..., n_windows=20, n_reweights=0) in "
+    "place of those keywords",
+    "operating_fit": "which takes settings=RefinementSettings(...) in place of windows=...",
+    "OperatingFit": "with settings in place of windows",
+    "OperatingRecord": "which is made by OperatingRecord.of(parameters, run) and finds its cycle",
+    "PointSearch": "which takes method=... in place of recipe=...",
+    "Joint": "for discover(method=...); estimate takes max_terms=... and align=... itself",
     "simulate_cached": "with cache=folder as before",
     "simulate_2d_cached": "with cache=folder as before",
-    "TiedFit": "with `law` and `tests` in place of `equations`",
-    "tied_fit": "which gives `law` and `tests` in place of `equations`",
+    "TiedFit": "with law, an OperatingLaw: law.model_at(point, extrapolate=True) in place of "
+    "model_at(point), law.functions in place of law, tests in place of equations",
+    "tied_fit": "called fit_law(shared, functions, parameters=...); it gives a LawFit with law, an "
+    "OperatingLaw: law.model_at(point, extrapolate=True) in place of model_at(point), "
+    "law.functions in place of law, tests in place of equations",
 }
 # Old name -> what to use instead, where nothing does the same.
 GONE: dict[str, str] = {
@@ -86,7 +95,8 @@ GONE: dict[str, str] = {
     "STLSQRegressor": "take pysindy.STLSQ, or ep2sindy.STLSQ() as the search of a Regression",
     "SingleShooting": "take ep2sindy.refinement.MultipleShooting()",
     "loss_against_window": "call ep2sindy.refine in a loop over the lengths of windows",
-    "Windows": "take ep2sindy.RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)",
+    "Windows": "take ep2sindy.RefinementSettings(n_windows=20, periods=2.0, n_reweights=0), "
+    "passed to operating_fit as settings=...",
     "LANDMARK_POINT": "see benchmarks/landmark.py",
     "landmark_thruster": "see benchmarks/landmark.py",
 }

@@ -130,9 +130,9 @@ def _load_old(module: str, name: str) -> Any:
     old = f"{module}.{name}"
     new = new_name(old)
     if new is None:
-        raise AttributeError(
-            f"module {module!r} has no attribute {name!r}; {gone_text(old) or _near(old)}"
-        )
+        if gone := gone_text(old):  # `from ep2sindy import name` drops the error's text
+            warn(gone, FutureWarning, stacklevel=3)
+        raise AttributeError(f"module {module!r} has no attribute {name!r}; {gone or _near(old)}")
     warn(moved_text(old), FutureWarning, stacklevel=3)
     return dotted_names()[new].load()
 

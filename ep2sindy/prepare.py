@@ -1,4 +1,4 @@
-"""Steps that prepare trajectories, fields and what is read from them."""
+"""Steps that prepare a field before trajectories are taken from it."""
 
 from ep2sindy._stubs import attach
 

@@ -1,8 +1,12 @@
 """The face: what users import and configs name."""
 
+import ast
+import inspect
+import re
 import subprocess
 import sys
 import warnings
+from functools import reduce
 from importlib import import_module
 from pathlib import Path
 
@@ -11,9 +15,10 @@ import yaml
 from omegaconf import OmegaConf
 
 import ep2sindy as ep
-from ep2sindy._old_names import GONE, RENAMED, gone_text
+from ep2sindy._old_names import GONE, NOTES, RENAMED, gone_text
 from ep2sindy._stubs import MARK, PACKAGE, dotted_names, read_stub, rooms
-from ep2sindy.app.targets import FOR_CONFIGS, target_of
+from ep2sindy.app.schema import bind_step
+from ep2sindy.app.targets import FOR_CONFIGS, check_targets, target_of
 
 ROOT = Path(__file__).resolve().parents[1]
 STUBS = sorted((ROOT / PACKAGE).rglob("*.pyi"))
@@ -110,18 +115,50 @@ def test_every_old_name_is_found_or_says_what_to_use() -> None:
                 assert said[0].filename == __file__
 
 
-def test_a_config_with_an_old_name_is_built_with_a_warning() -> None:
-    node = OmegaConf.create({"_target_": "ep2sindy." + "crop"})
-    with pytest.warns(FutureWarning, match=r"ep2sindy.crop is now ep2sindy.prepare.crop"):
-        assert target_of(node, "here") is ep.prepare.crop
+def test_an_old_import_of_a_name_that_is_gone_says_what_to_use() -> None:
+    """Python replaces the text of the error by its own, so the way out comes as a warning."""
+    said = pytest.warns(FutureWarning, match=r"BIC is gone; write ep2sindy\.EBIC\(gamma=0\.0")
+    with said, pytest.raises(ImportError, match="cannot import name 'BIC'"):
+        exec("from ep2sindy import BIC")
+
+
+CALLS = [
+    (old, call)
+    for old, text in {**NOTES, **GONE}.items()
+    for call in re.findall(r"[\w.]+\([^()]*\)", text)
+    if call.partition("(")[0].split(".")[0] not in {"law", "model_at", "pysindy"}  # not the face's
+]
+
+
+@pytest.mark.parametrize(("old", "call"), CALLS)
+def test_a_call_that_replaces_an_old_one_can_be_made(old: str, call: str) -> None:
+    tree = ast.parse(call, mode="eval").body
+    assert isinstance(tree, ast.Call), old
+    entries = {place.rpartition(".")[2]: entry for place, entry in dotted_names().items()}
+    parts = ast.unparse(tree.func).split(".")
+    name, *methods = [p for p in parts if p != PACKAGE and f"{PACKAGE}.{p}" not in rooms()]
+    target = reduce(getattr, methods, entries[name].load())
+    keywords = {str(each.arg): None for each in tree.keywords}
+    inspect.signature(target).bind_partial(*tree.args, **keywords)
+
+
+def test_a_config_with_an_old_name_is_built_with_one_warning() -> None:
+    config = OmegaConf.create({"prepare": [{"_target_": "ep2sindy." + "crop", "start_s": 0.0}]})
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("default")
+        check_targets(config)
+        assert bind_step(config.prepare[0], "prepare[0]").func is ep.prepare.crop
+    (text,) = {str(each.message) for each in said if each.category is FutureWarning}
+    assert text.startswith("prepare[0]: ep2sindy.crop is now ep2sindy.prepare.crop")
+    assert len({each.lineno for each in said}) == 1
 
 
 def test_a_name_that_is_gone_says_what_to_use(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(GONE, "OldScore", "take ep2sindy.EBIC()")
     said = r"ep2sindy\.OldScore is gone; take ep2sindy\.EBIC\(\)"
-    with pytest.raises(AttributeError, match=said):
+    with pytest.warns(FutureWarning, match=said), pytest.raises(AttributeError, match=said):
         ep.OldScore  # noqa: B018
-    with pytest.raises(ValueError, match=f"here must name a _target_ .*{said}; "):
+    with pytest.raises(ValueError, match=f"here must name a _target_ .*{said}$"):
         target_of(OmegaConf.create({"_target_": "ep2sindy.OldScore"}), "here")
 
 

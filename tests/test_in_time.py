@@ -137,6 +137,12 @@ def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: st
         step(plane(T), **settings)
 
 
+def test_a_step_takes_a_field_and_no_trajectory() -> None:
+    run = ep.lotka_volterra().trajectory()
+    with pytest.raises(ValueError, match=r"must be an xarray\.Dataset, .*: Trajectory came"):
+        ep.prepare.crop(run, start_s=5.0)
+
+
 def test_steps_that_need_every_sample_name_a_gap() -> None:
     for step, settings in (
         (ep.prepare.resample, {"dt_s": 0.5}),

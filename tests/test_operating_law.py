@@ -205,6 +205,12 @@ def test_a_record_must_hold_six_periods() -> None:
         OperatingRecord.of({"a": 1.0, "b": 0.0}, still)
 
 
+def test_a_cycle_is_no_status() -> None:
+    record = records()[0]
+    with pytest.raises(ValueError, match=r"status must be text, .*: a Cycle came; .*\.of\("):
+        OperatingRecord(record.parameters, record.run, record.cycle)  # as in version 0.2
+
+
 def test_a_structure_must_name_every_state() -> None:
     with pytest.raises(ValueError, match=r"terms for each of \['x', 'y'\]"):
         operating_fit(records(), LIBRARY, {"x": ["x"]})

@@ -373,6 +373,9 @@ def test_bad_input_is_refused() -> None:
         refine(model, [], window=50, rng=rng)
     with pytest.raises(ValueError, match="a list of trajectories of its own: 2 models and 1 lists"):
         refine([model] * 2, [[data]], RefinementSettings(window=50), rng=rng)
+    for models, runs in ((model, data), ([model], data), ([model], [data]), (model, [[data]])):
+        with pytest.raises(ValueError, match=r"one model takes a list of trajectories, as in re"):
+            refine(models, runs, window=50, rng=rng)
     with pytest.raises(ValueError, match="NelderMead cannot fit initial states"):
         refine(model, [data], window=50, method=NelderMead(), rng=rng)
 

@@ -163,18 +163,18 @@ def index_text(sweep: Path, *, n_figures: int = 4) -> str:
     records = records_of(sweep)
     if not records:
         return f"no job of the sweep noted its end in {sweep}"
-    everywhere = set.intersection(*(set(record["overrides"]) for record in records))
-    figures = list(dict.fromkeys(name for r in records for name in r.get("headline", {})))
+    varied, _ = split_varied(records)
+    figures = _headlines(records)
     table = Grid(title=f"sweep of {len(records)} jobs", title_justify="left", show_edge=False)
     for name in ("job", "overrides", "status", *figures[:n_figures], "folder or error"):
         table.add_column(in_line(name), overflow="fold")
     for record in records:
         headline = record.get("headline", {})
-        varied = [text for text in record["overrides"] if text not in everywhere]
+        own = [text for text in record["overrides"] if text.partition("=")[0] in varied]
         values = [headline.get(name) for name in figures[:n_figures]]
         texts = ["-" if value is None else f"{value:.4g}" for value in values]
         where = record.get("folder") or record.get("error", "")
-        cells = [str(record["job"]), " ".join(varied), record["status"], *texts, where]
+        cells = [str(record["job"]), " ".join(own), record["status"], *texts, where]
         table.add_row(*map(in_line, cells))
     text = StringIO()  # not a terminal: no colours, whose codes `say` would print
     console = Console(file=text, width=120, force_terminal=False, markup=False, emoji=False)

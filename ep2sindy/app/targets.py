@@ -30,20 +30,26 @@ def target_of(node: DictConfig, place: str) -> Callable[..., Any]:
     new = new_name(name) or name
     if new in FOR_CONFIGS:
         if new != name:
-            warn(moved_text(name), FutureWarning, stacklevel=2)
+            # Of this line, so that it shows once, though a target is checked before it is built.
+            warn(f"{place}: {moved_text(name)}", FutureWarning, stacklevel=1)
         return dotted_names()[new].load()
     module, _, last = name.rpartition(".")
     room = module.partition(".")[0]
     if room and room != "ep2sindy":
         return _own(name, place)
-    near = get_close_matches(last, {each.rpartition(".")[2] for each in FOR_CONFIGS})
-    there = sorted(each for each in FOR_CONFIGS if not near or each.rpartition(".")[2] in near)
-    gone = gone_text(name)
     raise ValueError(
         f"{place} must name a _target_ that there is, such as ep2sindy.EBIC, and that is for "
-        f"configs: {name!r} came; {gone and f'{gone}; '}"
-        f"{'near it are' if near else 'there are'} {', '.join(there)}"
+        f"configs: {name!r} came; {gone_text(name) or _near(last)}"
     )
+
+
+def _near(name: str) -> str:
+    """Targets with similar names; all targets if there are none."""
+    alike = get_close_matches(name, {each.rpartition(".")[2] for each in FOR_CONFIGS})
+    near = sorted(each for each in FOR_CONFIGS if each.rpartition(".")[2] in alike)
+    if not near:
+        return f"there are {', '.join(sorted(FOR_CONFIGS))}"
+    return f"near it {'is' if len(near) == 1 else 'are'} {', '.join(near)}"
 
 
 def _own(name: str, place: str) -> Callable[..., Any]:

@@ -87,7 +87,12 @@ def channel_length_m(attributes: Mapping[str, Any]) -> float | None:
 
 
 def grid_points(field: xr.Dataset, axis: str) -> Float[np.ndarray, " points"]:
-    """Coordinate of one axis as float64, in s or m."""
+    """Coordinate of one axis as float64, in s or m. Raises ValueError for what is no field."""
+    if not isinstance(field, xr.Dataset):
+        raise ValueError(
+            "a field must be an xarray.Dataset, as ep.open_field returns it: "
+            f"{type(field).__name__} came; prepare the field before trajectories are taken from it"
+        )
     return np.asarray(field[axis].values, dtype=np.float64)
 
 

@@ -94,8 +94,8 @@ def recognise(
     for axis, variable in axes.items():
         if (one := _of(held, variable.name)) is not None and axis not in named:
             axes[axis] = with_unit(axis, one, AXES[axis], guesses)
-    lengths = _lengths(axes, held, source, rest, dt_s, questions)
-    variables = _variables(source, rest, axes, held, lengths, questions, guesses)
+    lengths = _lengths(axes, held, source, rest, questions)
+    variables = _variables(rest, axes, held, lengths, questions, guesses)
     time = axes.get("time")
     if "time" not in named and time is not None and (one := _of(held, time.name)):
         said_s = _stated_step_s(usable)
@@ -154,7 +154,6 @@ def _lengths(
     held: Sequence[ArrayInfo],
     source: FileSource,
     rest: Sequence[ArrayInfo],
-    dt_s: float | None,
     questions: list[str],
 ) -> dict[str, int]:
     """Number of points of each axis; without a time array, samples are counted from the others."""
@@ -180,7 +179,6 @@ def _dim(variable: Variable, held: Sequence[ArrayInfo], axis: str) -> str:
 
 
 def _variables(
-    source: FileSource,
     rest: Sequence[ArrayInfo],
     axes: Mapping[str, Variable],
     held: Sequence[ArrayInfo],

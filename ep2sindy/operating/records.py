@@ -35,7 +35,7 @@ class OperatingRecord:
     trajectory: None if the source says that nothing oscillates. status: as the source says; only
     "oscillating" is checked, other values are taken as given. notes: remarks on problems of the
     data. used: description of the data.
-    Raises ValueError for parameters that are not finite.
+    Raises ValueError for parameters that are not finite, or for a status that is not text.
     """
 
     parameters: Mapping[str, float]
@@ -49,6 +49,12 @@ class OperatingRecord:
         object.__setattr__(self, "parameters", values)
         if not values or not np.isfinite(list(values.values())).all():
             raise ValueError(f"operating point {self.label} must have parameters, all finite")
+        if not isinstance(self.status, str):
+            raise ValueError(
+                "status must be text, such as 'oscillating': "
+                f"a {type(self.status).__name__} came; OperatingRecord.of(parameters, run) finds "
+                "the cycle of a record itself"
+            )
         if self.trajectory is None and self.status == Oscillation.OSCILLATING:
             raise ValueError(f"{self.label} oscillates: it needs its trajectory")
 

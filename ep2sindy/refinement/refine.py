@@ -103,6 +103,13 @@ def refine(
     trajectories: Sequence[Sequence[Trajectory]],
     settings: RefinementSettings = SETTINGS,
     *,
+    n_windows: int | None = None,
+    window: int | None = None,
+    periods: float | None = None,
+    method: Method | None = None,
+    constraint: Constraint | None = None,
+    free_start: bool | None = None,
+    n_reweights: int | None = None,
     points_per_batch: int = 8,
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
@@ -169,6 +176,15 @@ def _by_model(
     trajectories: Sequence[Trajectory] | Sequence[Sequence[Trajectory]],
 ) -> tuple[Sequence[SparseModel], Sequence[Sequence[Trajectory]]]:
     """Arguments of `refine` as a list of models and the trajectories of each."""
+    alone = isinstance(trajectories, Trajectory)
+    flat = alone or any(isinstance(each, Trajectory) for each in trajectories)
+    if alone or (len(trajectories) and flat != isinstance(model, SparseModel)):
+        raise ValueError(
+            "one model takes a list of trajectories, as in refine(model, [run]), and a list of "
+            "models a list of such lists, as in refine(models, [[run] for run in runs]): "
+            f"{type(model).__name__} came with {type(trajectories).__name__}"
+            f"{' of trajectories' if flat and not alone else ''}"
+        )
     if isinstance(model, SparseModel):
         return [model], [cast("Sequence[Trajectory]", trajectories)]
     return model, cast("Sequence[Sequence[Trajectory]]", trajectories)

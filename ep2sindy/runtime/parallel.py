@@ -6,7 +6,7 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -79,16 +79,13 @@ def rows_in_order(
     progress: called with 1 for every finished piece.
     Raises ValueError if there is no row at all.
     """
-    found = {}
-    for number, rows in workers.run(function, pieces):
-        found[number] = rows
-        progress(1)
-    if not any(found.values()):
+    found = collect(workers, function, list(pieces), nullcontext(progress))
+    if not any(found):
         raise ValueError(
             f"there must be something to run: {len(found)} pieces came, without a row; leave no "
             "list of settings empty"
         )
-    return [row for number in sorted(found) for row in found[number]]
+    return [row for rows in found for row in rows]
 
 
 def _in_worker(code: bytes, parent: int, numbered: tuple[int, Any]) -> tuple[int, Any]:
