@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery import choice
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import AnyMethod, Regression
+from ep2sindy.discovery.method import AnyMethod, Known, Regression
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.library.names import split_factors
+from ep2sindy.library.relations import relations_of
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
-from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.systems.systems import lotka_volterra
@@ -168,6 +171,57 @@ def test_intervals_under_relations_are_withheld_where_a_term_is_missing() -> Non
     found = discover(run, lacking, recipe, relations=["x: x^2 == -1 * y: x^2"])
     assert found.misfit
     assert found.model.covariance is None
+
+
+FORMS = [Differential(), Weak(), WeightedWeak()]
+
+
+@pytest.mark.parametrize("formulation", FORMS, ids=["differential", "weak", "weighted"])
+def test_relations_that_the_data_contradict_are_a_misfit(formulation: Formulation) -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=0)
+    recipe = Regression(formulation)
+    right = discover(run, None, recipe, relations=["x: x*y == -1"])
+    assert right.misfit == ""
+    wrong = discover(run, None, recipe, relations=["x: x == 5"])
+    assert wrong.model.terms("x")["x"] == 5.0
+    assert not wrong.noise_test.left["x"].leaves_noise
+    assert wrong.noise_test.left["y"].leaves_noise
+    assert "white noise of x'" in wrong.misfit
+    assert "check the relations" in wrong.misfit
+    assert wrong.model.covariance is None
+
+
+@pytest.mark.parametrize(
+    ("relations", "n_free"),
+    [
+        (["x: x*y == -1"], {"x": 1}),
+        (["x: x*y == -1 * y: x*y"], {"x": 2, "y": 2}),
+        (["x: x == 2 * y: x*y + y: y"], {"x": 2, "y": 2}),
+        (["x: x == 0.7", "x: x*y == -1"], {"x": 0}),
+    ],
+)
+def test_the_free_coefficients_of_related_equations_are_counted(
+    relations: list[str], n_free: dict[str, int]
+) -> None:
+    run, library = lotka_volterra().trajectory(), named_terms(["x", "y"], ["x", "y", "x*y"])
+    known = Known(relations_of(relations), {"x": ["x", "x*y"], "y": ["y", "x*y"]})
+    found = Regression().identify([run], library, known, rng=np.random.default_rng(0))
+    assert found.choice.n_free == n_free
+
+
+def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail_for_x(problem: RegressionRows, fit: choice.EquationFit) -> choice.EquationFit:
+        if fit.equation == "x":
+            raise np.linalg.LinAlgError("singular")
+        return reweight(problem, fit)
+
+    reweight = choice.reweight
+    monkeypatch.setattr(choice, "reweight", fail_for_x)
+    recipe = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0))
+    found = discover(lotka_volterra().trajectory(noise=0.05, rng=0), None, recipe)
+    assert list(found.noise_test.left) == ["y"]
 
 
 def test_a_rule_that_judges_free_runs_says_nothing_of_the_noise_of_rows() -> None:

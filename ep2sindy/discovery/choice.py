@@ -6,7 +6,8 @@ into one model.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,10 +17,10 @@ from scipy.linalg import block_diag
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation, binding, constraint
+from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
@@ -98,7 +99,9 @@ class Choice:
     fronts: with the scores of the rule. chosen: for each front, the selected candidate. model: of
     the chosen terms; its coefficients may differ from the candidates' by weighting, constraints or
     refinement. note: how the rule decided; else empty. left: for each state, the residuals of the
-    final fit on rows whose noise is known; None if the model was not judged by rows.
+    final fit on rows whose noise is known; None if the model was not judged by rows. n_free: for
+    each state named by a relation that holds in the model, the number of free coefficients of its
+    equation.
     """
 
     fronts: Sequence[ParetoFront]
@@ -106,6 +109,7 @@ class Choice:
     model: SparseModel
     note: str = ""
     left: Mapping[str, LeftOver] | None = None
+    n_free: Mapping[str, int] = field(default_factory=dict)
 
 
 def choose(
@@ -128,12 +132,13 @@ def choose(
     if relations:
         place = _least_sum(scored, relations)
         support = support_of(scored, place)
-        held = constraint(library, support, binding(relations, support) or ())
+        bound = binding(relations, support) or ()
+        held = constraint(library, support, bound)
         problems = list(dict.fromkeys(front.rows for front in scored))
         model = constrained_fit(problems, held, units=units, provenance=provenance)
         won = [f.with_scores(_won(f.scores, int(k))) for f, k in zip(scored, place, strict=True)]
         best = [front.candidates[k] for front, k in zip(won, place, strict=True)]
-        return Choice(won, best, model, left={})
+        return Choice(won, best, model, left={}, n_free=_count_free(held, bound))
     best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
     model = assemble_model(library, fits, units=units, provenance=provenance)
@@ -172,45 +177,51 @@ def score_by_rule(
 
 
 def noise_test(
-    model: SparseModel,
-    runs: Sequence[Trajectory],
-    *,
-    left: Mapping[str, LeftOver] | None,
-    estimate: Estimate | None = None,
+    choice: Choice, runs: Sequence[Trajectory], *, estimate: Estimate | None = None
 ) -> NoiseTest:
-    """Test the residuals of a model against the noise, independently of the method that found it.
+    """Test the residuals of the chosen model against the noise of the samples.
 
-    left: for each state, the residuals of the final fit. A state without any is tested on weak rows
-    of the runs, with the model's coefficients; if there are no such rows, for example for a record
-    of a few samples, that state is not tested. None if a rule judged the model by running it: rows
-    then say nothing. estimate: the joint estimate of states and coefficients, which has tested
-    whole trajectories already.
+    A state that the final fit has tested on its own rows keeps that result. Any other state is
+    tested on weak rows of the runs, with the terms of the model. If relations hold in its equation,
+    the model's own coefficients are tested. Otherwise the terms are fitted again to the weak rows,
+    which are whitened, and that fit is tested: coefficients of a formulation that does not weigh
+    its rows are not. A state without such rows, for example for a record of a few samples, is not
+    tested. Nothing is tested if a rule judged the model by running it: rows then say nothing.
+    estimate: of states and coefficients together, which has tested whole trajectories already.
     """
     if estimate is not None:
         return NoiseTest(misfit=estimate.misfit)
-    if left is None:
+    if choice.left is None:
         return NoiseTest()
-    unknown = [state for state in model.states if state not in left]
-    found = {**left, **(_left_of_weak_rows(model, runs, unknown) if unknown else {})}
-    ordered = {state: found[state] for state in model.states if state in found}
-    return NoiseTest(ordered, _misfit(ordered))
+    states = choice.model.states
+    unknown = [state for state in states if state not in choice.left]
+    found = {**choice.left, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}
+    ordered = {state: found[state] for state in states if state in found}
+    return NoiseTest(ordered, _misfit(ordered, choice.n_free))
 
 
 def _left_of_weak_rows(
-    model: SparseModel, runs: Sequence[Trajectory], states: Sequence[str]
+    choice: Choice, runs: Sequence[Trajectory], states: Sequence[str]
 ) -> dict[str, LeftOver]:
-    """Residuals of some equations on weak rows; empty if the samples are too few for rows."""
+    """Residuals of some equations on weak rows, as far as their rows can be made and whitened."""
+    model, left = choice.model, {}
     try:
         # Same result as with the whole library, at a fraction of the cost.
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
         used[0] |= not used.any()  # a library needs a term
         form, rng = Weak(split=RandomSplit(0.0)), np.random.default_rng(0)
         rows = form.assemble(runs, model.library.take(used), rng=rng)
-        found = {problem.equations[0]: problem for problem in rows}
-        fits = [reweight(found[state], _fit_in(model, state)) for state in states]
     except (ValueError, np.linalg.LinAlgError):
         return {}
-    return {fit.equation: fit.left for fit in fits if fit.left is not None}
+    problems = {problem.equations[0]: problem for problem in rows}
+    for state in states:
+        problem, fit = problems[state], _fit_in(model, state)
+        with suppress(ValueError, np.linalg.LinAlgError):
+            if state in choice.n_free:
+                left[state] = _left_of_fit(problem, fit, n_free=choice.n_free[state])
+            elif (tested := reweight(problem, fit).left) is not None:
+                left[state] = tested
+    return left
 
 
 def _fit_in(model: SparseModel, state: str) -> EquationFit:
@@ -219,12 +230,32 @@ def _fit_in(model: SparseModel, state: str) -> EquationFit:
     return EquationFit(state, tuple(terms), np.array(list(terms.values())))
 
 
-def _misfit(left: Mapping[str, LeftOver]) -> str:
-    """Sentence on the equations whose residuals exceed the noise; empty if there are none."""
+def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, int]:
+    """For each state that relations name, the number of free coefficients of its equation."""
+    named = {state for relation in relations for _, state, _ in relation.factors}
+    owners = np.array([state for state, _ in held.coefficients])
+    return {
+        state: int(np.linalg.matrix_rank(held.C[owners == state]))
+        for state in held.states
+        if state in named
+    }
+
+
+def _misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
+    """Sentence on the equations whose residuals exceed the noise; empty if there are none.
+
+    related: states whose coefficients obey relations.
+    """
     more = {state: each.chi_squared for state, each in left.items() if not each.leaves_noise}
     if not more:
         return ""
     parts = ", ".join(f"{state}' ({value:.3g} times its size)" for state, value in more.items())
+    if set(more) & set(related):
+        return (
+            f"the model leaves more than white noise of {parts} under its relations: intervals are "
+            "not given; check the relations, weigh the rows (WeightedWeak()), add terms or states, "
+            "or judge the model by free run"
+        )
     return (
         f"no equation of this library leaves white noise of {parts}: intervals are not given; "
         "add terms or states, or judge the model by free run"
@@ -265,28 +296,54 @@ def reweight(
     If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
     the truth.
     """
+    theta, target, scale = _whitened_terms(problem, candidate, n_steps=n_steps)
+    upper = np.linalg.qr(theta, mode="r")
+    root = np.linalg.inv(upper) * scale[:, None]
+    fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
+    left = _compare_with_noise(target - theta @ fitted, n_free=len(scale))
+    return EquationFit(
+        equation=candidate.equation,
+        terms=candidate.terms,
+        coef=fitted * scale,
+        covariance=root @ root.T if left.leaves_noise else None,
+        left=left,
+    )
+
+
+def _left_of_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
+    """Residuals of a fit with its own coefficients, whitened about a free fit of its terms.
+
+    The free fit is as close to the data as these terms allow, so the samples are corrected by it,
+    not by coefficients that the data may contradict. n_free: number of free coefficients.
+    """
+    free = fit_support(problem, fit.equation, fit.terms)
+    theta, target, scale = _whitened_terms(problem, free, n_steps=8)
+    order = [fit.terms.index(name) for name in free.terms]
+    return _compare_with_noise(target - theta @ (fit.coef[order] / scale), n_free=n_free)
+
+
+def _whitened_terms(
+    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int
+) -> tuple[
+    Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
+]:
+    """Whitened columns of a candidate's terms, the whitened target, and coefficients' scales."""
     terms = np.isin(problem.term_names, candidate.terms)
     scale = problem.coef_scale(0)
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]
     rows = whitened_rows(problem, terms, coef, n_steps=n_steps)
-    theta = rows.theta[:, order]
-    upper = np.linalg.qr(theta, mode="r")
-    root = np.linalg.inv(upper) * scale[order, None]
-    fitted = np.linalg.lstsq(theta, rows.target, rcond=None)[0]
-    left = rows.target - theta @ fitted
-    freedom = max(len(left) - len(order), 1)
+    return rows.theta[:, order], rows.target, scale[order]
+
+
+def _compare_with_noise(left: Float[np.ndarray, " rows"], *, n_free: int) -> LeftOver:
+    """Compare whitened residuals with white noise of variance 1; n_free: fitted coefficients."""
+    freedom = max(len(left) - n_free, 1)
     chi_squared = float(left @ left) / freedom
     leaves_noise = chi_squared <= MAX_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
     autocorrelation = float(left[1:] @ left[:-1]) / max(float(left @ left), SMALLEST)
-    return EquationFit(
-        equation=candidate.equation,
-        terms=candidate.terms,
-        coef=fitted * scale[order],
-        covariance=root @ root.T if leaves_noise else None,
-        left=LeftOver(chi_squared, autocorrelation, bool(leaves_noise)),
-    )
+    return LeftOver(chi_squared, autocorrelation, bool(leaves_noise))
 
 
 def _least_sum(

@@ -133,7 +133,7 @@ def discover(
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     found = method.identify(trajectories, library, known, rng=rng, progress=watch)
     choice = found.choice
-    test = noise_test(choice.model, trajectories, left=choice.left, estimate=found.estimate)
+    test = noise_test(choice, trajectories, estimate=found.estimate)
     # If the residuals of the rows exceed the noise, intervals would not cover the truth.
     withheld = bool(test.left and test.misfit)
     return Discovery(
