@@ -1,4 +1,6 @@
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -6,17 +8,21 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery import choice
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import AnyMethod, Known, Regression
-from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.discovery.method import AnyMethod, Known, Regression, TrajectorySearch
+from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.names import split_factors
-from ep2sindy.library.relations import relations_of
+from ep2sindy.library.relations import Relation, relations_of
+from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.weak import Weak, WeightedWeak
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
+from ep2sindy.selection.rule import Decision
 from ep2sindy.systems.systems import lotka_volterra
 
 # Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.
@@ -230,7 +236,49 @@ def test_a_rule_that_judges_free_runs_says_nothing_of_the_noise_of_rows() -> Non
     recipe = Regression(WeightedWeak(), BestSubset(max_terms=2), rule, Bootstraps(n=0))
     found = discover(run, named_terms(["x", "y"], ["x", "y", "x*y"]), recipe)
     assert not found.noise_test.left
+    assert not found.noise_test.tested
     assert found.misfit == ""
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """A rule for whole systems that takes no terms at all."""
+
+    label: ClassVar[str] = "stillness"
+
+    def scores(
+        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
+    ) -> list[np.ndarray]:
+        return list(self.decide(fronts, library, runs).scores)
+
+    def decide(
+        self,
+        fronts: Sequence[ParetoFront],
+        library: Library,
+        runs: Sequence[Trajectory],
+        relations: Sequence[Relation] = (),
+        *,
+        progress: Progress = SILENT,
+    ) -> Decision:
+        states = [front.equation for front in fronts]
+        model = SparseModel(library, states, coef_matrix(library, [{} for _ in states]))
+        return Decision([front.sizes for front in fronts], model, "nothing moves")
+
+
+def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
+    run = lotka_volterra().trajectory(noise=0.02, rng=0)
+    library = named_terms(["x", "y"], ["x", "y", "x*y"])
+    tested = discover(run, library, TrajectorySearch())
+    assert tested.noise_test.tested
+    still = discover(run, library, TrajectorySearch(selection=Stillness()))
+    assert not still.model.coef.any()
+    assert still.estimate.misfit == ""
+    assert not still.noise_test.tested
+    poor = discover(
+        run, library.take(np.array([True, True, False])), TrajectorySearch(selection=Stillness())
+    )
+    assert poor.estimate.misfit
+    assert poor.misfit == ""  # nothing is said of a model that was not tested
 
 
 def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:

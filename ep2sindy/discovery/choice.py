@@ -85,11 +85,12 @@ class NoiseTest:
     left: for each state, the residuals of its equation on rows. It is empty if no rows were tested:
     after a trajectory search, which tests whole trajectories, and for rules that judge free runs.
     misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
-    tested.
+    tested. tested: False if nothing was tested.
     """
 
     left: Mapping[str, LeftOver] = field(default_factory=dict)
     misfit: str = ""
+    tested: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,17 +188,18 @@ def noise_test(
     which are whitened, and that fit is tested: coefficients of a formulation that does not weigh
     its rows are not. A state without such rows, for example for a record of a few samples, is not
     tested. Nothing is tested if a rule judged the model by running it: rows then say nothing.
-    estimate: of states and coefficients together, which has tested whole trajectories already.
+    estimate: of states and coefficients together, which has tested whole trajectories already. It
+    counts only if the chosen model is its own.
     """
-    if estimate is not None:
-        return NoiseTest(misfit=estimate.misfit)
+    if estimate is not None and estimate.model is choice.model:
+        return NoiseTest(misfit=estimate.misfit, tested=True)
     if choice.left is None:
         return NoiseTest()
     states = choice.model.states
     unknown = [state for state in states if state not in choice.left]
     found = {**choice.left, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
-    return NoiseTest(ordered, _misfit(ordered, choice.n_free))
+    return NoiseTest(ordered, _misfit(ordered, choice.n_free), tested=bool(ordered))
 
 
 def _left_of_weak_rows(

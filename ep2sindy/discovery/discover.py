@@ -73,7 +73,7 @@ class Discovery:
     def misfit(self) -> str:
         """The reason why the model does not explain the data to within their noise.
 
-        Empty if it does, or if the noise is not propagated into the rows.
+        Empty if it does, or if the model was not tested: `noise_test.tested` is then False.
         """
         return self.noise_test.misfit
 
