@@ -15,14 +15,14 @@ from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.front import ParetoFront
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
 from ep2sindy.regression.weak import Weak, WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.selection.rule import Decision
+from ep2sindy.selection.rule import Decision, admissible, combinations
 from ep2sindy.systems.systems import lotka_volterra
 
 # Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.
@@ -213,6 +213,48 @@ def test_the_free_coefficients_of_related_equations_are_counted(
     known = Known(relations_of(relations), {"x": ["x", "x*y"], "y": ["y", "x*y"]})
     found = Regression().identify([run], library, known, rng=np.random.default_rng(0))
     assert found.choice.n_free == n_free
+
+
+def random_front(state: str, names: list[str], rng: np.random.Generator) -> ParetoFront:
+    """Eight candidates of random terms and random scores, the empty one first."""
+    supports = [[], *([n for n in names if rng.random() < 0.5] for _ in range(7))]
+    ones = [np.ones(len(terms)) for terms in supports]
+    pairs = zip(supports, ones, strict=True)
+    candidates = [Candidate(state, tuple(terms), c, 0.0, 0.0, 0.0, c) for terms, c in pairs]
+    return ParetoFront(state, candidates).with_scores(rng.normal(size=len(candidates)))
+
+
+RELATED = [
+    ["a: a == 1"],
+    ["a: b == -1 * c: b"],
+    ["a: b == -1 * c: b", "d: d == c: c"],
+    ["a: b == -1 * c: b", "b: a == d: c", "d: 1 == 2"],
+]
+
+
+@pytest.mark.parametrize("relations", RELATED, ids=len)
+@pytest.mark.parametrize("seed", range(5))
+def test_fronts_that_no_relation_ties_are_chosen_one_by_one(
+    relations: list[str], seed: int
+) -> None:
+    rng, related = np.random.default_rng(seed), relations_of(relations)
+    fronts = [random_front(state, ["1", *"abcd"], rng) for state in "abcd"]
+    every = admissible(fronts, combinations(fronts, 10_000), related)
+    sums = [sum(f.scores[k] for f, k in zip(fronts, place, strict=True)) for place in every]
+    found = choice._least_sum(fronts, related)
+    assert found.tolist() == every[int(np.argmin(sums))].tolist()
+
+
+def test_the_number_of_states_is_limited_only_where_relations_tie_them() -> None:
+    rng, names = np.random.default_rng(0), [f"s{k}" for k in range(8)]
+    fronts = [random_front(name, names, rng) for name in names]
+    two = choice._least_sum(fronts, relations_of(["s0: s1 == s1: s0"]))
+    for k in range(2, 8):
+        assert two[k] == np.argmin(fronts[k].scores)
+    chain = relations_of([f"s{k}: s0 == s{k + 1}: s0" for k in range(7)])
+    message = "compared under relations: .* make 16777216; .* tie fewer states to each other$"
+    with pytest.raises(ValueError, match=message):
+        choice._least_sum(fronts, chain)
 
 
 def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(

@@ -34,7 +34,7 @@ from ep2sindy.selection.rule import (
     support_of,
 )
 
-MAX_COMBINATIONS = 1_000_000  # most combinations to check for the terms of relations
+MAX_COMBINATIONS = 1_000_000  # most combinations of the fronts that relations tie together
 
 
 # For a correct equation chi-squared per row is 1 within its standard error, and a little more,
@@ -126,7 +126,8 @@ def choose(
 
     Under relations, only combinations that have the terms of the relations count. The one of least
     summed score wins, and all equations are fitted at once.
-    Raises ValueError for relations that no combination has the terms for.
+    Raises ValueError for relations that no combination has the terms for, or that tie so many
+    states to each other that their combinations exceed a million.
     """
     library = fronts[0].rows.library
     scored = score_by_rule(fronts, rule, progress)
@@ -351,10 +352,36 @@ def _compare_with_noise(left: Float[np.ndarray, " rows"], *, n_free: int) -> Lef
 def _least_sum(
     fronts: Sequence[ParetoFront], relations: Sequence[Relation]
 ) -> Int[np.ndarray, " fronts"]:
-    """The combination of least summed score among those that have the relations' terms."""
-    places = admissible(fronts, combinations(fronts, MAX_COMBINATIONS), relations)
-    sums = np.sum([f.scores[column] for f, column in zip(fronts, places.T, strict=True)], axis=0)
-    return places[int(np.argmin(sums))]
+    """The combination of least summed score among those that have the relations' terms.
+
+    Only fronts that relations tie to each other are combined, since the other scores can be chosen
+    one by one.
+    """
+    place = np.array([int(np.argmin(front.scores)) for front in fronts])
+    for states in _tied_states(relations):
+        tied = [k for k, front in enumerate(fronts) if front.equation in states]
+        some = [fronts[k] for k in tied]
+        own = [r for r in relations if any(state in states for _, state, _ in r.factors)]
+        every = combinations(
+            some,
+            MAX_COMBINATIONS,
+            use="compared under relations",
+            way_out="let the relations tie fewer states to each other",
+        )
+        places = admissible(some, every, own)
+        sums = np.sum([f.scores[column] for f, column in zip(some, places.T, strict=True)], axis=0)
+        place[tied] = places[int(np.argmin(sums))]
+    return place
+
+
+def _tied_states(relations: Sequence[Relation]) -> list[set[str]]:
+    """Sets of states that relations tie to each other, directly or through a third state."""
+    sets: list[set[str]] = []
+    for relation in relations:
+        tied = {state for _, state, _ in relation.factors}
+        tied = tied.union(*(other for other in sets if other & tied))
+        sets = [other for other in sets if not other & tied] + [tied]
+    return sets
 
 
 def _won(scores: Float[np.ndarray, " candidates"], winner: int) -> Float[np.ndarray, " candidates"]:

@@ -97,14 +97,22 @@ def score_candidates(
 
 
 def combinations(
-    fronts: Sequence[ParetoFront], most: int
+    fronts: Sequence[ParetoFront],
+    most: int,
+    *,
+    use: str = "integrated",
+    way_out: str = "raise max_combinations",
 ) -> Int[np.ndarray, "combinations fronts"]:
-    """Every choice of one candidate per front, by index. Raises ValueError for more than `most`."""
+    """Every choice of one candidate per front, by index.
+
+    use, way_out: of the caller, for the error.
+    Raises ValueError for more than `most`.
+    """
     counts = [len(front.candidates) for front in fronts]
     if prod(counts) > most:
         raise ValueError(
-            f"at most {most} combinations of candidates are integrated: {counts} candidates make "
-            f"{prod(counts)}; lower depth or the search's max_terms, or raise max_combinations"
+            f"at most {most} combinations of candidates are {use}: {counts} candidates make "
+            f"{prod(counts)}; lower depth or the search's max_terms, or {way_out}"
         )
     return np.indices(counts).reshape(len(counts), -1).T
 
