@@ -19,7 +19,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.regression.gram_fits import solve_masks
+from ep2sindy.regression.gram_fits import explained_squares, fit_masks
 from ep2sindy.regression.searches import AdaptiveLasso
 
 
@@ -102,5 +102,4 @@ def _residual_shares(
     masks: Bool[np.ndarray, "supports terms"],
 ) -> Float[np.ndarray, " supports"]:
     """Least-squares residual, squared, of a target of norm 1; NaN for dependent terms."""
-    coef = solve_masks(xx, np.where(masks, xy, 0.0), masks)
-    return 1.0 - (coef * (2.0 * xy - coef @ xx)).sum(axis=1)
+    return 1.0 - explained_squares(fit_masks(xx, xy, masks), xx, xy)
