@@ -99,9 +99,9 @@ class BestSubset:
             raise ValueError(f"n_best must be at least 1: {self.n_best} came")
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        return self.joint_supports(xx[None], xy[None], np.array([yy]))
+        return self.shared_supports(xx[None], xy[None], np.array([yy]))
 
-    def joint_supports(
+    def shared_supports(
         self,
         xx: Float[np.ndarray, "problems terms terms"],
         xy: Float[np.ndarray, "problems terms"],

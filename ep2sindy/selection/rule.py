@@ -117,7 +117,7 @@ def combinations(
     return np.indices(counts).reshape(len(counts), -1).T
 
 
-def joint_scores(
+def combination_scores(
     fronts: Sequence[ParetoFront],
     places: Int[np.ndarray, "combinations fronts"],
     errors: Float[np.ndarray, " combinations"],
