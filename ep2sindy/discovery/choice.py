@@ -130,7 +130,9 @@ def choose(
     states to each other that their combinations exceed a million.
     """
     library = fronts[0].rows.library
-    scored = score_by_rule(fronts, rule, progress)
+    with progress.stage(None, "", f"candidates by {rule.label}"):
+        scores = rule.scores(fronts)
+    scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
     if relations:
         place = _least_sum(scored, relations)
         support = support_of(scored, place)
@@ -167,15 +169,6 @@ def choose_by_runs(
     model = replace(decision.model, units=runs[0].units, provenance=provenance)
     best = [front.best for front in scored]
     return Choice(scored, best, model, decision.note)
-
-
-def score_by_rule(
-    fronts: Sequence[ParetoFront], rule: Selection, progress: Progress
-) -> list[ParetoFront]:
-    """Fronts with the scores of a rule that judges single candidates."""
-    with progress.stage(None, "", f"candidates by {rule.label}"):
-        scores = rule.scores(fronts)
-    return [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
 
 
 def noise_test(

@@ -14,7 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, binding
 from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
 
 # Least residual squares, as a share of the target's squares: below this value a criterion would
@@ -37,11 +37,6 @@ class Selection(Protocol):
     def label(self) -> str: ...
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]: ...
-
-
-def selected(front: ParetoFront, scores: Float[np.ndarray, " candidates"]) -> Candidate:
-    """The candidate of least score; of several, the one with fewest terms."""
-    return front.with_scores(scores).best
 
 
 @dataclass(frozen=True, eq=False)
