@@ -23,7 +23,7 @@ from ep2sindy.runtime.parallel import Loky
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.free_run import FreeRunScore
 from ep2sindy.selection.refined import RefinedScore
-from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.selection.rule import Selection
 from ep2sindy.systems.draws import realization
 
 SYSTEMS = ("lotka_volterra", "van_der_pol", "oscillator", "lorenz")
@@ -59,7 +59,7 @@ def judged(number: int, *, name: str, noise: float, rules: Sequence[str]) -> dic
         begin = time.process_time()
         scores = RULES[rule].scores(fronts)
         row[f"{rule}, s"] = time.process_time() - begin
-        chosen = [set(selected(f, s).terms) for f, s in zip(fronts, scores, strict=True)]
+        chosen = [set(f.with_scores(s).best.terms) for f, s in zip(fronts, scores, strict=True)]
         row[rule] = float(chosen == truth)
     return row
 

@@ -32,7 +32,7 @@ MOVED = {
         fit_support constrained_fit Relation relations_from_matrix
         pareto_front ParetoFront Candidate pooled_supports
     """,
-    "selection": "selected Stability",
+    "selection": "Stability",
     "signals": """
         KalmanSmoother LogSmoother SavitzkyGolay NoSmoothing power_spectrum dominant_frequency
         Cycle find_cycle Trace Rate LogRate Delays embed Embedded
@@ -95,6 +95,7 @@ GONE: dict[str, str] = {
     "STLSQRegressor": "take pysindy.STLSQ, or ep2sindy.STLSQ() as the search of a Regression",
     "SingleShooting": "take ep2sindy.refinement.MultipleShooting()",
     "loss_against_window": "call ep2sindy.refine in a loop over the lengths of windows",
+    "selected": "write front.with_scores(scores).best, which is the same",
     "Windows": "take ep2sindy.RefinementSettings(n_windows=20, periods=2.0, n_reweights=0), "
     "passed to operating_fit as settings=...",
     "LANDMARK_POINT": "see benchmarks/landmark.py",

@@ -17,7 +17,6 @@ from ep2sindy.regression.front import Candidate, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.criteria import Knee
-from ep2sindy.selection.rule import selected
 from ep2sindy.systems.systems import lotka_volterra
 
 PREY = lotka_volterra()
@@ -72,7 +71,7 @@ def named(found: Corrected, library: Library) -> list[Candidate]:
     )
     fronts = [pareto_front(rows, each) for each in supports]
     return [
-        selected(front, score)
+        front.with_scores(score).best
         for front, score in zip(fronts, Knee(scale="log").scores(fronts), strict=True)
     ]
 

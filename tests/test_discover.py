@@ -1,19 +1,28 @@
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery import choice
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import AnyMethod, Regression
-from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.discovery.method import AnyMethod, Known, Regression, TrajectorySearch
+from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.names import split_factors
+from ep2sindy.library.relations import Relation, relations_of
+from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
+from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import AdaptiveLasso, BestSubset
-from ep2sindy.regression.weak import WeightedWeak
+from ep2sindy.regression.weak import Weak, WeightedWeak
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import EBIC, Knee
 from ep2sindy.selection.free_run import FreeRunScore
+from ep2sindy.selection.rule import Decision, admissible, combinations
 from ep2sindy.systems.systems import lotka_volterra
 
 # Pelts in thousands, 1900 to 1920. Source: Elton & Nicholson 1942, doi:10.2307/1358.
@@ -170,13 +179,148 @@ def test_intervals_under_relations_are_withheld_where_a_term_is_missing() -> Non
     assert found.model.covariance is None
 
 
+FORMS = [Differential(), Weak(), WeightedWeak()]
+
+
+@pytest.mark.parametrize("formulation", FORMS, ids=["differential", "weak", "weighted"])
+def test_relations_that_the_data_contradict_are_a_misfit(formulation: Formulation) -> None:
+    run = lotka_volterra().trajectory(noise=0.05, rng=0)
+    recipe = Regression(formulation)
+    right = discover(run, None, recipe, relations=["x: x*y == -1"])
+    assert right.misfit == ""
+    wrong = discover(run, None, recipe, relations=["x: x == 5"])
+    assert wrong.model.terms("x")["x"] == 5.0
+    assert not wrong.noise_test.left["x"].leaves_noise
+    assert wrong.noise_test.left["y"].leaves_noise
+    assert "white noise of x'" in wrong.misfit
+    assert "check the relations" in wrong.misfit
+    assert wrong.model.covariance is None
+
+
+@pytest.mark.parametrize(
+    ("relations", "n_free"),
+    [
+        (["x: x*y == -1"], {"x": 1}),
+        (["x: x*y == -1 * y: x*y"], {"x": 2, "y": 2}),
+        (["x: x == 2 * y: x*y + y: y"], {"x": 2, "y": 2}),
+        (["x: x == 0.7", "x: x*y == -1"], {"x": 0}),
+    ],
+)
+def test_the_free_coefficients_of_related_equations_are_counted(
+    relations: list[str], n_free: dict[str, int]
+) -> None:
+    run, library = lotka_volterra().trajectory(), named_terms(["x", "y"], ["x", "y", "x*y"])
+    known = Known(relations_of(relations), {"x": ["x", "x*y"], "y": ["y", "x*y"]})
+    found = Regression().identify([run], library, known, rng=np.random.default_rng(0))
+    assert found.choice.n_free == n_free
+
+
+def random_front(state: str, names: list[str], rng: np.random.Generator) -> ParetoFront:
+    """Eight candidates of random terms and random scores, the empty one first."""
+    supports = [[], *([n for n in names if rng.random() < 0.5] for _ in range(7))]
+    ones = [np.ones(len(terms)) for terms in supports]
+    pairs = zip(supports, ones, strict=True)
+    candidates = [Candidate(state, tuple(terms), c, 0.0, 0.0, 0.0, c) for terms, c in pairs]
+    return ParetoFront(state, candidates).with_scores(rng.normal(size=len(candidates)))
+
+
+RELATED = [
+    ["a: a == 1"],
+    ["a: b == -1 * c: b"],
+    ["a: b == -1 * c: b", "d: d == c: c"],
+    ["a: b == -1 * c: b", "b: a == d: c", "d: 1 == 2"],
+]
+
+
+@pytest.mark.parametrize("relations", RELATED, ids=len)
+@pytest.mark.parametrize("seed", range(5))
+def test_fronts_that_no_relation_ties_are_chosen_one_by_one(
+    relations: list[str], seed: int
+) -> None:
+    rng, related = np.random.default_rng(seed), relations_of(relations)
+    fronts = [random_front(state, ["1", *"abcd"], rng) for state in "abcd"]
+    every = admissible(fronts, combinations(fronts, 10_000), related)
+    sums = [sum(f.scores[k] for f, k in zip(fronts, place, strict=True)) for place in every]
+    found = choice._least_sum(fronts, related)
+    assert found.tolist() == every[int(np.argmin(sums))].tolist()
+
+
+def test_the_number_of_states_is_limited_only_where_relations_tie_them() -> None:
+    rng, names = np.random.default_rng(0), [f"s{k}" for k in range(8)]
+    fronts = [random_front(name, names, rng) for name in names]
+    two = choice._least_sum(fronts, relations_of(["s0: s1 == s1: s0"]))
+    for k in range(2, 8):
+        assert two[k] == np.argmin(fronts[k].scores)
+    chain = relations_of([f"s{k}: s0 == s{k + 1}: s0" for k in range(7)])
+    message = "compared under relations: .* make 16777216; .* tie fewer states to each other$"
+    with pytest.raises(ValueError, match=message):
+        choice._least_sum(fronts, chain)
+
+
+def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail_for_x(problem: RegressionRows, fit: choice.EquationFit) -> choice.EquationFit:
+        if fit.equation == "x":
+            raise np.linalg.LinAlgError("singular")
+        return reweight(problem, fit)
+
+    reweight = choice.reweight
+    monkeypatch.setattr(choice, "reweight", fail_for_x)
+    recipe = Regression(Differential(), BestSubset(), bootstraps=Bootstraps(n=0))
+    found = discover(lotka_volterra().trajectory(noise=0.05, rng=0), None, recipe)
+    assert list(found.noise_test.left) == ["y"]
+
+
 def test_a_rule_that_judges_free_runs_says_nothing_of_the_noise_of_rows() -> None:
     run = replace(lotka_volterra(), rate_Hz=5.0).trajectory(noise=0.05, rng=0)
     rule = FreeRunScore(n_windows=4, n_folds=2)
     recipe = Regression(WeightedWeak(), BestSubset(max_terms=2), rule, Bootstraps(n=0))
     found = discover(run, named_terms(["x", "y"], ["x", "y", "x*y"]), recipe)
     assert not found.noise_test.left
+    assert not found.noise_test.tested
     assert found.misfit == ""
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """A rule for whole systems that takes no terms at all."""
+
+    label: ClassVar[str] = "stillness"
+
+    def scores(
+        self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
+    ) -> list[np.ndarray]:
+        return list(self.decide(fronts, library, runs).scores)
+
+    def decide(
+        self,
+        fronts: Sequence[ParetoFront],
+        library: Library,
+        runs: Sequence[Trajectory],
+        relations: Sequence[Relation] = (),
+        *,
+        progress: Progress = SILENT,
+    ) -> Decision:
+        states = [front.equation for front in fronts]
+        model = SparseModel(library, states, coef_matrix(library, [{} for _ in states]))
+        return Decision([front.sizes for front in fronts], model, "nothing moves")
+
+
+def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
+    run = lotka_volterra().trajectory(noise=0.02, rng=0)
+    library = named_terms(["x", "y"], ["x", "y", "x*y"])
+    tested = discover(run, library, TrajectorySearch())
+    assert tested.noise_test.tested
+    still = discover(run, library, TrajectorySearch(selection=Stillness()))
+    assert not still.model.coef.any()
+    assert still.estimate.misfit == ""
+    assert not still.noise_test.tested
+    poor = discover(
+        run, library.take(np.array([True, True, False])), TrajectorySearch(selection=Stillness())
+    )
+    assert poor.estimate.misfit
+    assert poor.misfit == ""  # nothing is said of a model that was not tested
 
 
 def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:

@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
+from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
+from ep2sindy.studies.library_result import REPLACED
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
 
@@ -240,6 +244,15 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
     assert "The model explains the samples as far as their noise" in said
     assert "share" not in said  # there are no bootstraps
     assert "95 % from" in years.page
+
+
+def test_a_report_says_if_the_samples_speak_of_another_model(years: Computed) -> None:
+    result, data = years.outcome.results["model"], years.outcome.data
+    plain = result.sections("model", data)[1]
+    assert REPLACED not in [block.text for block in plain.blocks if isinstance(block, Text)]
+    untested = replace(result, discovery=replace(result.discovery, noise_test=NoiseTest()))
+    other = untested.sections("model", data)[1]
+    assert REPLACED in [block.text for block in other.blocks if isinstance(block, Text)]
 
 
 @pytest.mark.parametrize("search", ["adaptive_lasso", "stlsq", "best_subset"])

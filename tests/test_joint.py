@@ -118,7 +118,7 @@ def test_noise_free_equations_come_back_at_every_point() -> None:
 
 @pytest.mark.parametrize("n_best", [1, 3])
 @pytest.mark.parametrize("seed", range(3))
-def test_joint_subsets_match_exhaustive_enumeration(seed: int, n_best: int) -> None:
+def test_shared_subsets_match_exhaustive_enumeration(seed: int, n_best: int) -> None:
     rng = np.random.default_rng(seed)
     theta = 2.0 * rng.normal(size=(3, 40, 1)) + rng.normal(size=(3, 40, 9))
     theta[0, :, 2] = 0.0  # a term that the first problem cannot show
@@ -135,7 +135,7 @@ def test_joint_subsets_match_exhaustive_enumeration(seed: int, n_best: int) -> N
         ]
         return float(np.log(residuals).sum())
 
-    masks = BestSubset(max_terms=9, n_best=n_best).joint_supports(
+    masks = BestSubset(max_terms=9, n_best=n_best).shared_supports(
         np.einsum("pri,prj->pij", theta, theta),
         np.einsum("pri,pr->pi", theta, target),
         np.square(target).sum(axis=1),
@@ -186,7 +186,7 @@ def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -
     assert searched(rows, selection=EBIC()).chosen["y"] == ("b",)
 
 
-def test_joint_errors_are_geometric_means_that_fall_with_size() -> None:
+def test_shared_errors_are_geometric_means_that_fall_with_size() -> None:
     truth = {"a": 1.0, "b": -0.6}
     rows = {f"P{k}": rows_of(truth, seed=k, noise=0.1 * 10.0**k) for k in range(3)}
     front = searched(rows, selection=BIC).fronts["y"]

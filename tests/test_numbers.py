@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from ep2sindy.data.coerce import trajectories_of
-from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
+from ep2sindy.data.numbers import check_magnitude, column_norms, real_numbers, rounding_s, seconds
 from ep2sindy.regression.sampling import is_even
 from ep2sindy.signals.spectrum import is_uniform
 
@@ -109,3 +109,10 @@ def test_a_trajectory_refuses_them_without_type_checks_too() -> None:
         "states must hold real numbers:",
         "a variable must be of a size w",
     ]
+
+
+def test_norms_of_columns_neither_overflow_nor_vanish() -> None:
+    values = np.array([[3.0, -3e200, 3e-200, 0.0], [4.0, 4e200, -4e-200, 0.0]])
+    np.testing.assert_allclose(column_norms(values), [5.0, 5e200, 5e-200, 1.0], rtol=1e-15)
+    np.testing.assert_array_equal(column_norms(np.zeros((0, 2))), [1.0, 1.0])
+    assert column_norms(np.zeros((3, 0))).shape == (0,)

@@ -254,6 +254,43 @@ def test_a_broken_run_goes_on_with_its_finished_blocks(
     assert not kept.folder.exists()
 
 
+OTHERS = [
+    {"search": BestSubset(max_terms=1)},
+    {"seed": 1},
+    {"least_variation": 0.01},
+    {"library": named_terms(["x", "u", "w"], ["1", "x", "u", "w", "x*w"])},
+    {"bootstraps": Bootstraps(n=8, n_culled=0, block=11)},
+]
+
+
+@pytest.mark.parametrize("changes", OTHERS, ids=lambda changes: next(iter(changes)))
+def test_blocks_of_another_search_are_not_taken_up(
+    tmp_path: Path, changes: dict[str, object]
+) -> None:
+    field, kept = noisy().isel(z=slice(2)), Kept(tmp_path)
+    pointwise(field, searching(), workers=Serial(), kept=kept)
+    alone = pointwise(field, searching(**changes), workers=Serial())
+    among = pointwise(field, searching(**changes), workers=Serial(), kept=kept)
+    assert bytes_of(among) == bytes_of(alone)
+
+
+def test_blocks_on_other_axes_are_not_taken_up(tmp_path: Path) -> None:
+    kept = Kept(tmp_path)
+    pointwise(parabolas(), searching(), workers=Serial(), kept=kept)
+    slower = parabolas().assign_coords(time=("time", 2.0 * T, {"units": "s"}))
+    result = pointwise(slower, searching(), workers=Serial(), kept=kept)
+    np.testing.assert_allclose(result["coef"].sel(term="u")[0, 0], -25.0 * R, rtol=1e-9)
+
+
+def test_a_block_is_held_under_its_own_key_alone(tmp_path: Path) -> None:
+    (block,) = blocks_of(parabolas(), 12)
+    Kept(tmp_path, "one").write(block, {"coef": np.ones(3)})
+    assert Kept(tmp_path, "one").holds(block)
+    assert list(Kept(tmp_path, "one").read(block)) == ["coef"]
+    assert not Kept(tmp_path, "two").holds(block)
+    assert Kept(tmp_path, "two").read(block) is None
+
+
 def test_a_damaged_block_is_computed_again(tmp_path: Path) -> None:
     kept = Kept(tmp_path)
     first = pointwise(noisy(), searching(), workers=Serial(), kept=kept, block_points=6)

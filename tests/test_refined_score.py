@@ -15,7 +15,7 @@ from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.refined import RefinedScore, _refined
-from ep2sindy.selection.rule import FLOOR, MAX_ERROR, selected
+from ep2sindy.selection.rule import FLOOR, MAX_ERROR
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra
 
@@ -64,7 +64,7 @@ def scores_by(rule: RefinedScore, fronts: list[ParetoFront]) -> list[np.ndarray]
 
 def picked(rule: RefinedScore, fronts: list[ParetoFront]) -> list[set[str]]:
     scores = scores_by(rule, fronts)
-    return [set(selected(f, s).terms) for f, s in zip(fronts, scores, strict=True)]
+    return [set(f.with_scores(s).best.terms) for f, s in zip(fronts, scores, strict=True)]
 
 
 def supports(system: System) -> list[set[str]]:
@@ -98,7 +98,7 @@ def test_the_truth_is_selected_from_exact_samples(system: System, n_samples: int
     run = system.trajectory().window(0, n_samples)
     fronts = fronts_of([run], system.model.library, next_to_truth(system, WRONG[system.name]))
     found = scores_by(RefinedScore(), fronts)
-    chosen = [selected(f, scores) for f, scores in zip(fronts, found, strict=True)]
+    chosen = [f.with_scores(scores).best for f, scores in zip(fronts, found, strict=True)]
     assert [set(c.terms) for c in chosen] == supports(system)
     assert max(scores.min() for scores in found) <= EXACT
 

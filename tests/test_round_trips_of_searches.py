@@ -14,7 +14,6 @@ from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.front import ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
-from ep2sindy.selection.rule import selected
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)
 SEARCHES = [ep.AdaptiveLasso(), ep.STLSQ(), ep.BestSubset(max_terms=4)]
@@ -66,7 +65,7 @@ def chosen(problem: RegressionRows, search: Search, rule: Any) -> dict[str, floa
     (scores,) = rule.scores([front])
     assert scores.shape == (len(front.candidates),)
     assert not np.isnan(scores).any()
-    return selected(front, scores).coef_by_term
+    return front.with_scores(scores).best.coef_by_term
 
 
 @pytest.mark.parametrize("search", SEARCHES, ids=lambda s: type(s).__name__)

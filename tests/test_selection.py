@@ -9,7 +9,7 @@ from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.criteria import EBIC, AICc, Knee, log_supports
-from ep2sindy.selection.rule import Selection, selected
+from ep2sindy.selection.rule import Selection
 from ep2sindy.systems.systems import lorenz
 
 BIC, LOG_KNEE = EBIC(gamma=0.0, coarsening=None), Knee(scale="log")
@@ -45,7 +45,7 @@ def front_of(errors: list[float], n_library: int) -> ParetoFront:
 
 def n_selected(rule: Selection, front: ParetoFront) -> int:
     (scores,) = rule.scores([front])
-    return selected(front, scores).n_terms
+    return front.with_scores(scores).best.n_terms
 
 
 def test_knee_distance_is_equation_9_of_the_thesis() -> None:
@@ -101,7 +101,7 @@ def test_the_log_knee_keeps_a_small_term_of_an_exact_law() -> None:
 
 def test_of_equal_scores_the_smallest_candidate_is_selected() -> None:
     front = front_of([1.0, 0.5, 0.4], 5)
-    assert selected(front, np.array([2.0, 1.0, 1.0])).n_terms == 1
+    assert front.with_scores(np.array([2.0, 1.0, 1.0])).best.n_terms == 1
 
 
 def noisy_front(n_rows: int = 200, *, seed: int = 0, scale: float = 1.0) -> ParetoFront:
@@ -174,7 +174,7 @@ def test_criteria_find_two_true_terms_in_white_noise(rule: Selection) -> None:
     for seed in range(40):
         front = noisy_front(seed=seed)
         (scores,) = rule.scores([front])
-        found.append(selected(front, scores).terms)
+        found.append(front.with_scores(scores).best.terms)
     assert all({"t0", "t1"} <= set(terms) for terms in found)
     # A needless term costs log 200 = 5.3 at the least, and chi-square exceeds that in 2.1 % of
     # cases: for four such terms in 40 fronts 3.4 times, give or take 1.8.
@@ -203,7 +203,7 @@ def test_criteria_keep_no_term_that_explains_rounding(
 ) -> None:
     truth = lorenz().model
     for front, scores in zip(exact_fronts, rule.scores(exact_fronts), strict=True):
-        assert set(selected(front, scores).terms) == set(truth.terms(front.equation))
+        assert set(front.with_scores(scores).best.terms) == set(truth.terms(front.equation))
 
 
 @pytest.mark.parametrize("rule", RULES, ids=repr)

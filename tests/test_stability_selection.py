@@ -6,7 +6,6 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.selection.criteria import Stability
-from ep2sindy.selection.rule import selected
 
 
 def candidate(inclusion: list[float]) -> Candidate:
@@ -36,7 +35,7 @@ def test_the_largest_candidate_of_stable_terms_is_selected(
 ) -> None:
     front = ParetoFront("x", [candidate(list(each)) for each in ((), *inclusions)])
     (scores,) = Stability(threshold=0.7).scores([front])
-    assert selected(front, scores).n_terms == n_terms
+    assert front.with_scores(scores).best.n_terms == n_terms
     expected = [-len(i) if min(i, default=1.0) >= 0.7 else 1.0 - min(i) for i in ([], *inclusions)]
     assert scores == pytest.approx(expected)
 

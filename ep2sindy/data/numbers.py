@@ -96,6 +96,10 @@ def zero_to_one(sizes: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
 def column_norms(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, " columns"]:
     """L2 norms of the columns, with one in place of zero.
 
-    Values must be of moderate size, since squares beyond 1e308 overflow.
+    High powers of densities do not overflow, since every column is divided by its largest value
+    before it is squared.
     """
-    return zero_to_one(np.linalg.norm(values, axis=0))
+    columns = np.abs(values.T, order="C")  # each column contiguous in memory
+    largest = zero_to_one(columns.max(axis=1, initial=0.0))
+    columns /= largest[:, None]
+    return zero_to_one(largest * np.sqrt(np.einsum("cr,cr->c", columns, columns)))

@@ -6,7 +6,8 @@ into one model.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,10 +17,10 @@ from scipy.linalg import block_diag
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation, binding, constraint
+from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
-from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit
 from ep2sindy.regression.weak import Weak
@@ -33,7 +34,7 @@ from ep2sindy.selection.rule import (
     support_of,
 )
 
-MAX_COMBINATIONS = 1_000_000  # most combinations to check for the terms of relations
+MAX_COMBINATIONS = 1_000_000  # most combinations of the fronts that relations tie together
 
 
 # For a correct equation chi-squared per row is 1 within its standard error, and a little more,
@@ -84,11 +85,12 @@ class NoiseTest:
     left: for each state, the residuals of its equation on rows. It is empty if no rows were tested:
     after a trajectory search, which tests whole trajectories, and for rules that judge free runs.
     misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
-    tested.
+    tested. tested: False if nothing was tested.
     """
 
     left: Mapping[str, LeftOver] = field(default_factory=dict)
     misfit: str = ""
+    tested: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,9 @@ class Choice:
     fronts: with the scores of the rule. chosen: for each front, the selected candidate. model: of
     the chosen terms; its coefficients may differ from the candidates' by weighting, constraints or
     refinement. note: how the rule decided; else empty. left: for each state, the residuals of the
-    final fit on rows whose noise is known; None if the model was not judged by rows.
+    final fit on rows whose noise is known; None if the model was not judged by rows. n_free: for
+    each state named by a relation that holds in the model, the number of free coefficients of its
+    equation.
     """
 
     fronts: Sequence[ParetoFront]
@@ -106,6 +110,7 @@ class Choice:
     model: SparseModel
     note: str = ""
     left: Mapping[str, LeftOver] | None = None
+    n_free: Mapping[str, int] = field(default_factory=dict)
 
 
 def choose(
@@ -121,19 +126,23 @@ def choose(
 
     Under relations, only combinations that have the terms of the relations count. The one of least
     summed score wins, and all equations are fitted at once.
-    Raises ValueError for relations that no combination has the terms for.
+    Raises ValueError for relations that no combination has the terms for, or that tie so many
+    states to each other that their combinations exceed a million.
     """
     library = fronts[0].rows.library
-    scored = score_by_rule(fronts, rule, progress)
+    with progress.stage(None, "", f"candidates by {rule.label}"):
+        scores = rule.scores(fronts)
+    scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
     if relations:
         place = _least_sum(scored, relations)
         support = support_of(scored, place)
-        held = constraint(library, support, binding(relations, support) or ())
+        bound = binding(relations, support) or ()
+        held = constraint(library, support, bound)
         problems = list(dict.fromkeys(front.rows for front in scored))
         model = constrained_fit(problems, held, units=units, provenance=provenance)
         won = [f.with_scores(_won(f.scores, int(k))) for f, k in zip(scored, place, strict=True)]
         best = [front.candidates[k] for front, k in zip(won, place, strict=True)]
-        return Choice(won, best, model, left={})
+        return Choice(won, best, model, left={}, n_free=_count_free(held, bound))
     best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
     model = assemble_model(library, fits, units=units, provenance=provenance)
@@ -162,55 +171,53 @@ def choose_by_runs(
     return Choice(scored, best, model, decision.note)
 
 
-def score_by_rule(
-    fronts: Sequence[ParetoFront], rule: Selection, progress: Progress
-) -> list[ParetoFront]:
-    """Fronts with the scores of a rule that judges single candidates."""
-    with progress.stage(None, "", f"candidates by {rule.label}"):
-        scores = rule.scores(fronts)
-    return [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
-
-
 def noise_test(
-    model: SparseModel,
-    runs: Sequence[Trajectory],
-    *,
-    left: Mapping[str, LeftOver] | None,
-    estimate: Estimate | None = None,
+    choice: Choice, runs: Sequence[Trajectory], *, estimate: Estimate | None = None
 ) -> NoiseTest:
-    """Test the residuals of a model against the noise, independently of the method that found it.
+    """Test the residuals of the chosen model against the noise of the samples.
 
-    left: for each state, the residuals of the final fit. A state without any is tested on weak rows
-    of the runs, with the model's coefficients; if there are no such rows, for example for a record
-    of a few samples, that state is not tested. None if a rule judged the model by running it: rows
-    then say nothing. estimate: the joint estimate of states and coefficients, which has tested
-    whole trajectories already.
+    A state that the final fit has tested on its own rows keeps that result. Any other state is
+    tested on weak rows of the runs, with the terms of the model. If relations hold in its equation,
+    the model's own coefficients are tested. Otherwise the terms are fitted again to the weak rows,
+    which are whitened, and that fit is tested: coefficients of a formulation that does not weigh
+    its rows are not. A state without such rows, for example for a record of a few samples, is not
+    tested. Nothing is tested if a rule judged the model by running it: rows then say nothing.
+    estimate: of states and coefficients together, which has tested whole trajectories already. It
+    counts only if the chosen model is its own.
     """
-    if estimate is not None:
-        return NoiseTest(misfit=estimate.misfit)
-    if left is None:
+    if estimate is not None and estimate.model is choice.model:
+        return NoiseTest(misfit=estimate.misfit, tested=True)
+    if choice.left is None:
         return NoiseTest()
-    unknown = [state for state in model.states if state not in left]
-    found = {**left, **(_left_of_weak_rows(model, runs, unknown) if unknown else {})}
-    ordered = {state: found[state] for state in model.states if state in found}
-    return NoiseTest(ordered, _misfit(ordered))
+    states = choice.model.states
+    unknown = [state for state in states if state not in choice.left]
+    found = {**choice.left, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}
+    ordered = {state: found[state] for state in states if state in found}
+    return NoiseTest(ordered, _misfit(ordered, choice.n_free), tested=bool(ordered))
 
 
 def _left_of_weak_rows(
-    model: SparseModel, runs: Sequence[Trajectory], states: Sequence[str]
+    choice: Choice, runs: Sequence[Trajectory], states: Sequence[str]
 ) -> dict[str, LeftOver]:
-    """Residuals of some equations on weak rows; empty if the samples are too few for rows."""
+    """Residuals of some equations on weak rows, as far as their rows can be made and whitened."""
+    model, left = choice.model, {}
     try:
         # Same result as with the whole library, at a fraction of the cost.
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
         used[0] |= not used.any()  # a library needs a term
         form, rng = Weak(split=RandomSplit(0.0)), np.random.default_rng(0)
         rows = form.assemble(runs, model.library.take(used), rng=rng)
-        found = {problem.equations[0]: problem for problem in rows}
-        fits = [reweight(found[state], _fit_in(model, state)) for state in states]
     except (ValueError, np.linalg.LinAlgError):
         return {}
-    return {fit.equation: fit.left for fit in fits if fit.left is not None}
+    problems = {problem.equations[0]: problem for problem in rows}
+    for state in states:
+        problem, fit = problems[state], _fit_in(model, state)
+        with suppress(ValueError, np.linalg.LinAlgError):
+            if state in choice.n_free:
+                left[state] = _left_of_fit(problem, fit, n_free=choice.n_free[state])
+            elif (tested := reweight(problem, fit).left) is not None:
+                left[state] = tested
+    return left
 
 
 def _fit_in(model: SparseModel, state: str) -> EquationFit:
@@ -219,12 +226,32 @@ def _fit_in(model: SparseModel, state: str) -> EquationFit:
     return EquationFit(state, tuple(terms), np.array(list(terms.values())))
 
 
-def _misfit(left: Mapping[str, LeftOver]) -> str:
-    """Sentence on the equations whose residuals exceed the noise; empty if there are none."""
+def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, int]:
+    """For each state that relations name, the number of free coefficients of its equation."""
+    named = {state for relation in relations for _, state, _ in relation.factors}
+    owners = np.array([state for state, _ in held.coefficients])
+    return {
+        state: int(np.linalg.matrix_rank(held.C[owners == state]))
+        for state in held.states
+        if state in named
+    }
+
+
+def _misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
+    """Sentence on the equations whose residuals exceed the noise; empty if there are none.
+
+    related: states whose coefficients obey relations.
+    """
     more = {state: each.chi_squared for state, each in left.items() if not each.leaves_noise}
     if not more:
         return ""
     parts = ", ".join(f"{state}' ({value:.3g} times its size)" for state, value in more.items())
+    if set(more) & set(related):
+        return (
+            f"the model leaves more than white noise of {parts} under its relations: intervals are "
+            "not given; check the relations, weigh the rows (WeightedWeak()), add terms or states, "
+            "or judge the model by free run"
+        )
     return (
         f"no equation of this library leaves white noise of {parts}: intervals are not given; "
         "add terms or states, or judge the model by free run"
@@ -265,37 +292,89 @@ def reweight(
     If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
     the truth.
     """
+    theta, target, scale = _whitened_terms(problem, candidate, n_steps=n_steps)
+    upper = np.linalg.qr(theta, mode="r")
+    root = np.linalg.inv(upper) * scale[:, None]
+    fitted = np.linalg.lstsq(theta, target, rcond=None)[0]
+    left = _compare_with_noise(target - theta @ fitted, n_free=len(scale))
+    return EquationFit(
+        equation=candidate.equation,
+        terms=candidate.terms,
+        coef=fitted * scale,
+        covariance=root @ root.T if left.leaves_noise else None,
+        left=left,
+    )
+
+
+def _left_of_fit(problem: RegressionRows, fit: EquationFit, *, n_free: int) -> LeftOver:
+    """Residuals of a fit with its own coefficients, whitened about a free fit of its terms.
+
+    The free fit is as close to the data as these terms allow, so the samples are corrected by it,
+    not by coefficients that the data may contradict. n_free: number of free coefficients.
+    """
+    free = fit_support(problem, fit.equation, fit.terms)
+    theta, target, scale = _whitened_terms(problem, free, n_steps=8)
+    order = [fit.terms.index(name) for name in free.terms]
+    return _compare_with_noise(target - theta @ (fit.coef[order] / scale), n_free=n_free)
+
+
+def _whitened_terms(
+    problem: RegressionRows, candidate: Candidate | EquationFit, *, n_steps: int
+) -> tuple[
+    Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
+]:
+    """Whitened columns of a candidate's terms, the whitened target, and coefficients' scales."""
     terms = np.isin(problem.term_names, candidate.terms)
     scale = problem.coef_scale(0)
     coef = np.zeros(len(terms))
     order = [problem.library.index(name) for name in candidate.terms]
     coef[order] = candidate.coef / scale[order]
     rows = whitened_rows(problem, terms, coef, n_steps=n_steps)
-    theta = rows.theta[:, order]
-    upper = np.linalg.qr(theta, mode="r")
-    root = np.linalg.inv(upper) * scale[order, None]
-    fitted = np.linalg.lstsq(theta, rows.target, rcond=None)[0]
-    left = rows.target - theta @ fitted
-    freedom = max(len(left) - len(order), 1)
+    return rows.theta[:, order], rows.target, scale[order]
+
+
+def _compare_with_noise(left: Float[np.ndarray, " rows"], *, n_free: int) -> LeftOver:
+    """Compare whitened residuals with white noise of variance 1; n_free: fitted coefficients."""
+    freedom = max(len(left) - n_free, 1)
     chi_squared = float(left @ left) / freedom
     leaves_noise = chi_squared <= MAX_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
     autocorrelation = float(left[1:] @ left[:-1]) / max(float(left @ left), SMALLEST)
-    return EquationFit(
-        equation=candidate.equation,
-        terms=candidate.terms,
-        coef=fitted * scale[order],
-        covariance=root @ root.T if leaves_noise else None,
-        left=LeftOver(chi_squared, autocorrelation, bool(leaves_noise)),
-    )
+    return LeftOver(chi_squared, autocorrelation, bool(leaves_noise))
 
 
 def _least_sum(
     fronts: Sequence[ParetoFront], relations: Sequence[Relation]
 ) -> Int[np.ndarray, " fronts"]:
-    """The combination of least summed score among those that have the relations' terms."""
-    places = admissible(fronts, combinations(fronts, MAX_COMBINATIONS), relations)
-    sums = np.sum([f.scores[column] for f, column in zip(fronts, places.T, strict=True)], axis=0)
-    return places[int(np.argmin(sums))]
+    """The combination of least summed score among those that have the relations' terms.
+
+    Only fronts that relations tie to each other are combined, since the other scores can be chosen
+    one by one.
+    """
+    place = np.array([int(np.argmin(front.scores)) for front in fronts])
+    for states in _tied_states(relations):
+        tied = [k for k, front in enumerate(fronts) if front.equation in states]
+        some = [fronts[k] for k in tied]
+        own = [r for r in relations if any(state in states for _, state, _ in r.factors)]
+        every = combinations(
+            some,
+            MAX_COMBINATIONS,
+            use="compared under relations",
+            way_out="let the relations tie fewer states to each other",
+        )
+        places = admissible(some, every, own)
+        sums = np.sum([f.scores[column] for f, column in zip(some, places.T, strict=True)], axis=0)
+        place[tied] = places[int(np.argmin(sums))]
+    return place
+
+
+def _tied_states(relations: Sequence[Relation]) -> list[set[str]]:
+    """Sets of states that relations tie to each other, directly or through a third state."""
+    sets: list[set[str]] = []
+    for relation in relations:
+        tied = {state for _, state, _ in relation.factors}
+        tied = tied.union(*(other for other in sets if other & tied))
+        sets = [other for other in sets if not other & tied] + [tied]
+    return sets
 
 
 def _won(scores: Float[np.ndarray, " candidates"], winner: int) -> Float[np.ndarray, " candidates"]:

@@ -73,7 +73,7 @@ class Discovery:
     def misfit(self) -> str:
         """The reason why the model does not explain the data to within their noise.
 
-        Empty if it does, or if the noise is not propagated into the rows.
+        Empty if it does, or if the model was not tested: `noise_test.tested` is then False.
         """
         return self.noise_test.misfit
 
@@ -133,7 +133,7 @@ def discover(
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     found = method.identify(trajectories, library, known, rng=rng, progress=watch)
     choice = found.choice
-    test = noise_test(choice.model, trajectories, left=choice.left, estimate=found.estimate)
+    test = noise_test(choice, trajectories, estimate=found.estimate)
     # If the residuals of the rows exceed the noise, intervals would not cover the truth.
     withheld = bool(test.left and test.misfit)
     return Discovery(

@@ -6,9 +6,10 @@ can be continued.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from zipfile import BadZipFile
@@ -23,11 +24,15 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression, check_kind
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
-from ep2sindy.runtime.files import WriteError, replacing, sweep
+from ep2sindy.runtime.files import WriteError, fingerprint, replacing, sweep
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 
 NO_FIT = "no_fit"
+
+KEY = "key"  # of the arrays in the file of a finished block, the one that says what they depend on
+
+PACKAGE = Path(__file__).resolve().parents[1]
 
 STATUSES = ("fitted", "no_plasma", "missing_samples", "too_little_variation", NO_FIT)
 
@@ -83,13 +88,16 @@ def pointwise(
     equation; status per point. If the status is not 0, the others are NaN. The attribute no_fit
     holds a reason why a fit failed, if one did.
     If the field is opened lazily, only the current block is in memory.
-    kept: store of finished blocks, from which an interrupted run is continued. progress: True shows
-    a bar; a function is called with the number of points of every finished block; see `Progress`.
+    kept: store of finished blocks, from which an interrupted run of the same search is continued.
+    progress: True shows a bar; a function is called with the number of points of every finished
+    block; see `Progress`.
     Raises ValueError for a field without space, a variable it lacks, or, with the first reason, if
     no point could be fitted.
     """
     _check(field, search)
     part = field[list(search.variables)]
+    if kept and kept.key is None:
+        kept = replace(kept, key=search_key(part, search))
     blocks = blocks_of(part, block_points)
     result = _empty(part, search)
     n_points = sum(block.n_points for block in blocks)
@@ -100,6 +108,21 @@ def pointwise(
     if not (result["status"] == 0).any():
         raise ValueError(f"no point could be fitted: {_why_none(result)}")
     return result
+
+
+def search_key(field: xr.Dataset, search: PointSearch) -> str:
+    """Hash of the search, the axes of the field, and the code of the package."""
+    axes = [axis for axis in ("time", *SPACE) if axis in field.dims]
+    decisive = {
+        "states": list(search.states),
+        "terms": list(search.library.names),
+        "functions": repr(search.library.functions),
+        "method": repr(search.method),
+        "least_variation": search.least_variation,
+        "seed": search.seed,
+        "axes": {axis: grid_points(field, axis).tolist() for axis in axes},
+    }
+    return fingerprint(json.dumps(decisive), sources=PACKAGE)
 
 
 def _search_blocks(
@@ -332,29 +355,41 @@ def blocks_of(field: xr.Dataset, n_points: int) -> list[Block]:
 
 @dataclass(frozen=True)
 class Kept:
-    """Store of finished blocks in a folder; each file is complete or absent."""
+    """Store of finished blocks in a folder; each file is complete or absent.
+
+    key: of all that a result depends on, stored with every block; a block of another key counts as
+    absent, and is replaced. None: `pointwise` takes the key of its search and of the field's axes
+    (`search_key`), which does not look at the values of the field: give every field its own folder.
+    """
 
     folder: Path
+    key: str | None = None
 
     def __post_init__(self) -> None:
         sweep(self.folder)
 
     def holds(self, block: Block) -> bool:
-        return self._path(block).exists()
+        """True if the block is finished under this key."""
+        return self._read(block, names=[KEY]) is not None
 
     def read(self, block: Block) -> dict[str, np.ndarray] | None:
-        """Results of a finished block, or None if there are none that can be read."""
+        """Results of a finished block, or None if there are none of this key that can be read."""
+        return self._read(block)
+
+    def _read(self, block: Block, names: Sequence[str] = ()) -> dict[str, np.ndarray] | None:
+        """Some arrays of a finished block, or all, but for its key; None as in `read`."""
         try:
             with np.load(self._path(block), allow_pickle=False) as stored:
-                return dict(stored)
-        except (OSError, ValueError, EOFError, BadZipFile):
+                found = {name: stored[name] for name in names or stored.files}
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
             return None
+        return found if str(found.pop(KEY, "")) == (self.key or "") else None
 
     def write(self, block: Block, done: Mapping[str, np.ndarray]) -> None:
         """Store a finished block. Raises OSError, naming the way out, if writing fails."""
         try:
             with replacing(self._path(block)) as temporary:
-                np.savez(temporary, **done)  # type: ignore[arg-type]
+                np.savez(temporary, **done, **{KEY: np.array(self.key or "")})  # type: ignore[arg-type]
         except WriteError as error:
             raise OSError(
                 f"a finished block must be kept on disk: writing to {self.folder} failed with "

@@ -24,7 +24,7 @@ from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import covariance_in, names_in, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, point_label
-from ep2sindy.operating.shared_support import JointFront, SharedDiscovery
+from ep2sindy.operating.shared_support import SharedDiscovery, SharedFront
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
@@ -360,7 +360,7 @@ class _Tied:
 
 
 def _tied(
-    front: JointFront,
+    front: SharedFront,
     shared: SharedDiscovery,
     law_at: Mapping[str, Float[np.ndarray, " functions"]],
 ) -> _Tied:

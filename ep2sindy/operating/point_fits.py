@@ -337,7 +337,7 @@ def _free_rows(
 
 
 @dataclass(frozen=True, eq=False)
-class JointResult:
+class SharedResult:
     """Result of one search over all points that oscillate.
 
     fitted: for each point that oscillates, the support with the point's own coefficients; None at
@@ -359,7 +359,7 @@ def search_shared(
     *,
     rng: np.random.Generator,
     progress: Progress = SILENT,
-) -> JointResult | None:
+) -> SharedResult | None:
     """Search all points that oscillate at once; None for fewer than two of them.
 
     law: functions of the points' parameters that tie the coefficients. Also None for a search that
@@ -391,7 +391,7 @@ def search_shared(
         reason = str(error)
     labels = [point.label for point in points]
     fitted = [_fitted(found, label) if label in used else None for label in labels]
-    return JointResult(found, fitted, tied, reason)
+    return SharedResult(found, fitted, tied, reason)
 
 
 def _fitted(found: SharedDiscovery, label: str) -> Fitted:

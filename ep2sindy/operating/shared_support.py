@@ -1,4 +1,4 @@
-"""Joint search: one support for all operating points, with free coefficients at each."""
+"""Shared search: one support for all operating points, with free coefficients at each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
 
 @dataclass(frozen=True, eq=False)
-class JointFront:
+class SharedFront:
     """The best supports of every size for one equation at all points, the empty one first.
 
     errors: (supports,), geometric mean over the points of 1 - R2 (on held-out rows, if any); the
@@ -41,13 +41,13 @@ class JointFront:
 
 @dataclass(frozen=True, eq=False)
 class SharedDiscovery:
-    """Result of a joint search: fronts, scores and supports by state, and models by point.
+    """Result of a shared search: fronts, scores and supports by state, and models by point.
 
     scores: for each state, one per support, summed over the points; the lowest is chosen.
     ambiguities: for each point, terms that its data cannot tell apart.
     """
 
-    fronts: Mapping[str, JointFront] = field(repr=False)
+    fronts: Mapping[str, SharedFront] = field(repr=False)
     scores: Mapping[str, Float[np.ndarray, " supports"]] = field(repr=False)
     chosen: Mapping[str, tuple[str, ...]]
     models: Mapping[str, SparseModel] = field(repr=False)
@@ -88,7 +88,7 @@ def discover_shared(
         p: method.formulation.assemble(points[p], library, rng=rng)
         for p in count_pieces(watch, sorted(points), "point", "rows of the regression")
     }
-    fronts = _joint_fronts(problems, search, method.depth, watch)
+    fronts = _shared_fronts(problems, search, method.depth, watch)
     scores = _summed_scores(list(fronts.values()), method.selection, library, points)
     best = {state: int(np.argmin(each)) for state, each in zip(fronts, scores, strict=True)}
     provenance = method.provenance | {"joint": ", ".join(points)}
@@ -105,20 +105,20 @@ def discover_shared(
     )
 
 
-def _joint_fronts(
+def _shared_fronts(
     problems: Mapping[str, Sequence[RegressionRows]],
     search: BestSubset,
     depth: int,
     progress: Progress,
-) -> dict[str, JointFront]:
-    """Joint search for every equation. problems: for each point, of the same structure."""
+) -> dict[str, SharedFront]:
+    """Shared search for every equation. problems: for each point, of the same structure."""
     equations = [
         (k, equation)
         for k, problem in enumerate(next(iter(problems.values())))
         for equation in problem.equations
     ]
     return {
-        equation: _joint_front(
+        equation: _shared_front(
             {p: parts[k] for p, parts in problems.items()}, equation, search, depth
         )
         for k, equation in count_pieces(progress, equations, "equation", "search of all points")
@@ -129,11 +129,11 @@ def _search_of(method: Regression) -> BestSubset:
     """The method's search, if it can weigh all points at once."""
     if not isinstance(method.search, BestSubset):
         raise ValueError(
-            f"a joint search must weigh all points at once: {method.search} cannot; use BestSubset"
+            f"a shared search must weigh all points at once: {method.search} cannot; use BestSubset"
         )
     if method.bootstraps.n:
         raise ValueError(
-            f"a joint search has no bootstraps: {method.bootstraps} came; use Bootstraps(n=0)"
+            f"a shared search has no bootstraps: {method.bootstraps} came; use Bootstraps(n=0)"
         )
     return method.search
 
@@ -141,7 +141,7 @@ def _search_of(method: Regression) -> BestSubset:
 def _models(
     points: Mapping[str, Sequence[Trajectory]],
     library: Library,
-    fronts: Mapping[str, JointFront],
+    fronts: Mapping[str, SharedFront],
     best: Mapping[str, int],
     provenance: Mapping[str, str],
 ) -> dict[str, SparseModel]:
@@ -164,7 +164,7 @@ def _check_points(points: Mapping[str, Sequence[Trajectory]], library: Library) 
     if not points or not all(points.values()):
         empty = [point for point, runs in points.items() if not runs]
         raise ValueError(
-            "a joint search needs operating points with a trajectory each: "
+            "a shared search needs operating points with a trajectory each: "
             + (f"{empty} came without" if empty else "no point came")
         )
     first, reference = next((point, runs[0]) for point, runs in points.items())
@@ -177,16 +177,16 @@ def _check_points(points: Mapping[str, Sequence[Trajectory]], library: Library) 
             ) from error
 
 
-def _joint_front(
+def _shared_front(
     problems: Mapping[str, RegressionRows], equation: str, search: BestSubset, depth: int
-) -> JointFront:
+) -> SharedFront:
     """Search the Gram matrices of all points at once, and fit the supports at each point."""
     any_problem = next(iter(problems.values()))
     k = any_problem.equations.index(equation)
     grams = [problem.train_gram for problem in problems.values()]
     # A term that repeats another at one point may stand for it there, if they differ elsewhere.
     usable = np.any([usable_terms(problem) for problem in problems.values()], axis=0)
-    masks = search.joint_supports(
+    masks = search.shared_supports(
         np.stack([gram.xx[0] * usable[:, None] * usable for gram in grams]),
         np.stack([gram.xy[0, k] * usable for gram in grams]),
         np.array([gram.yy[0, k] for gram in grams]),
@@ -199,7 +199,7 @@ def _joint_front(
     errors = np.exp(np.log(np.maximum(by_point, ROUNDING)).mean(axis=0))
     order = front_order(masks.sum(axis=1), errors, depth=depth)
     names = np.array(any_problem.term_names)
-    return JointFront(
+    return SharedFront(
         equation=equation,
         supports=tuple(tuple(names[mask].tolist()) for mask in masks[order]),
         errors=errors[order],
@@ -222,7 +222,7 @@ def _keep_determined(
 
 
 def _summed_scores(
-    fronts: Sequence[JointFront],
+    fronts: Sequence[SharedFront],
     selection: Selection | SystemSelection,
     library: Library,
     runs: Mapping[str, Sequence[Trajectory]],

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.regression.ambiguity import largest_support, usable_terms
-from ep2sindy.regression.gram_fits import solve_masks
+from ep2sindy.regression.gram_fits import explained_squares, fit_masks
 from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.regression.searches import Search
 from ep2sindy.runtime.progress import Advance, nothing
@@ -145,9 +145,8 @@ class Resamples:
             if not len(same_size):
                 same_size = (support & self.at_hand[k])[None]
             xx, xy = self.xx[k], self.xy[k, equation]
-            fits = solve_masks(xx, np.where(same_size, xy, 0.0), same_size)
-            explained = (fits * (2.0 * xy - fits @ xx)).sum(axis=1)
-            coef[k] = fits[int(np.argmax(explained))] * self.scale[k]
+            fits = fit_masks(xx, xy, same_size)
+            coef[k] = fits[int(np.argmax(explained_squares(fits, xx, xy)))] * self.scale[k]
         return coef
 
 

@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.regression.gram_fits import solve_masks
+from ep2sindy.data.numbers import column_norms
+from ep2sindy.regression.gram_fits import explained_squares, fit_masks
 from ep2sindy.regression.searches import AdaptiveLasso
 
 
@@ -57,15 +57,16 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not 0.0 < self.tolerance < 1.0:
             raise ValueError(f"tolerance must lie in (0, 1): {self.tolerance} came")
         X, y = validate_data(self, X, y, dtype=np.float64, y_numeric=True, multi_output=True)
-        columns, column_norms = _unit_columns(X)
-        targets, target_norms = _unit_columns(y.astype(np.float64).reshape(len(y), -1))
+        targets = y.astype(np.float64).reshape(len(y), -1)
+        term_norms, target_norms = column_norms(X), column_norms(targets)
+        columns, targets = X / term_norms, targets / target_norms
         xx, xy = columns.T @ columns, targets.T @ columns
         support = np.array([self._choose(search, xx, products, len(X)) for products in xy])
         coef = np.zeros(support.shape)
         for mask, row, target in zip(support, coef, targets.T, strict=True):
             # Solved on the rows, since the Gram matrix squares their condition number.
             row[mask] = np.linalg.lstsq(columns[:, mask], target, rcond=None)[0]
-        coef *= target_norms[:, None] / column_norms
+        coef *= target_norms[:, None] / term_norms
         self.coef_ = coef if y.ndim == 2 else coef[0]
         self.support_ = support if y.ndim == 2 else support[0]
         self.intercept_ = 0.0
@@ -87,20 +88,10 @@ class AdaptiveLassoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return masks[np.nanargmin(bic)]
 
 
-def _unit_columns(
-    values: Float[np.ndarray, "rows columns"],
-) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " columns"]]:
-    """Columns divided by their L2 norms, and the norms; the norm of a zero column is set to 1."""
-    # Unlike squares, hypot does not overflow for high powers of densities.
-    norms = zero_to_one(np.hypot.reduce(np.abs(values), axis=0))
-    return values / norms, norms
-
-
 def _residual_shares(
     xx: Float[np.ndarray, "terms terms"],
     xy: Float[np.ndarray, " terms"],
     masks: Bool[np.ndarray, "supports terms"],
 ) -> Float[np.ndarray, " supports"]:
     """Least-squares residual, squared, of a target of norm 1; NaN for dependent terms."""
-    coef = solve_masks(xx, np.where(masks, xy, 0.0), masks)
-    return 1.0 - (coef * (2.0 * xy - coef @ xx)).sum(axis=1)
+    return 1.0 - explained_squares(fit_masks(xx, xy, masks), xx, xy)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.bootstraps import Supports
-from ep2sindy.regression.gram_fits import solve_masks
+from ep2sindy.regression.gram_fits import explained_squares, fit_masks, solve_masks
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 
@@ -263,8 +263,8 @@ def _explain(
     """
     train = problem.train_gram
     judge = problem.test_gram if problem.test.any() else train
-    coef = solve_masks(train.xx[0], np.where(masks, train.xy[0, equation], 0.0), masks)
-    return (coef * (2.0 * judge.xy[0, equation] - coef @ judge.xx[0])).sum(axis=1)
+    coef = fit_masks(train.xx[0], train.xy[0, equation], masks)
+    return explained_squares(coef, judge.xx[0], judge.xy[0, equation])
 
 
 def _best_of_each_size(
@@ -306,7 +306,7 @@ def _fit(
     gram = problem.train_gram
     xx = gram.xx[0]
     theta, target = problem.train_theta, problem.train_target(equation)
-    coef = solve_masks(xx, np.where(masks, gram.xy[0, equation], 0.0), masks)
+    coef = fit_masks(xx, gram.xy[0, equation], masks)
     for _ in range(2):
         residual = target - coef @ theta.T
         coef = coef + solve_masks(xx, residual @ theta, masks)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
-from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.runtime.arrays import read_only
@@ -101,11 +101,11 @@ class RegressionRows:
     @cached_property
     def theta_scale(self) -> Float[np.ndarray, " terms"]:
         """L2 norm of each column over the training rows; 1 for a column of zeros."""
-        return _column_norms(self.theta[~self.test])
+        return column_norms(self.theta[~self.test])
 
     @cached_property
     def target_scale(self) -> Float[np.ndarray, " equations"]:
-        return _column_norms(self.target[~self.test])
+        return column_norms(self.target[~self.test])
 
     @cached_property
     def train_rows(self) -> Float[np.ndarray, "train columns"]:
@@ -195,14 +195,6 @@ class RegressionRows:
             xy=products[:, n:, :n],
             yy=products.diagonal(axis1=1, axis2=2)[:, n:],
         )
-
-
-def _column_norms(values: np.ndarray) -> np.ndarray:
-    """L2 norms of columns, without overflow for high powers of densities."""
-    columns = np.abs(values.T, order="C")  # each column contiguous in memory
-    largest = zero_to_one(columns.max(axis=1))
-    columns /= largest[:, None]
-    return zero_to_one(largest * np.sqrt(np.einsum("cr,cr->c", columns, columns)))
 
 
 @runtime_checkable

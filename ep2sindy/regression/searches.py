@@ -15,6 +15,10 @@ from ep2sindy.regression.search_kernels import (
 )
 from ep2sindy.trust.memory import check_memory
 
+Gram = Float[np.ndarray, "terms terms"]
+Products = Float[np.ndarray, " terms"]
+Masks = Bool[np.ndarray, "supports terms"]
+
 
 @runtime_checkable
 class Search(Protocol):
@@ -24,12 +28,7 @@ class Search(Protocol):
     A column of zeros is a term that is not available, and must not appear in a support.
     """
 
-    def supports(
-        self,
-        xx: Float[np.ndarray, "terms terms"],
-        xy: Float[np.ndarray, " terms"],
-        yy: float,
-    ) -> Bool[np.ndarray, "supports terms"]: ...
+    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks: ...
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,7 @@ class AdaptiveLasso:
             raise ValueError(f"gamma must be positive: {self.gamma} came")
         _check_max_terms(self.max_terms)
 
-    def supports(
-        self,
-        xx: Float[np.ndarray, "terms terms"],
-        xy: Float[np.ndarray, " terms"],
-        yy: float,
-    ) -> Bool[np.ndarray, "supports terms"]:
+    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
         return adaptive_lasso_supports(xx, xy, self.gamma, self.max_terms or len(xy))
 
 
@@ -81,12 +75,7 @@ class STLSQ:
             )
         _check_max_terms(self.max_terms)
 
-    def supports(
-        self,
-        xx: Float[np.ndarray, "terms terms"],
-        xy: Float[np.ndarray, " terms"],
-        yy: float,
-    ) -> Bool[np.ndarray, "supports terms"]:
+    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
         thresholds = np.sqrt(yy) * np.geomspace(self.lowest, self.highest, self.n_thresholds)
         masks = thresholded_supports(xx, xy, thresholds)
         return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
@@ -109,20 +98,15 @@ class BestSubset:
         if self.n_best < 1:
             raise ValueError(f"n_best must be at least 1: {self.n_best} came")
 
-    def supports(
-        self,
-        xx: Float[np.ndarray, "terms terms"],
-        xy: Float[np.ndarray, " terms"],
-        yy: float,
-    ) -> Bool[np.ndarray, "supports terms"]:
-        return self.joint_supports(xx[None], xy[None], np.array([yy]))
+    def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
+        return self.shared_supports(xx[None], xy[None], np.array([yy]))
 
-    def joint_supports(
+    def shared_supports(
         self,
         xx: Float[np.ndarray, "problems terms terms"],
         xy: Float[np.ndarray, "problems terms"],
         yy: Float[np.ndarray, " problems"],
-    ) -> Bool[np.ndarray, "supports terms"]:
+    ) -> Masks:
         """Supports common to several problems, with separate coefficients in each.
 
         The best supports minimise the product of residuals. If every problem has Gaussian errors

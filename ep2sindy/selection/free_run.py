@@ -26,8 +26,8 @@ from ep2sindy.selection.rule import (
     MAX_ERROR,
     Decision,
     admissible,
+    combination_scores,
     combinations,
-    joint_scores,
 )
 from ep2sindy.selection.systems import (
     Fold,
@@ -165,7 +165,7 @@ class FreeRunScore:
         errors = np.array([trial.error for trial in trials])
         winner, model, note = self._winner(records, cycles, trials, progress)
         limit = max(1.0, float(errors[winner]))
-        scores = joint_scores(fronts, places, errors, limit=limit, winner=winner)
+        scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
         return Decision(scores, model, note)
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
@@ -189,12 +189,12 @@ class FreeRunScore:
             return trials
         some = [systems[k] for k in whole]
         folds = folds_of(records.runs, self.n_folds)
-        tried = [self._tried(records, cycles, some, f, progress) for f in folds]
+        tried = [self._try_fold(records, cycles, some, f, progress) for f in folds]
         for k, worst in zip(whole, np.max(tried, axis=0), strict=True):
             trials[k] = Trial(systems[k], *worst.tolist())
         return trials
 
-    def _tried(
+    def _try_fold(
         self,
         records: Records,
         cycles: Sequence[Cycle],
@@ -228,11 +228,11 @@ class FreeRunScore:
         judged = []
         with progress.stage(None, "run", "free runs over the fold") as advance:
             for t, paths, cycle in paths_over(ensemble, fold.held, records, cycles, self.n_starts):
-                judged.append(self._judged(t, paths, cycle, first.states))
+                judged.append(self._judge(t, paths, cycle, first.states))
                 advance(len(paths))
         return np.column_stack([np.max(judged, axis=0), refined.loss])
 
-    def _judged(
+    def _judge(
         self,
         t: Float[np.ndarray, " samples"],
         paths: Float[np.ndarray, "systems samples n_states"],
@@ -276,7 +276,7 @@ class FreeRunScore:
                 n_reweights=0,
                 seed=self.seed,
             )
-            run = self._confirmed(model, records, cycles)
+            run = self._confirm(model, records, cycles)
             lives = run.verdict is Verdict.LIVES
             attracts = lives and _attracts(run, cycles)
             pulls = attracts and (resting is None or trials[k].loss < GAIN * resting)
@@ -295,7 +295,7 @@ class FreeRunScore:
     def _rank(self, trial: Trial) -> tuple[bool, int, float]:
         return trial.error > self.margin, trial.system.n_terms, trial.waveform
 
-    def _confirmed(self, model: SparseModel, records: Records, cycles: Sequence[Cycle]) -> FreeRun:
+    def _confirm(self, model: SparseModel, records: Records, cycles: Sequence[Cycle]) -> FreeRun:
         """Free run over the longest record, from the start of its cycle."""
         pairs = zip(records.runs, cycles, strict=True)
         run, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))

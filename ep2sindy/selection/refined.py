@@ -23,8 +23,8 @@ from ep2sindy.selection.rule import (
     MAX_ERROR,
     Decision,
     admissible,
+    combination_scores,
     combinations,
-    joint_scores,
     smallest,
 )
 from ep2sindy.selection.systems import Records, TrialSystem, budget, records_of, systems_of
@@ -92,7 +92,7 @@ class RefinedScore:
         places = combinations(fronts, self.max_combinations)
         systems = systems_of(fronts, places, library, runs)
         errors, limit = self._judge(systems, records_of(fronts, runs), SILENT)
-        return joint_scores(fronts, places, errors, limit=limit)
+        return combination_scores(fronts, places, errors, limit=limit)
 
     def decide(
         self,
@@ -112,7 +112,7 @@ class RefinedScore:
         systems = systems_of(fronts, places, library, runs, relations)
         errors, limit = self._judge(systems, records, progress)
         winner = smallest(fronts, places, errors, limit=limit)
-        scores = joint_scores(fronts, places, errors, limit=limit, winner=winner)
+        scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
         with progress.stage(None, "", "the best system refined on all data"):
             found = systems[winner].refined_on_all(runs)
         return Decision(scores, found, self.label)

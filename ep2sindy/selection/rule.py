@@ -14,7 +14,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, binding
 from ep2sindy.model.model import SparseModel
-from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
 
 # Least residual squares, as a share of the target's squares: below this value a criterion would
@@ -37,11 +37,6 @@ class Selection(Protocol):
     def label(self) -> str: ...
 
     def scores(self, fronts: Sequence[ParetoFront]) -> list[Float[np.ndarray, " _candidates"]]: ...
-
-
-def selected(front: ParetoFront, scores: Float[np.ndarray, " candidates"]) -> Candidate:
-    """The candidate of least score; of several, the one with fewest terms."""
-    return front.with_scores(scores).best
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,19 +92,27 @@ def score_candidates(
 
 
 def combinations(
-    fronts: Sequence[ParetoFront], most: int
+    fronts: Sequence[ParetoFront],
+    most: int,
+    *,
+    use: str = "integrated",
+    way_out: str = "raise max_combinations",
 ) -> Int[np.ndarray, "combinations fronts"]:
-    """Every choice of one candidate per front, by index. Raises ValueError for more than `most`."""
+    """Every choice of one candidate per front, by index.
+
+    use, way_out: of the caller, for the error.
+    Raises ValueError for more than `most`.
+    """
     counts = [len(front.candidates) for front in fronts]
     if prod(counts) > most:
         raise ValueError(
-            f"at most {most} combinations of candidates are integrated: {counts} candidates make "
-            f"{prod(counts)}; lower depth or the search's max_terms, or raise max_combinations"
+            f"at most {most} combinations of candidates are {use}: {counts} candidates make "
+            f"{prod(counts)}; lower depth or the search's max_terms, or {way_out}"
         )
     return np.indices(counts).reshape(len(counts), -1).T
 
 
-def joint_scores(
+def combination_scores(
     fronts: Sequence[ParetoFront],
     places: Int[np.ndarray, "combinations fronts"],
     errors: Float[np.ndarray, " combinations"],

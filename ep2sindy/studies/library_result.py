@@ -48,6 +48,11 @@ FITS = (
     "an exact trajectory is likelier than one that leaves the model."
 )
 
+REPLACED = (
+    "This section is about the likeliest model of the search. The rule chose another one, which "
+    "was not tested against the noise."
+)
+
 
 @dataclass(frozen=True, eq=False)
 class LibraryResult:
@@ -91,7 +96,8 @@ class LibraryResult:
     def sections(self, name: str, data: Trajectory) -> list[Section]:
         found = [_candidates_section(name, self, data.clock)]
         if (estimate := self.discovery.estimate) is not None:
-            found.append(estimate_section(name, estimate, data))
+            of_model = self.discovery.noise_test.tested
+            found.append(estimate_section(name, estimate, data, of_model=of_model))
         return found
 
     def summary(self) -> dict[str, Any]:
@@ -315,10 +321,14 @@ def _published_summary(run: FreeRun, refitted: Mapping[str, Candidate]) -> dict[
     }
 
 
-def estimate_section(name: str, found: Estimate, data: Trajectory) -> Section:
-    """Section on the noise of the samples, the misfit of the model, and other possible supports."""
+def estimate_section(name: str, found: Estimate, data: Trajectory, *, of_model: bool) -> Section:
+    """Section on the noise of the samples, the misfit of the model, and other possible supports.
+
+    of_model: False if the estimate's model is not the one that was chosen.
+    """
     rows = ResultTable([found], [*noise_sizes(data), *ESTIMATE]).screen(by_state=True)
     blocks: list[Block] = [
+        *([] if of_model else [Text(REPLACED, warning=True)]),
         Table(rows, title="noise of the samples", note=NOISE),
         Text(found.misfit or FITS, warning=bool(found.misfit)),
     ]

@@ -19,9 +19,9 @@ from ep2sindy.library.units import SECONDS
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.point_fits import (
     Case,
-    JointResult,
     PointStudy,
     Refining,
+    SharedResult,
     TimeBootstrap,
     fit_points,
     search_shared,
@@ -215,7 +215,7 @@ class Outcome:
     study: PointStudy
     results: Sequence[PointResult]
     laws: Laws
-    joint: JointResult | None
+    joint: SharedResult | None
     along: Sequence[tuple[str, Mapping[str, float]]]
     published: pd.DataFrame
     shown: Panels
@@ -331,7 +331,7 @@ class Outcome:
             ],
             "laws": laws_summary(self.laws),
             "trends": self._tables["trends"].to_dict("records"),
-            "joint": joint_summary(self.joint),
+            "joint": shared_summary(self.joint),
         }
 
     def headline(self) -> dict[str, float]:
@@ -472,7 +472,7 @@ def supports_table(
     return pd.DataFrame(rows, columns=columns)
 
 
-def tied_table(joint: JointResult | None) -> pd.DataFrame:
+def tied_table(joint: SharedResult | None) -> pd.DataFrame:
     """R2 at every point, with coefficients tied over all points and without."""
     rows = []
     if joint and joint.tied:
@@ -569,7 +569,7 @@ def laws_summary(laws: Laws) -> dict[str, Any]:
     }
 
 
-def joint_summary(joint: JointResult | None) -> dict[str, Any] | None:
+def shared_summary(joint: SharedResult | None) -> dict[str, Any] | None:
     """The common support of all points, and its coefficients as polynomials of the parameters."""
     if joint is None:
         return None

@@ -17,7 +17,14 @@ import xarray as xr
 
 from ep2sindy.data.fields import SPACE, write_netcdf
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise
+from ep2sindy.discovery.pointwise import (
+    PACKAGE,
+    STATUSES,
+    Kept,
+    PointSearch,
+    blocks_of,
+    pointwise,
+)
 from ep2sindy.discovery.recipe import regression_of
 from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
 from ep2sindy.figures.maps import MEDIANS, coefficient_maps, quality_maps, regime_map
@@ -35,7 +42,6 @@ from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
 from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.trust.user_code import own_source
 
-PACKAGE = Path(__file__).resolve().parents[1]
 # Settings that do not change a point's result; they may differ when a broken run is continued.
 AFTERWARDS = {"output", "parallel", "max_regimes", "keep", "outline", "experiment", "study"}
 FADING = (
@@ -103,7 +109,8 @@ class Study:
         left_out = [name for name in map(str, self.terms) if name not in search.library.names]
         if left_out:
             run.say(f"terms left out, for this field lacks their variables: {left_out}")
-        kept = Kept(Path(self.keep) / blocks_key(run.settings))
+        key = blocks_key(run.settings)
+        kept = Kept(Path(self.keep) / key, key)  # runs of other settings may be at work beside it
         begin = time.perf_counter()
         result, n_before = self._searched(field, search, kept, run)
         wall_s = time.perf_counter() - begin

@@ -1,4 +1,4 @@
-"""Compiled least squares on supports, from Gram matrices only.
+"""Least squares on supports, from Gram matrices only; the loops are compiled.
 
 xx: (terms, terms) is a Gram matrix of columns in comparable units; a mask: (terms,) of bool is a
 support.
@@ -97,3 +97,16 @@ def solve_masks(xx, rhs, masks):
             for j in range(n_terms):
                 coef[m, j] = np.nan
     return coef
+
+
+def fit_masks(xx, xy, masks):
+    """Least-squares coefficients of each support; NaN if its columns are linearly dependent.
+
+    xy: (terms,), of the columns and one target.
+    """
+    return solve_masks(xx, np.where(masks, xy, 0.0), masks)
+
+
+def explained_squares(coef, xx, xy):
+    """Reduction of the target's sum of squares by each row of coef, on the rows of xx and xy."""
+    return (coef * (2.0 * xy - coef @ xx)).sum(axis=1)
