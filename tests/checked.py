@@ -10,7 +10,7 @@ from jaxtyping import install_import_hook
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
 # Compiled by numba, which cannot look inside a checking wrapper.
-COMPILED = ("kernels", "gram_fits")  # endings of names
+COMPILED = ("kernels", "gram_kernels")  # endings of names
 MODULES = [
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
     for path in sorted(PACKAGE.rglob("*.py"))

@@ -15,7 +15,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
 from ep2sindy.regression.front import ParetoFront, errors_of, fit_supports, front_order
-from ep2sindy.regression.gram_fits import ROUNDING, independent_terms
+from ep2sindy.regression.gram_kernels import ROUNDING, independent_terms
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces

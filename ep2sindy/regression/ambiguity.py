@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.library import Library
-from ep2sindy.regression.gram_fits import independent_terms
+from ep2sindy.regression.gram_kernels import independent_terms
 from ep2sindy.regression.rows import RegressionRows
 
 # Bounds on one minus the cosine between two columns: at 1e-10 they differ by 1e-5 of their size.

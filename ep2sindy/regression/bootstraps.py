@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ep2sindy.regression.ambiguity import largest_support, usable_terms
-from ep2sindy.regression.gram_fits import explained_squares, fit_masks
+from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.regression.searches import Search
 from ep2sindy.runtime.progress import Advance, nothing

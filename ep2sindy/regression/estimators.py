@@ -19,7 +19,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ep2sindy.data.numbers import column_norms
-from ep2sindy.regression.gram_fits import explained_squares, fit_masks
+from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.searches import AdaptiveLasso
 
 

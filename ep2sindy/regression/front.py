@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.library.equations import equation_html, equation_text
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.bootstraps import Supports
-from ep2sindy.regression.gram_fits import explained_squares, fit_masks, solve_masks
+from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 

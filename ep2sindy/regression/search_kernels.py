@@ -6,7 +6,13 @@ xy: (terms,) holds their products with one target. A mask: (terms,) of bool is a
 
 import numpy as np
 
-from ep2sindy.regression.gram_fits import DEPENDENT, ROUNDING, independent_terms, solve, solve_masks
+from ep2sindy.regression.gram_kernels import (
+    DEPENDENT,
+    ROUNDING,
+    independent_terms,
+    solve,
+    solve_masks,
+)
 from ep2sindy.runtime.compilation import compiled
 
 

@@ -59,7 +59,7 @@ def sources() -> list[Path]:
 
 def _kernels_in(folder: Path) -> list[Path]:
     """Files below a folder that define kernels, recognised by their names."""
-    return [path for path in folder.rglob("*.py") if path.stem.endswith(("kernels", "_fits"))]
+    return [path for path in folder.rglob("*.py") if path.stem.endswith("kernels")]
 
 
 def _imported(files: Iterable[Path]) -> set[Path]:
