@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import NUMBER, PRODUCT, VARIABLE
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 
 ROUNDING = 1e-12  # a sum this small relative to its addends has cancelled and counts as zero
 

@@ -15,7 +15,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.quantities import PointResult
 from ep2sindy.operating.records import check_varying, left_out_predictions
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 
 # Share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.discovery.choice import assemble_model, fit_last
-from ep2sindy.discovery.method import Regression, check_kind, method_given
+from ep2sindy.discovery.method import Regression, method_given
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
@@ -20,6 +20,7 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
+from ep2sindy.runtime.values import check_kind
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
