@@ -1,13 +1,16 @@
 """What a method is asked: records that agree, a library, and what is known of the equations."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.coerce import Task
+from ep2sindy.discovery.method import DiscoveryMethod
 from ep2sindy.library.relations import parse_relation
+from ep2sindy.runtime.values import check_kind
 
 PREY = ep.lotka_volterra()
 RUN = PREY.trajectory(noise=0.02, rng=0).window(0, 200)
@@ -89,3 +92,53 @@ def test_a_task_keeps_its_values_and_takes_a_tuple_of_runs() -> None:
     assert replace(task, relations=()).runs == task.runs == (RUN, OTHER)
     with pytest.raises(TypeError):
         task.terms["y"] = ["y"]
+
+
+def driven(x0: float, f_Hz: float) -> ep.Trajectory:
+    """x' = -x + 2 u - v with u = sin(w t) and v = cos(w t), and an input that no term uses."""
+    t, w = np.linspace(0.0, 12.0, 241), 2.0 * np.pi * f_Hz
+    u, v = np.sin(w * t), np.cos(w * t)
+    forced = ((2.0 - w) * u - (1.0 + 2.0 * w) * v) / (1.0 + w**2)
+    x = forced + (x0 - forced[0]) * np.exp(-t)
+    return ep.Trajectory(t, x[:, None], ["x"], np.column_stack([u, v, t]), ["u", "v", "extra"])
+
+
+@METHODS
+def test_inputs_are_taken_by_name_in_every_run(method) -> None:
+    first, second = driven(1.0, 0.2), driven(-2.0, 0.35)
+    swapped = replace(second, inputs=second.inputs[:, [1, 0]], input_names=["v", "u"])
+    library = ep.polynomial(["x", "u", "v"], degree=1)
+    found = ep.discover([first, swapped], library, method)
+    assert found.model.terms("x") == pytest.approx({"x": -1.0, "u": 2.0, "v": -1.0}, rel=1e-2)
+    other = ep.discover([first, second], library, method)
+    assert np.array_equal(found.model.coef, other.model.coef)
+
+
+class Smallest:
+    """A method of one's own, which asks another one."""
+
+    selection = ep.Evidence()
+
+    def identify(self, task, *, rng, progress):
+        return ep.TrajectorySearch(max_terms=2).identify(task, rng=rng, progress=progress)
+
+
+def test_a_method_needs_no_more_than_a_rule_and_an_answer() -> None:
+    found = ep.discover(RUN, LIBRARY, Smallest())
+    assert set(found.model.terms("x")) == {"x", "x*y"}
+    assert "chosen by Evidence()" in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("value", "lacking"),
+    [
+        (ep.BestSubset(), "which has no selection and no identify"),
+        (ep.EBIC(), "which has no selection and no identify"),
+        (SimpleNamespace(selection=ep.EBIC()), "which has no identify"),
+        (ep.Regression, "the class Regression came; call it to make a value$"),
+    ],
+)
+def test_what_is_no_method_is_refused_with_what_it_lacks(value: object, lacking: str) -> None:
+    message = f"(?s)^method must be a DiscoveryMethod, such as ep.Regression.*{lacking}"
+    with pytest.raises(ValueError, match=message):
+        check_kind("method", value, DiscoveryMethod, "ep.Regression()")

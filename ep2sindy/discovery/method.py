@@ -56,7 +56,8 @@ class IdentifiedEquations:
 class Finding:
     """Supports that a method offers, without the final fit.
 
-    kept: state -> the supports on its front. selected: state -> the support of its equation, or
+    kept: state -> all supports that were compared: of a regression those on its front, of a search
+    of trajectories the best few of every size. selected: state -> the support of its equation, or
     None if the method offers candidates and leaves the choice to the user.
     """
 
@@ -68,26 +69,26 @@ class Finding:
 class DiscoveryMethod(Protocol):
     """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
 
-    selection: the rule that chooses among candidates. depth: candidates kept per size.
-    provenance: record in a model of how it was found.
+    selection: the rule that chooses among candidates; it is named in the headline of the result.
+    identify: answers a `Task`. A method of one's own may ask another one:
+
+    >>> class Smallest:
+    ...     selection = ep.Evidence()
+    ...
+    ...     def identify(self, task, *, rng, progress):
+    ...         own = ep.TrajectorySearch(max_terms=2)
+    ...         return own.identify(task, rng=rng, progress=progress)
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> list(ep.discover(run, method=Smallest()).model.terms("x"))
+    ['x', 'x*y']
     """
 
     @property
     def selection(self) -> SystemSelection | Selection: ...
 
-    @property
-    def depth(self) -> int: ...
-
-    @property
-    def provenance(self) -> dict[str, str]: ...
-
     def identify(
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> IdentifiedEquations: ...
-
-    def find(
-        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
-    ) -> Finding: ...
 
 
 @dataclass(frozen=True)
@@ -134,38 +135,42 @@ class TrajectorySearch:
 
         Ambiguities are terms whose values at the samples are alike.
         """
+        found = self._estimate(task, progress)
+        choice = self._choose(found, task, progress)
+        return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
+
+    def _estimate(self, task: Task, progress: Progress) -> Estimate:
         provenance = self.provenance | _labels(task)
-        found = estimate_task(
+        return estimate_task(
             task,
             max_terms=self.max_terms,
             align=self.align,
             provenance=provenance,
             progress=progress,
         )
+
+    def _choose(self, found: Estimate, task: Task, progress: Progress) -> Choice:
+        """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         if isinstance(self.selection, SystemSelection):
-            choice = choose_by_runs(
+            return choose_by_runs(
                 fronts, self.selection, task.relations, library=task.library, runs=task.runs,
-                provenance=provenance, progress=progress,
+                provenance=found.model.provenance, progress=progress,
             )  # fmt: skip
-        else:
-            scores = self.selection.scores(fronts)
-            scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
-            best = [front.best for front in scored]
-            choice = Choice(scored, best, found.model, found.note)
-        alike = _ambiguities_of_samples(task)
-        return IdentifiedEquations(choice, alike, found.remarks, found)
+        scores = self.selection.scores(fronts)
+        scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
+        return Choice(scored, [front.best for front in scored], found.model, found.note)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
         """Supports alone, as a benchmark counts them."""
         task = Task(runs, library)
-        found = estimate_task(task, max_terms=self.max_terms, align=self.align)
-        states = found.model.states
+        found = self._estimate(task, SILENT)
+        model = self._choose(found, task, SILENT).model
         return Finding(
-            kept={s: [frozenset(each.coef) for each in found.supports[s]] for s in states},
-            selected={s: frozenset(found.model.terms(s)) for s in states},
+            kept={s: [frozenset(each.coef) for each in found.supports[s]] for s in task.states},
+            selected={s: frozenset(model.terms(s)) for s in task.states},
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 
@@ -13,6 +15,15 @@ def read_only(values: np.ndarray) -> np.ndarray:
 
 
 def check_kind(name: str, value: object, kind: type, example: str) -> None:
-    """Raise ValueError for a value of the wrong type, or a class instead of an instance."""
-    if isinstance(value, type) or not isinstance(value, kind):
-        raise ValueError(f"{name} must be a {kind.__name__}, such as {example}: {value!r} came")
+    """Raise ValueError for a value of the wrong type, or a class instead of an instance.
+
+    kind: a class, or a protocol; then the error names the members that the value lacks.
+    """
+    start = f"{name} must be a {kind.__name__}, such as {example}"
+    if isinstance(value, type):
+        raise ValueError(f"{start}: the class {value.__name__} came; call it to make a value")
+    if not isinstance(value, kind):
+        members = [m for m in vars(kind) if not m.startswith("_")]
+        lacking = [m for m in members if m not in dir(value)] if Protocol in kind.__mro__ else []
+        end = f", which has no {' and no '.join(lacking)}" if lacking else ""
+        raise ValueError(f"{start}: {value!r} came{end}")
