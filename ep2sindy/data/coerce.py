@@ -22,7 +22,7 @@ from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, complete, relations_of
-from ep2sindy.runtime.values import check_kind
+from ep2sindy.runtime.values import check_kind, check_list
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -265,6 +265,8 @@ class Task:
 
     def __post_init__(self) -> None:
         check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
+        for state, names in self.terms.items():
+            check_list(f"the terms of {state!r}", names)
         terms = {state: tuple(names) for state, names in self.terms.items()}
         for name, value in {
             "runs": tuple(trajectories_of(self.runs)),

@@ -16,7 +16,7 @@ from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, sec
 from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import check_list, read_only
 
 
 def read_only_mapping(values: dict) -> MappingProxyType:
@@ -62,6 +62,8 @@ class Trajectory:
     clock: Clock = SECONDS
 
     def __post_init__(self) -> None:
+        check_list("state_names", self.state_names)
+        check_list("input_names", self.input_names)
         empty = not self.input_names and not np.size(self.inputs)
         inputs = np.empty((len(self.t), 0)) if empty else self.inputs
         for name, value in {

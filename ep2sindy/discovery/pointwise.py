@@ -27,7 +27,7 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.files import WriteError, replacing, sweep
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
-from ep2sindy.runtime.values import check_kind
+from ep2sindy.runtime.values import check_kind, check_list
 
 NO_FIT = "no_fit"
 
@@ -50,6 +50,7 @@ class PointSearch:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_list("states", self.states)
         object.__setattr__(self, "states", tuple(self.states))
         if not 0.0 <= self.least_variation < 1.0:
             raise ValueError(

@@ -13,6 +13,7 @@ from typing import Any
 from ep2sindy.library.functions import Function, function_names, function_of
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
 from ep2sindy.library.units import unit_product
+from ep2sindy.runtime.values import check_list
 from ep2sindy.trust.memory import check_memory
 
 
@@ -120,8 +121,7 @@ def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Func
     A bare name such as `sin` gives one function of every variable; `sin(2*x)` gives that function.
     Raises ValueError for a name that is not a function.
     """
-    if isinstance(names, str):
-        raise ValueError(f"functions must be a list: {names!r} came; write [{names!r}]")
+    check_list("functions", names)
     found: list[Function] = []
     for name in names:
         texts = [f"{name}({v})" for v in variables] if name in function_names() else [name]

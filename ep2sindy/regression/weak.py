@@ -22,6 +22,7 @@ from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, WindowRows
 from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.runtime.values import check_list
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 from ep2sindy.signals.smoothers import Smoother
 
@@ -53,11 +54,7 @@ class Weak:
     exact_inputs: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.exact_inputs, str):
-            raise ValueError(
-                f"exact_inputs must be a list of names: {self.exact_inputs!r} came; write "
-                f"[{self.exact_inputs!r}]"
-            )
+        check_list("exact_inputs", self.exact_inputs)
         if self.errors_in_variables and isinstance(self.test_functions, Boxes):
             raise ValueError(
                 "errors_in_variables needs smooth test functions: Boxes came; use Bumps, or set "

@@ -14,6 +14,12 @@ def read_only(values: np.ndarray) -> np.ndarray:
     return copy
 
 
+def check_list(name: str, value: object) -> None:
+    """Raise ValueError for a text where a list belongs: it would be read letter by letter."""
+    if isinstance(value, str):
+        raise ValueError(f"{name} must be a list: {value!r} came; write [{value!r}]")
+
+
 def check_kind(name: str, value: object, kind: type, example: str) -> None:
     """Raise ValueError for a value of the wrong type, or a class instead of an instance.
 

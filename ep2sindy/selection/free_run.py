@@ -20,6 +20,7 @@ from ep2sindy.model.stability import limit_cycle
 from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
+from ep2sindy.runtime.values import check_list
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import (
     FLOOR,
@@ -132,6 +133,7 @@ class FreeRunScore:
             raise ValueError(f"window_periods must be positive: {self.window_periods} came")
         if not 0.0 < self.margin <= 1.0:
             raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
+        check_list("judged", self.judged)
 
     def scores(
         self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]
