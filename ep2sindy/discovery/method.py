@@ -29,7 +29,7 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.runtime.values import check_kind
+from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
@@ -111,8 +111,7 @@ class TrajectorySearch:
     depth: int = 1
 
     def __post_init__(self) -> None:
-        if self.max_terms < 1:
-            raise ValueError(f"max_terms must be at least 1: {self.max_terms} came")
+        set_counts(self, {"max_terms": 1, "depth": 1})
         check_kind("selection", self.selection, Selection, "ep.Evidence()")
         if not isinstance(self.selection, Evidence | SystemSelection):
             raise ValueError(
@@ -121,7 +120,6 @@ class TrajectorySearch:
                 f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, "
                 "such as Regression(search=BestSubset()) (search=best_subset)"
             )
-        _check_depth(self.depth)
 
     @property
     def provenance(self) -> dict[str, str]:
@@ -258,7 +256,12 @@ class Regression:
         check_kind("search", self.search, Search, "ep.BestSubset()")
         check_kind("bootstraps", self.bootstraps, Bootstraps, "ep.Bootstraps(n=0)")
         check_kind("selection", self.selection, Selection, "ep.EBIC()")
-        _check_depth(self.depth)
+        if isinstance(self.selection, Evidence):
+            raise ValueError(
+                "Evidence weighs what a search of trajectories found, and a regression has rows: "
+                "take TrajectorySearch() (search=trajectory), or select by EBIC() (selection=ebic)"
+            )
+        set_counts(self, {"depth": 1})
 
     @property
     def provenance(self) -> dict[str, str]:
@@ -346,11 +349,6 @@ def method_given(method: M | None, recipe: M | None) -> M | None:
         )
         return recipe
     return method
-
-
-def _check_depth(depth: int) -> None:
-    if type(depth) is not int or depth < 1:
-        raise ValueError(f"depth must be a whole number, one or more: {depth!r} came")
 
 
 def _labels(task: Task) -> dict[str, str]:

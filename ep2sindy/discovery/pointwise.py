@@ -51,6 +51,7 @@ class PointSearch:
 
     def __post_init__(self) -> None:
         check_list("states", self.states)
+        check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
         object.__setattr__(self, "states", tuple(self.states))
         if not 0.0 <= self.least_variation < 1.0:
             raise ValueError(

@@ -28,6 +28,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
+from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
 MIN_ODDS = 1e-3  # rivals with lower odds are not reported
@@ -155,8 +156,7 @@ def estimate_task(
     progress: Progress = SILENT,
 ) -> Estimate:
     """Answer a task by `estimate`."""
-    if max_terms < 1:
-        raise ValueError(f"max_terms must be at least 1: {max_terms} came")
+    max_terms = check_count("max_terms", max_terms)
     check_runs(task)
     check_size(task.runs, task.library, task.terms)
     with progress.stage(None, "step", "states and coefficients") as advance:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping
+from operator import index
+from typing import Protocol, SupportsIndex, cast
 
 import numpy as np
 
@@ -12,6 +14,29 @@ def read_only(values: np.ndarray) -> np.ndarray:
     copy = np.array(values, dtype=np.float64, order="C")
     copy.flags.writeable = False
     return copy
+
+
+COUNTS = ("zero", "one", "two")
+
+
+def check_count(name: str, value: object, least: int = 1) -> int:
+    """Return a whole number, also one of NumPy, as an int; raise ValueError for anything else."""
+    try:
+        count = least - 1 if isinstance(value, bool) else index(cast(SupportsIndex, value))
+    except TypeError:
+        count = least - 1
+    if count < least:
+        raise ValueError(f"{name} must be a whole number, {COUNTS[least]} or more: {value!r} came")
+    return count
+
+
+def set_counts(settings: object, least: Mapping[str, int]) -> None:
+    """Check fields of a frozen value that hold whole numbers, and keep each as an int.
+
+    least: name of a field -> its least value.
+    """
+    for name, fewest in least.items():
+        object.__setattr__(settings, name, check_count(name, getattr(settings, name), fewest))
 
 
 def check_list(name: str, value: object) -> None:
