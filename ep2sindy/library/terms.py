@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import comb, prod
-from typing import Any
 
 from ep2sindy.library.functions import Function, function_names, function_of
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
@@ -27,14 +26,8 @@ class VariableFactor:
     def variable(self) -> str:
         return self.name
 
-    def value(self, x: Any) -> Any:
-        return x
-
     def derivative(self) -> tuple[float, Factor | None]:
         return 1.0, None
-
-    def scaled(self, scale: float) -> tuple[float, Factor]:
-        return scale, self
 
     def unit(self, unit: str) -> str:
         return unit
