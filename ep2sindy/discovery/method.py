@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -19,7 +20,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choose, choose_by_runs
+from ep2sindy.discovery.choice import Choice, choose, choose_by_runs, score_by_rule
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
@@ -31,7 +32,7 @@ from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence
-from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
+from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates, selected
 
 M = TypeVar("M")
 
@@ -155,8 +156,7 @@ class TrajectorySearch:
                 fronts, self.selection, task.relations, library=task.library, runs=task.runs,
                 provenance=found.model.provenance, progress=progress,
             )  # fmt: skip
-        scores = self.selection.scores(fronts)
-        scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
+        scored = score_by_rule(fronts, self.selection, progress)
         return Choice(scored, [front.best for front in scored], found.model, found.note)
 
     def find(
@@ -176,15 +176,12 @@ def _front(
     state: str, scored: Sequence[ScoredSupport], library: Library, depth: int
 ) -> ParetoFront:
     """The likeliest `depth` candidates of every size, the empty support first."""
-    kept = [s for k, s in enumerate(scored) if _rank(scored, k) < depth or s.deviance == 0.0]
+    by_size = groupby(scored, key=lambda support: len(support.coef))  # they are sorted
+    ranked = [pair for _, same_size in by_size for pair in enumerate(same_size)]
+    kept = [support for k, support in ranked if k < depth or support.deviance == 0.0]
     if not kept or kept[0].coef:
         kept = [ScoredSupport({}, float("inf")), *kept]
     return ParetoFront(state, [_candidate(state, support, library) for support in kept])
-
-
-def _rank(scored: Sequence[ScoredSupport], k: int) -> int:
-    """Number of supports of the same size before this one; they are sorted."""
-    return sum(len(each.coef) == len(scored[k].coef) for each in scored[:k])
 
 
 def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidate:
@@ -329,7 +326,7 @@ class Regression:
         task = Task(runs, library)
         fronts = [e.front for e in self.search_equations(task, rng=rng)]
         scores = score_candidates(self.selection, fronts, library, task.runs)
-        chosen = [f.with_scores(s).best for f, s in zip(fronts, scores, strict=True)]
+        chosen = [selected(f, s) for f, s in zip(fronts, scores, strict=True)]
         return Finding(
             kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
             selected={c.equation: frozenset(c.terms) for c in chosen},

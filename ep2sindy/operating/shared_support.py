@@ -72,7 +72,7 @@ def discover_shared(
     out everywhere. The method's rule scores the fits at each point, and the scores are added: for
     AICc, BIC and EBIC the sum is the criterion of the joint likelihood, with the number of supports
     counted once. A term may vanish at some points, if it shows at others. For a single point the
-    result is that of `discover`.
+    result is that of `discover` by the same `Regression`.
     points: name -> trajectories. Points are assembled in the order of their names. method: None
     means Regression(). recipe: the old name of method, for one more version.
     Raises ValueError for a search that cannot serve several points, bootstraps (not available for
