@@ -68,8 +68,7 @@ class Discovery:
     def misfit(self) -> str:
         """The reason why the model does not explain the data to within their noise.
 
-        Empty if it does, or if nothing was tested: after a rule that judges models by free run, or
-        with samples too few for the weak rows of the test.
+        Empty if it does, or if the noise is not propagated into the rows.
         """
         return self.noise_test.misfit
 

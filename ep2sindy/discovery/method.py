@@ -20,7 +20,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choose, choose_by_runs, score_by_rule
+from ep2sindy.discovery.choice import Choice, choose, choose_by_runs
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
@@ -32,7 +32,7 @@ from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence
-from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates, selected
+from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
 M = TypeVar("M")
 
@@ -156,7 +156,8 @@ class TrajectorySearch:
                 fronts, self.selection, task.relations, library=task.library, runs=task.runs,
                 provenance=found.model.provenance, progress=progress,
             )  # fmt: skip
-        scored = score_by_rule(fronts, self.selection, progress)
+        scores = self.selection.scores(fronts)
+        scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
         return Choice(scored, [front.best for front in scored], found.model, found.note)
 
     def find(
@@ -326,7 +327,7 @@ class Regression:
         task = Task(runs, library)
         fronts = [e.front for e in self.search_equations(task, rng=rng)]
         scores = score_candidates(self.selection, fronts, library, task.runs)
-        chosen = [selected(f, s) for f, s in zip(fronts, scores, strict=True)]
+        chosen = [f.with_scores(s).best for f, s in zip(fronts, scores, strict=True)]
         return Finding(
             kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
             selected={c.equation: frozenset(c.terms) for c in chosen},
