@@ -13,10 +13,18 @@ from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy as ep
 from ep2sindy.app import program, sweep
-from ep2sindy.app.runner import check_overrides, hparams_of, list_studies, run_config, study_class
+from ep2sindy.app.runner import (
+    check_overrides,
+    hparams_of,
+    list_studies,
+    run_config,
+    study_class,
+    unused_rows,
+)
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.app.sweep import index_text, write_index
 from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.runtime.files import write_json, write_text
 from ep2sindy.selection.rule import Selection
 from ep2sindy.studies.study import Count, Counts, Deferred, Levels, Names, PositiveOrAll, Share
@@ -133,7 +141,7 @@ def test_a_recipe_stands_for_its_groups() -> None:
         ("many.one=null", "many.one may have .*: None came"),
         ("selection._target_=ep2sindy.BestSubset", "selection must name a _target_ that is a Sele"),
         ("later=1", "later must name a _target_: 1 came"),
-        ("search.max_terms=0", "max_terms must be at least 1: 0 came"),
+        ("search.max_terms=0", "max_terms must be a whole number, one or more: 0 came"),
         ("search.max_terms=1.5", "search.max_terms must be a whole number: 1.5 came"),
         ("search.max_terms=two", "search.max_terms must be a whole number: 'two' came"),
         ("selection.n_norm=3", "selection.n_norm must be text: 3 came"),
@@ -362,3 +370,41 @@ def test_mistakes_end_in_one_clear_message(
     assert message in error
     assert error.startswith("error: ")
     assert not list(tmp_path.glob("outputs/*/*"))  # no run folder of a run that never began
+
+
+@dataclass(frozen=True)
+class WithRows:
+    """A study that makes rows beside its search."""
+
+    method: AnyMethod
+    formulation: Formulation
+
+
+@dataclass(frozen=True)
+class WithoutRows:
+    """A study that searches, and does nothing else."""
+
+    method: AnyMethod
+
+
+@pytest.mark.parametrize(
+    ("study", "typed", "said"),
+    [
+        (WithRows(ep.TrajectorySearch(), ep.Weak()), ["search.max_terms=3"], ""),
+        (WithRows(ep.Regression(), ep.Weak()), ["formulation=weak"], ""),
+        (
+            WithRows(ep.TrajectorySearch(), ep.Weak()),
+            ["seed=1", "formulation=weak", "+formulation.n_steps=3"],
+            "formulation=weak +formulation.n_steps=3: a search of trajectories makes no rows, so "
+            "it serves only the fits and figures that this experiment makes of rows beside the",
+        ),
+        (WithoutRows(ep.TrajectorySearch()), ["formulation=weak"], "so it does nothing here; equ"),
+        (WithoutRows(ep.Regression()), ["formulation=weak"], ""),
+    ],
+)
+def test_a_formulation_beside_a_search_of_trajectories_is_spoken_of(
+    study: object, typed: list[str], said: str
+) -> None:
+    message = unused_rows(typed, study)
+    assert said in message
+    assert bool(said) == bool(message)

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy._stubs import dotted_names
+from ep2sindy.discovery.recipe import method_of
 from ep2sindy.estimation import problem as estimation_problem
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
@@ -516,6 +517,8 @@ PUBLIC = {
         ({"selection": ep.EBIC()}, ep.Regression()),
         ({"search": ep.BestSubset(max_terms=2)}, ep.Regression(search=ep.BestSubset(max_terms=2))),
         ({"selection": RULE}, ep.Regression(selection=RULE)),
+        ({"search": ep.TrajectorySearch(depth=3)}, ep.TrajectorySearch(depth=3)),
+        ({"search": ep.BestSubset(), "depth": 3}, ep.Regression(depth=3)),
     ],
 )
 def test_a_recipe_is_the_method_that_it_stands_for_and_warns(asked: dict, method: object) -> None:
@@ -540,6 +543,49 @@ def test_bootstraps_are_refused_where_there_are_no_rows() -> None:
         ep.Recipe(search=ep.TrajectorySearch(), bootstraps=ep.Bootstraps(n=2))
 
 
+def test_a_formulation_is_refused_where_there_are_no_rows() -> None:
+    with pytest.raises(ValueError, match=r"makes no rows: Weak\(.*; leave the formulation out, or"):
+        ep.Recipe(search=ep.TrajectorySearch(), formulation=ep.Weak())
+
+
+NO_ROWS = (ep.WeightedWeak(), ep.Bootstraps(n=0))
+
+
+@pytest.mark.parametrize(
+    ("search", "selection", "depth", "expected"),
+    [
+        (ep.TrajectorySearch(depth=3), ep.Evidence(), 1, ep.TrajectorySearch(depth=3)),
+        (ep.TrajectorySearch(), RULE, 2, ep.TrajectorySearch(selection=RULE, depth=2)),
+        (
+            ep.TrajectorySearch(selection=RULE, depth=2),
+            ep.Evidence(),
+            2,
+            ep.TrajectorySearch(selection=RULE, depth=2),
+        ),
+    ],
+)
+def test_settings_of_a_given_search_hold(
+    search: ep.TrajectorySearch, selection: object, depth: int, expected: object
+) -> None:
+    formulation, bootstraps = NO_ROWS
+    assert method_of(formulation, search, bootstraps, selection, depth) == expected
+
+
+@pytest.mark.parametrize(
+    ("search", "selection", "depth", "name"),
+    [
+        (ep.TrajectorySearch(depth=3), ep.Evidence(), 2, r"search.depth\), and 2 beside"),
+        (ep.TrajectorySearch(selection=RULE), ep.FreeRunScore(n_folds=3), 1, "search.selection"),
+    ],
+)
+def test_a_setting_is_not_given_twice(
+    search: ep.TrajectorySearch, selection: object, depth: int, name: str
+) -> None:
+    formulation, bootstraps = NO_ROWS
+    with pytest.raises(ValueError, match=f"must be set once: .*{name}.*; leave one of them out"):
+        method_of(formulation, search, bootstraps, selection, depth)
+
+
 def test_evidence_is_refused_for_fronts_of_rows() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     with pytest.raises(ValueError, match="Evidence weighs what a search of trajectories found"):
@@ -554,7 +600,7 @@ def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
         ep.estimate([run.window(0, 6)], ep.polynomial(["x", "y"], degree=2))
     with pytest.raises(ValueError, match="a run must have five samples or more: .* has 2"):
         ep.estimate([run, run.window(0, 2)], ep.polynomial(["x", "y"], degree=2))
-    with pytest.raises(ValueError, match="max_terms must be at least 1: 0 came"):
+    with pytest.raises(ValueError, match="max_terms must be a whole number, one or more: 0 came"):
         ep.TrajectorySearch(max_terms=0)
 
 

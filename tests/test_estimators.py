@@ -80,7 +80,7 @@ def test_max_terms_ends_the_path() -> None:
     ("estimator", "message"),
     [
         (AdaptiveLassoRegressor(gamma=-1.0), "gamma must be positive"),
-        (AdaptiveLassoRegressor(max_terms=0), "max_terms must be at least 1"),
+        (AdaptiveLassoRegressor(max_terms=0), "max_terms must be a whole number, one or more"),
         (AdaptiveLassoRegressor(tolerance=0.0), r"tolerance must lie in \(0, 1\): 0.0 came"),
     ],
 )

@@ -147,7 +147,10 @@ def test_a_library_takes_functions_of_every_variable_or_of_one() -> None:
         ({"functions": ["x*sin(v)"]}, "go into products"),
         ({"functions": ["sin(x)^2"]}, "come with function_degree=2"),
         ({"function_degree": 2}, r"function_degree=2 needs functions, such as \['sin'\]"),
-        ({"functions": ["sin"], "function_degree": 0}, "must be one or more: 0 came"),
+        (
+            {"functions": ["sin"], "function_degree": 0},
+            "must be a whole number, one or more: 0 came",
+        ),
     ],
 )
 def test_wrong_functions_of_a_library_are_refused(setting: dict, message: str) -> None:

@@ -4,7 +4,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.coerce import trajectories_of
-from ep2sindy.discovery.method import check_kind
+from ep2sindy.runtime.values import check_kind
 from ep2sindy.selection.rule import Selection
 
 T = np.linspace(0.0, 3.0, 31)

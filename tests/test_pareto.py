@@ -78,7 +78,7 @@ def test_a_size_whose_best_does_not_beat_smaller_ones_is_left_out() -> None:
 def test_a_front_without_depth_is_refused() -> None:
     problem = exact_problem(damped_oscillator())
     supports = pooled_supports(problem, BestSubset(), Bootstraps(n=0), rng=np.random.default_rng(0))
-    with pytest.raises(ValueError, match="depth must be at least 1: 0 came"):
+    with pytest.raises(ValueError, match="depth must be a whole number, one or more: 0 came"):
         pareto_front(problem, supports[0], depth=0)
 
 

@@ -218,9 +218,9 @@ def test_culling_everything_is_refused() -> None:
     ("build", "message"),
     [
         (lambda: AdaptiveLasso(gamma=0.0), "gamma must be positive"),
-        (lambda: AdaptiveLasso(max_terms=0), "max_terms must be at least 1"),
+        (lambda: AdaptiveLasso(max_terms=0), "max_terms must be a whole number, one or more"),
         (lambda: STLSQ(lowest=1.0, highest=0.5), "0 < lowest < highest"),
-        (lambda: BestSubset(n_best=0), "n_best must be at least 1"),
+        (lambda: BestSubset(n_best=0), "n_best must be a whole number, one or more"),
         (lambda: Bootstraps(n=-1), "n must be a whole number, zero or more: -1"),
         (lambda: Bootstraps(smallest=0.0), "0 < smallest <= largest"),
     ],

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -21,6 +21,8 @@ from ep2sindy.app.safety import check_output
 from ep2sindy.app.schema import GROUPS, keys_of, study_of
 from ep2sindy.app.targets import check_targets
 from ep2sindy.app.warm import warm
+from ep2sindy.discovery.method import TrajectorySearch
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.about import ASIDE, About, by_place, settings_used
 from ep2sindy.report.folder import FORMATS, RunFolder
 from ep2sindy.report.page import page_html
@@ -48,6 +50,7 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
     """
     check_common(config)
     formats = formats_of(config)
+    overrides = list(overrides)
     with Bars().stage(3, "step", "loading") as advance:
         check_targets(config)
         advance(1)
@@ -58,6 +61,8 @@ def run_config(config: DictConfig, *, overrides: Iterable[str] = ()) -> Finished
         advance(1)
     warm()
     with start_run(config) as run:
+        if said := unused_rows(overrides, study):
+            run.say(said)
         outcome = study.compute(run)
         headline = write(run, outcome, study, formats)
     return Finished(run.folder.path, headline)
@@ -129,11 +134,37 @@ def formats_of(config: DictConfig) -> list[str]:
 def check_overrides(overrides: Iterable[str], *, used: Collection[str], experiment: str) -> None:
     """Raise ValueError for a key of conf/config.yaml that was set but is not used by the study."""
     for text in overrides:
-        key = re.split(r"[.=@]", text.lstrip("+~/"))[0]
+        key = _key_of(text)
         if key in set(GROUPS) - set(used):
             raise ValueError(
                 f"{text!r} would do nothing: {experiment} does not use {key!r}; leave it out"
             )
+
+
+def unused_rows(overrides: Iterable[str], study: Any) -> str:
+    """A message if rows were set on the command line, and the study searches trajectories.
+
+    Empty otherwise. study: a dataclass.
+    """
+    rows = [text for text in overrides if _key_of(text) == "formulation"]
+    values = [getattr(study, field.name) for field in fields(study)]
+    if not rows or not any(isinstance(value, TrajectorySearch) for value in values):
+        return ""
+    beside = any(isinstance(value, Formulation) for value in values)
+    use = (
+        "it serves only the fits and figures that this experiment makes of rows beside the search"
+        if beside
+        else "it does nothing here"
+    )
+    return (
+        f"{' '.join(rows)}: a search of trajectories makes no rows, so {use}; equations are "
+        "searched in rows by search=best_subset selection=ebic"
+    )
+
+
+def _key_of(override: str) -> str:
+    """The first key of a setting: `formulation` of `+formulation.split.test_fraction=0`."""
+    return re.split(r"[.=@]", override.lstrip("+~/"))[0]
 
 
 @contextmanager

@@ -1,24 +1,28 @@
 """Conversion of tables and arrays to trajectories, and checks of the trajectories that come in.
 
 The checks look for samples outside the domain of a library's functions, for states that repeat
-another state, and for samples that two runs share.
+another state, and for samples that two runs share. A `Task` is what a method is asked: trajectories
+that agree, a library, and what is known of the equations.
 """
 
 from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, present_rows
 from ep2sindy.data.numbers import real_numbers, seconds
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation, complete, relations_of
+from ep2sindy.runtime.values import check_kind, check_list
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,11 +47,14 @@ def trajectories_of(runs: object) -> list[Trajectory]:
       Rows that hold a NaN are left out, with the warning `MissingSamples`.
     - A tuple (t, x) of times (samples,) and states (samples,) or (samples, n_states). The states
       are then called x, or x0, x1 ...
+    A tuple of runs, none of them an array, is a list of them.
     Raises ValueError for anything else, and for whatever Trajectory refuses.
     """
+    if isinstance(runs, tuple) and all(map(is_run, runs)):
+        runs = list(runs)
     if isinstance(runs, Sequence) and not isinstance(runs, tuple | str):
         if not runs:
-            raise ValueError("a discovery needs at least one run: an empty list came")
+            raise ValueError("finding equations needs at least one run: an empty list came")
         return [_trajectory(run, f" {k} of the list") for k, run in enumerate(runs)]
     return [_trajectory(runs, "")]
 
@@ -235,3 +242,67 @@ def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m 
     n = min(len(first), len(second))
     same = n >= MIN_SHARED and np.array_equal(first[:MIN_SHARED], second[:MIN_SHARED])
     return n if same and np.array_equal(first[:n], second[:n]) else 0
+
+
+# What a method is asked.
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What a method is asked: equations of these runs, from this library, with what is known.
+
+    runs: trajectories of the same states, which agree in the units of the library's variables.
+    relations: between coefficients. terms: for each state whose equation is known but for its
+    coefficients, all terms of that equation; it is not searched.
+    Raises ValueError for runs that do not agree or that share samples, a state that repeats
+    another, a variable that a run lacks, or a relation or term of unknown names.
+    """
+
+    runs: Sequence[Trajectory]
+    library: Library
+    relations: Sequence[Relation] = ()
+    terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
+        for state, names in self.terms.items():
+            check_list(f"the terms of {state!r}", names)
+        terms = {state: tuple(names) for state, names in self.terms.items()}
+        for name, value in {
+            "runs": tuple(trajectories_of(self.runs)),
+            "relations": relations_of(self.relations),
+            "terms": read_only_mapping(terms),
+        }.items():
+            object.__setattr__(self, name, value)
+        check_agreement(self.runs, self.library.variables)
+        check_repeats(self.runs)
+        self._check_known()
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states, one equation each."""
+        return tuple(self.runs[0].state_names)
+
+    def complete(
+        self, equation: str, found: Sequence[Bool[np.ndarray, "_ terms"]]
+    ) -> list[Bool[np.ndarray, "_ terms"]]:
+        """Supports found for an equation in every draw, made consistent with what is known."""
+        if equation in self.terms:
+            known = np.zeros((1, len(self.library)), dtype=np.bool_)
+            known[0, [self.library.index(name) for name in self.terms[equation]]] = True
+            return [known] * len(found)
+        if not self.relations:
+            return list(found)
+        return [complete(masks, self.library, equation, self.relations) for masks in found]
+
+    def _check_known(self) -> None:
+        """Raise ValueError for an unknown state or term, or an equation without terms."""
+        named = [(state, term) for r in self.relations for _, state, term in r.factors]
+        named += [(state, term) for state, terms in self.terms.items() for term in terms]
+        for state in (*self.terms, *(state for state, _ in named)):
+            if state not in self.states:
+                raise ValueError(f"unknown state {state!r}; there are {list(self.states)}")
+        for _, term in named:
+            self.library.index(term)
+        if empty := [state for state, terms in self.terms.items() if not terms]:
+            raise ValueError(f"an equation whose terms are given must have some: {empty} has none")

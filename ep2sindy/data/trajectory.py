@@ -15,8 +15,8 @@ from jaxtyping import Float
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
+from ep2sindy.runtime.values import check_list, read_only
 
 
 def read_only_mapping(values: dict) -> MappingProxyType:
@@ -62,6 +62,8 @@ class Trajectory:
     clock: Clock = SECONDS
 
     def __post_init__(self) -> None:
+        check_list("state_names", self.state_names)
+        check_list("input_names", self.input_names)
         empty = not self.input_names and not np.size(self.inputs)
         inputs = np.empty((len(self.t), 0)) if empty else self.inputs
         for name, value in {
@@ -232,10 +234,11 @@ def check_finite(
 def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]) -> None:
     """Raise ValueError unless all trajectories have the same states, and agree in units.
 
-    Every column of a regression must mean the same thing in all trajectories.
+    variables: of the library. They may stand in any order among the inputs, which are taken by
+    name; states must come in one order.
     """
     if not trajectories:
-        raise ValueError("a regression needs at least one trajectory: none came")
+        raise ValueError("at least one trajectory is needed to find equations: none came")
     first = trajectories[0]
     names = [*first.state_names, *(v for v in variables if v not in first.state_names)]
     for k, run in enumerate(trajectories):
@@ -244,7 +247,7 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
             raise ValueError(
                 f"every trajectory needs the states {list(first.state_names)} and the variables "
                 f"{list(variables)}: trajectory {k} has states {list(run.state_names)} and inputs "
-                f"{list(run.input_names)}"
+                f"{list(run.input_names)}; {_way_to_agree(first, missing)}"
             )
         for name in names:
             if run.units[name] != first.units[name]:
@@ -252,3 +255,13 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
                     f"units must agree: {name!r} is in {first.units[name]} in trajectory 0 and "
                     f"in {run.units[name]} in trajectory {k}; convert one of them first"
                 )
+
+
+def _way_to_agree(first: Trajectory, missing: Sequence[str]) -> str:
+    """What to do about a trajectory that lacks variables, or whose states are others."""
+    if lacking := [name for name in missing if name not in first.state_names]:
+        return (
+            f"the library needs {lacking}: sample it as a state or pass it as an input, leave its "
+            "terms out, or derive it (+exp=trace does, of one signal)"
+        )
+    return "give all of them the same states, named alike and in the same order"

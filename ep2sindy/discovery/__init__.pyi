@@ -1,4 +1,8 @@
 # Discover
+from ep2sindy.data.coerce import Task as Task
+from ep2sindy.discovery.method import DiscoveryMethod as DiscoveryMethod
+from ep2sindy.discovery.method import IdentifiedEquations as IdentifiedEquations
+from ep2sindy.discovery.choice import Choice as Choice
 from ep2sindy.estimation.estimate import Estimate as Estimate
 from ep2sindy.discovery.pointwise import PointSearch as PointSearch
 from ep2sindy.discovery.pointwise import Kept as Kept

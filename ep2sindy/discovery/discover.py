@@ -9,15 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import Runs, trajectories_of
+from ep2sindy.data.coerce import Runs, Task, trajectories_of
 from ep2sindy.discovery.choice import NoiseTest, noise_test
-from ep2sindy.discovery.method import (
-    DiscoveryMethod,
-    Known,
-    TrajectorySearch,
-    check_kind,
-    method_given,
-)
+from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch, method_given
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Relation, relations_of
@@ -28,6 +22,7 @@ from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
+from ep2sindy.runtime.values import check_kind
 
 MAX_NOTES = 6  # shown in the repr
 
@@ -121,17 +116,16 @@ def discover(
     the model. terms: for each state whose equation is known but for its coefficients, all terms of
     that equation. progress: True shows bars; see `Progress`. recipe: the old name of method, for
     one more version.
-    Raises ValueError for a relation or a term that the library or the states do not have.
+    Raises ValueError for a relation or a term that the library or the states do not have, for runs
+    whose states or units differ, and for states or samples that come twice.
     """
     method = method_given(method, recipe) or TrajectorySearch()
     trajectories = trajectories_of(runs)
     library = polynomial(trajectories[0].names, degree=2) if library is None else library
-    check_kind("library", library, Library, "ep.polynomial(['x', 'y'], degree=2)")
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
-    known = Known(relations_of(relations), terms or {})
-    known.check(library, trajectories[0].state_names)
+    task = Task(trajectories, library, relations_of(relations), terms or {})
     rng, watch = np.random.default_rng(seed), as_progress(progress)
-    found = method.identify(trajectories, library, known, rng=rng, progress=watch)
+    found = method.identify(task, rng=rng, progress=watch)
     choice = found.choice
     test = noise_test(choice, trajectories, estimate=found.estimate)
     # If the residuals of the rows exceed the noise, intervals would not cover the truth.

@@ -10,19 +10,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool
 
-from ep2sindy.data.coerce import check_repeats
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import Choice, choose, choose_by_runs
-from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate
+from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation, complete
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
 from ep2sindy.regression.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
@@ -30,48 +30,11 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
 M = TypeVar("M")
-
-
-@dataclass(frozen=True)
-class Known:
-    """Knowledge of the user about the equations before the search.
-
-    relations: between coefficients. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation; it is not searched.
-    """
-
-    relations: Sequence[Relation] = ()
-    terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
-
-    def of(
-        self, equation: str, library: Library, found: Sequence[Bool[np.ndarray, "_ terms"]]
-    ) -> list[Bool[np.ndarray, "_ terms"]]:
-        """Supports found for an equation in every draw, made consistent with this knowledge.
-
-        Raises ValueError for a term that the library does not have.
-        """
-        if equation in self.terms:
-            known = np.zeros((1, len(library)), dtype=np.bool_)
-            known[0, [library.index(name) for name in self.terms[equation]]] = True
-            return [known] * len(found)
-        if not self.relations:
-            return list(found)
-        return [complete(masks, library, equation, self.relations) for masks in found]
-
-    def check(self, library: Library, states: Sequence[str]) -> None:
-        """Raise ValueError for an unknown state or term, or an equation without terms."""
-        named = [(state, term) for r in self.relations for _, state, term in r.factors]
-        named += [(state, term) for state, terms in self.terms.items() for term in terms]
-        for state, term in named:
-            if state not in states:
-                raise ValueError(f"unknown state {state!r}; there are {list(states)}")
-            library.index(term)
-        if empty := [state for state, terms in self.terms.items() if not terms]:
-            raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +57,8 @@ class IdentifiedEquations:
 class Finding:
     """Supports that a method offers, without the final fit.
 
-    kept: state -> the supports on its front. selected: state -> the support of its equation, or
+    kept: state -> all supports that were compared: of a regression those on its front, of a search
+    of trajectories the best few of every size. selected: state -> the support of its equation, or
     None if the method offers candidates and leaves the choice to the user.
     """
 
@@ -106,32 +70,26 @@ class Finding:
 class DiscoveryMethod(Protocol):
     """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
 
-    selection: the rule that chooses among candidates. depth: candidates kept per size.
-    provenance: record in a model of how it was found.
+    selection: the rule that chooses among candidates; it is named in the headline of the result.
+    identify: answers a `Task`. A method of one's own may ask another one:
+
+    >>> class Smallest:
+    ...     selection = ep.Evidence()
+    ...
+    ...     def identify(self, task, *, rng, progress):
+    ...         own = ep.TrajectorySearch(max_terms=2)
+    ...         return own.identify(task, rng=rng, progress=progress)
+    >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    >>> list(ep.discover(run, method=Smallest()).model.terms("x"))
+    ['x', 'x*y']
     """
 
     @property
     def selection(self) -> SystemSelection | Selection: ...
 
-    @property
-    def depth(self) -> int: ...
-
-    @property
-    def provenance(self) -> dict[str, str]: ...
-
     def identify(
-        self,
-        runs: Sequence[Trajectory],
-        library: Library,
-        known: Known,
-        *,
-        rng: np.random.Generator,
-        progress: Progress = SILENT,
+        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> IdentifiedEquations: ...
-
-    def find(
-        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
-    ) -> Finding: ...
 
 
 @dataclass(frozen=True)
@@ -154,8 +112,7 @@ class TrajectorySearch:
     depth: int = 1
 
     def __post_init__(self) -> None:
-        if self.max_terms < 1:
-            raise ValueError(f"max_terms must be at least 1: {self.max_terms} came")
+        set_counts(self, {"max_terms": 1, "depth": 1})
         check_kind("selection", self.selection, Selection, "ep.Evidence()")
         if not isinstance(self.selection, Evidence | SystemSelection):
             raise ValueError(
@@ -164,7 +121,6 @@ class TrajectorySearch:
                 f"FreeRunScore(): {self.selection!r} came. Rules of rows go with a regression, "
                 "such as Regression(search=BestSubset()) (search=best_subset)"
             )
-        _check_depth(self.depth)
 
     @property
     def provenance(self) -> dict[str, str]:
@@ -172,53 +128,48 @@ class TrajectorySearch:
         return {"search": repr(self), "selection": repr(self.selection)}
 
     def identify(
-        self,
-        runs: Sequence[Trajectory],
-        library: Library,
-        known: Known,
-        *,
-        rng: np.random.Generator,
-        progress: Progress = SILENT,
+        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> IdentifiedEquations:
         """Estimate states and coefficients, and choose; the search is deterministic.
 
         Ambiguities are terms whose values at the samples are alike.
         """
-        provenance = self.provenance | _labels(runs)
-        found = estimate(
-            runs,
-            library,
+        found = self._estimate(task, progress)
+        choice = self._choose(found, task, progress)
+        return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
+
+    def _estimate(self, task: Task, progress: Progress) -> Estimate:
+        provenance = self.provenance | _labels(task)
+        return estimate_task(
+            task,
             max_terms=self.max_terms,
             align=self.align,
-            relations=known.relations,
-            terms=known.terms,
-            units=runs[0].units,
             provenance=provenance,
             progress=progress,
         )
-        fronts = [_front(s, found.supports[s], library, self.depth) for s in found.model.states]
+
+    def _choose(self, found: Estimate, task: Task, progress: Progress) -> Choice:
+        """Candidates of every equation with their scores, and the model by the selection rule."""
+        fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         if isinstance(self.selection, SystemSelection):
-            choice = choose_by_runs(
-                fronts, self.selection, known.relations, library=library, runs=runs,
-                provenance=provenance, progress=progress,
+            return choose_by_runs(
+                fronts, self.selection, task.relations, library=task.library, runs=task.runs,
+                provenance=found.model.provenance, progress=progress,
             )  # fmt: skip
-        else:
-            scores = self.selection.scores(fronts)
-            scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
-            best = [front.best for front in scored]
-            choice = Choice(scored, best, found.model, found.note)
-        alike = _ambiguities_of_samples(runs, library)
-        return IdentifiedEquations(choice, alike, found.remarks, found)
+        scores = self.selection.scores(fronts)
+        scored = [front.with_scores(s) for front, s in zip(fronts, scores, strict=True)]
+        return Choice(scored, [front.best for front in scored], found.model, found.note)
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
         """Supports alone, as a benchmark counts them."""
-        found = estimate(runs, library, max_terms=self.max_terms, align=self.align)
-        states = found.model.states
+        task = Task(runs, library)
+        found = self._estimate(task, SILENT)
+        model = self._choose(found, task, SILENT).model
         return Finding(
-            kept={s: [frozenset(each.coef) for each in found.supports[s]] for s in states},
-            selected={s: frozenset(found.model.terms(s)) for s in states},
+            kept={s: [frozenset(each.coef) for each in found.supports[s]] for s in task.states},
+            selected={s: frozenset(model.terms(s)) for s in task.states},
         )
 
 
@@ -226,15 +177,12 @@ def _front(
     state: str, scored: Sequence[ScoredSupport], library: Library, depth: int
 ) -> ParetoFront:
     """The likeliest `depth` candidates of every size, the empty support first."""
-    kept = [s for k, s in enumerate(scored) if _rank(scored, k) < depth or s.deviance == 0.0]
+    by_size = groupby(scored, key=lambda support: len(support.coef))  # they are sorted
+    ranked = [pair for _, same_size in by_size for pair in enumerate(same_size)]
+    kept = [support for k, support in ranked if k < depth or support.deviance == 0.0]
     if not kept or kept[0].coef:
         kept = [ScoredSupport({}, float("inf")), *kept]
     return ParetoFront(state, [_candidate(state, support, library) for support in kept])
-
-
-def _rank(scored: Sequence[ScoredSupport], k: int) -> int:
-    """Number of supports of the same size before this one; they are sorted."""
-    return sum(len(each.coef) == len(scored[k].coef) for each in scored[:k])
 
 
 def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidate:
@@ -252,9 +200,10 @@ def _candidate(state: str, support: ScoredSupport, library: Library) -> Candidat
     )
 
 
-def _ambiguities_of_samples(runs: Sequence[Trajectory], library: Library) -> tuple[Ambiguity, ...]:
+def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
     """Terms whose values at the samples cannot be told apart."""
-    theta = library.evaluate(np.concatenate([run.columns(library.variables) for run in runs]))
+    library = task.library
+    theta = library.evaluate(np.concatenate([r.columns(library.variables) for r in task.runs]))
     theta = theta / zero_to_one(np.abs(theta).max(axis=0))  # else squares of densities overflow
     theta = theta / column_norms(theta)
     return find_ambiguities(library, theta, theta.T @ theta)
@@ -305,7 +254,12 @@ class Regression:
         check_kind("search", self.search, Search, "ep.BestSubset()")
         check_kind("bootstraps", self.bootstraps, Bootstraps, "ep.Bootstraps(n=0)")
         check_kind("selection", self.selection, Selection, "ep.EBIC()")
-        _check_depth(self.depth)
+        if isinstance(self.selection, Evidence):
+            raise ValueError(
+                "Evidence weighs what a search of trajectories found, and a regression has rows: "
+                "take TrajectorySearch() (search=trajectory), or select by EBIC() (selection=ebic)"
+            )
+        set_counts(self, {"depth": 1})
 
     @property
     def provenance(self) -> dict[str, str]:
@@ -318,80 +272,61 @@ class Regression:
         }
 
     def identify(
-        self,
-        runs: Sequence[Trajectory],
-        library: Library,
-        known: Known,
-        *,
-        rng: np.random.Generator,
-        progress: Progress = SILENT,
+        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> IdentifiedEquations:
         """Assemble rows, search them, and choose."""
-        check_repeats(runs)
-        equations = self.search_equations(runs, library, known, rng=rng, progress=progress)
+        equations = self.search_equations(task, rng=rng, progress=progress)
         fronts = [equation.front for equation in equations]
-        choice = self.choose(fronts, runs, library, known.relations, progress=progress)
+        choice = self.choose(fronts, task, progress=progress)
         found: list[Ambiguity] = []
         for front in fronts:
             # Known equations are not searched, so too few rows do no harm to them.
-            if not set(front.rows.equations) <= set(known.terms):
+            if not set(front.rows.equations) <= set(task.terms):
                 found += few_rows(front.rows)
             found += ambiguities(front.rows)
-        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(runs))
+        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
 
     def search_equations(
-        self,
-        runs: Sequence[Trajectory],
-        library: Library,
-        known: Known | None = None,
-        *,
-        rng: np.random.Generator | int,
-        progress: Progress = SILENT,
+        self, task: Task, *, rng: np.random.Generator | int, progress: Progress = SILENT
     ) -> list[SearchedEquation]:
         """Assemble the rows, search every bootstrap of them, and fit the supports found."""
-        rng, known = np.random.default_rng(rng), known or Known()
-        equations = []
+        rng, equations = np.random.default_rng(rng), []
         with progress.stage(None, "", "rows of the regression"):
-            problems = self.formulation.assemble(runs, library, rng=rng)
+            problems = self.formulation.assemble(task.runs, task.library, rng=rng)
         for problem in problems:
             with progress.stage(None, "", "draws of rows"):
                 draws = draw_resamples(problem, self.bootstraps, rng=rng)
             for k, equation in enumerate(problem.equations):
                 with progress.stage(len(draws.xx), "draw", f"search for {equation}'") as advance:
                     proposed = draws.search(self.search, k, advance)
-                found = known.of(equation, library, proposed)
+                found = task.complete(equation, proposed)
                 supports = pool(draws, k, found)
                 front = pareto_front(problem, supports, depth=self.depth)
                 equations.append(SearchedEquation(draws, k, found, supports, front))
         return equations
 
     def choose(
-        self,
-        fronts: Sequence[ParetoFront],
-        runs: Sequence[Trajectory],
-        library: Library,
-        relations: Sequence[Relation] = (),
-        *,
-        progress: Progress = SILENT,
+        self, fronts: Sequence[ParetoFront], task: Task, *, progress: Progress = SILENT
     ) -> Choice:
         """Select a candidate from every front, and fit it."""
-        provenance = self.provenance | _labels(runs)
+        provenance = self.provenance | _labels(task)
         if isinstance(self.selection, SystemSelection):
             return choose_by_runs(
-                fronts, self.selection, relations, library=library, runs=runs,
+                fronts, self.selection, task.relations, library=task.library, runs=task.runs,
                 provenance=provenance, progress=progress,
             )  # fmt: skip
         return choose(
-            fronts, self.selection, relations, units=runs[0].units, provenance=provenance,
-            progress=progress,
+            fronts, self.selection, task.relations, units=task.runs[0].units,
+            provenance=provenance, progress=progress,
         )  # fmt: skip
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
         """Supports alone, as a benchmark counts them."""
-        fronts = [e.front for e in self.search_equations(runs, library, rng=rng)]
-        scores = score_candidates(self.selection, fronts, library, runs)
+        task = Task(runs, library)
+        fronts = [e.front for e in self.search_equations(task, rng=rng)]
+        scores = score_candidates(self.selection, fronts, library, task.runs)
         chosen = [f.with_scores(s).best for f, s in zip(fronts, scores, strict=True)]
         return Finding(
             kept={f.equation: [frozenset(c.terms) for c in f.candidates] for f in fronts},
@@ -414,19 +349,8 @@ def method_given(method: M | None, recipe: M | None) -> M | None:
     return method
 
 
-def check_kind(name: str, value: object, kind: type, example: str) -> None:
-    """Raise ValueError for a value of the wrong type, or a class instead of an instance."""
-    if isinstance(value, type) or not isinstance(value, kind):
-        raise ValueError(f"{name} must be a {kind.__name__}, such as {example}: {value!r} came")
-
-
-def _check_depth(depth: int) -> None:
-    if type(depth) is not int or depth < 1:
-        raise ValueError(f"depth must be a whole number, one or more: {depth!r} came")
-
-
-def _labels(runs: Sequence[Trajectory]) -> dict[str, str]:
-    return {"trajectories": ", ".join(run.label for run in runs)}
+def _labels(task: Task) -> dict[str, str]:
+    return {"trajectories": ", ".join(run.label for run in task.runs)}
 
 
 def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:

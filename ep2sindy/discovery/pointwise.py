@@ -18,15 +18,17 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.method import Regression, check_kind
+from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.files import WriteError, fingerprint, replacing, sweep
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
+from ep2sindy.runtime.values import check_kind, check_list
 
 NO_FIT = "no_fit"
 
@@ -53,6 +55,8 @@ class PointSearch:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_list("states", self.states)
+        check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
         object.__setattr__(self, "states", tuple(self.states))
         if not 0.0 <= self.least_variation < 1.0:
             raise ValueError(
@@ -294,9 +298,10 @@ def _nothing(search: PointSearch) -> dict[str, np.ndarray]:
 def _at_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit at one point, and the spread over the bootstraps."""
     rng = np.random.default_rng(search.seed)
-    equations = search.method.search_equations([run], search.library, rng=rng)
+    task = Task([run], search.library)
+    equations = search.method.search_equations(task, rng=rng)
     fronts = [equation.front for equation in equations]
-    choice = search.method.choose(fronts, [run], search.library)
+    choice = search.method.choose(fronts, task)
     point = _nothing(search)
     for row, (equation, chosen) in enumerate(zip(equations, choice.chosen, strict=True)):
         problem = equation.front.rows

@@ -34,17 +34,52 @@ def method_of(
 ) -> AnyMethod:
     """The method for settings that are chosen one by one, such as the groups of a config.
 
-    A `TrajectorySearch` takes the rule and the depth, and ignores the formulation.
-    Raises ValueError for bootstraps that do not go with the search.
+    A `TrajectorySearch` takes the rule and the depth, unless its own are set, and ignores the
+    formulation: it makes no rows, but experiments may make some beside it.
+    Raises ValueError for bootstraps that do not go with the search, or a rule or depth that differs
+    from the search's own.
     """
     if not isinstance(search, TrajectorySearch):
         return Regression(formulation, search, selection, bootstraps, depth)
-    if bootstraps.n:
+    _check_no_bootstraps(bootstraps)
+    plain = TrajectorySearch()  # a group of a config always has a value, perhaps the default
+    return _with_settings(
+        search,
+        None if selection == plain.selection else selection,
+        None if depth == plain.depth else depth,
+    )
+
+
+def _check_no_bootstraps(bootstraps: Bootstraps | None) -> None:
+    if bootstraps is not None and bootstraps.n:
         raise ValueError(
             f"a search of trajectories draws no bootstraps: {bootstraps!r} came; take "
             "Bootstraps(n=0) (bootstraps=none), or a regression"
         )
-    return replace(search, selection=selection, depth=depth)
+
+
+def _with_settings(
+    search: TrajectorySearch, selection: SystemSelection | Selection | None, depth: int | None
+) -> TrajectorySearch:
+    """The search with another rule and depth; None leaves its own.
+
+    Raises ValueError for a setting that the search has already, with another value.
+    """
+    plain = TrajectorySearch()
+    for name, own, default, given in (
+        ("selection", search.selection, plain.selection, selection),
+        ("depth", search.depth, plain.depth, depth),
+    ):
+        if given is not None and own not in (default, given):
+            raise ValueError(
+                f"{name} must be set once: {own!r} came in the search (search.{name}), and "
+                f"{given!r} beside it; leave one of them out"
+            )
+    return replace(
+        search,
+        selection=search.selection if selection is None else selection,
+        depth=search.depth if depth is None else depth,
+    )
 
 
 def Recipe(  # has the name of the class that it replaces
@@ -52,24 +87,34 @@ def Recipe(  # has the name of the class that it replaces
     search: TrajectorySearch | Search | None = None,
     bootstraps: Bootstraps | None = None,
     selection: SystemSelection | Selection | None = None,
-    depth: int = 1,
+    depth: int | None = None,
 ) -> AnyMethod:
     """Old way to write a method, for one more version: it warns, and writes out the new one.
 
-    It returns a search of trajectories, unless a setting of a regression is given.
+    It returns a search of trajectories, unless a setting of a regression is given. depth: None
+    leaves the search's own, or 1 for a regression.
+    Raises ValueError for settings of a regression beside a search of trajectories.
     """
     of_rows = formulation is not None or bootstraps is not None
     if search is None and (of_rows or not isinstance(selection, Evidence | None)):
         search = BestSubset()
-    joint = search if isinstance(search, TrajectorySearch) else TrajectorySearch()
-    of_trajectories = search is None or isinstance(search, TrajectorySearch)
-    found = method_of(
-        WeightedWeak() if formulation is None else formulation,
-        joint if search is None else search,
-        Bootstraps(n=0) if bootstraps is None else bootstraps,
-        (joint.selection if of_trajectories else EBIC()) if selection is None else selection,
-        depth,
-    )
+    found: AnyMethod
+    if search is None or isinstance(search, TrajectorySearch):
+        if formulation is not None:
+            raise ValueError(
+                f"a search of trajectories makes no rows: {formulation!r} came; leave the "
+                "formulation out, or take a search of rows, such as BestSubset()"
+            )
+        _check_no_bootstraps(bootstraps)
+        found = _with_settings(search or TrajectorySearch(), selection, depth)
+    else:
+        found = Regression(
+            WeightedWeak() if formulation is None else formulation,
+            search,
+            EBIC() if selection is None else selection,
+            Bootstraps(n=0) if bootstraps is None else bootstraps,
+            1 if depth is None else depth,
+        )
     warnings.warn(
         f"ep.Recipe(...) goes with the next version: write {_call_of(found)}, and pass it to "
         "ep.discover as method=...",

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import check_domain, check_repeats
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import EstimationProblem, check_size, scale_problem
@@ -26,9 +25,10 @@ from ep2sindy.estimation.solver import (
 )
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation
+from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.model import SparseModel
-from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
+from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
+from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
 MIN_ODDS = 1e-3  # rivals with lower odds are not reported
@@ -112,12 +112,12 @@ class Estimate:
 
 
 def estimate(
-    runs: Sequence[Trajectory],
+    runs: Runs,
     library: Library,
     *,
     max_terms: int = 7,
     align: bool = False,
-    relations: Sequence[Relation] = (),
+    relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
@@ -125,25 +125,47 @@ def estimate(
 ) -> Estimate:
     """Estimate the states at every sample and sparse coefficients together, by maximum likelihood.
 
-    runs: all runs share the coefficients. Samples may be spaced unequally. Inputs are taken as
-    exact. max_terms: the most terms of one equation. align: if True, channels found to be late are
-    shifted forward; if False, late channels make the model a misfit, and their delays are reported.
+    runs: one run or a list, see `trajectories_of`; all share the coefficients. Samples may be
+    spaced unequally. Inputs are taken as exact. max_terms: the most terms of one equation. align:
+    if True, channels found to be late are shifted forward; if False, late channels make the model a
+    misfit, and their delays are reported.
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
     known but for its coefficients, all terms of that equation. progress: True shows bars; see
     `Progress`.
     Raises ValueError for fewer than one term, a library that needs more samples than there are, or
-    a variable that no run has.
+    whatever a `Task` refuses.
     """
-    if max_terms < 1:
-        raise ValueError(f"max_terms must be at least 1: {max_terms} came")
-    check_runs(runs, library)
-    check_size(runs, library, terms or {})
-    watch = as_progress(progress)
-    with watch.stage(None, "step", "states and coefficients") as advance:
-        problem = scale_problem(runs, library, relations, terms, advance=advance)
+    task = Task(trajectories_of(runs), library, relations_of(relations), terms or {})
+    return estimate_task(
+        task,
+        max_terms=max_terms,
+        align=align,
+        units=units,
+        provenance=provenance,
+        progress=as_progress(progress),
+    )
+
+
+def estimate_task(
+    task: Task,
+    *,
+    max_terms: int,
+    align: bool,
+    units: Mapping[str, str] | None = None,
+    provenance: Mapping[str, str] | None = None,
+    progress: Progress = SILENT,
+) -> Estimate:
+    """Answer a task by `estimate`."""
+    max_terms = check_count("max_terms", max_terms)
+    check_runs(task)
+    check_size(task.runs, task.library, task.terms)
+    with progress.stage(None, "step", "states and coefficients") as advance:
+        problem = scale_problem(
+            task.runs, task.library, task.relations, task.terms, advance=advance
+        )
         answer = _answer(problem, max_terms, align=align)
-    model = _model(answer, library, units or runs[0].units, provenance or {})
-    return _report(answer, model, max_terms, watch)
+    model = _model(answer, task.library, units or task.runs[0].units, provenance or {})
+    return _report(answer, model, max_terms, progress)
 
 
 def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progress) -> Estimate:
@@ -200,23 +222,16 @@ def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Repo
     return _Reported(late.problem, late.solution, misfit, late.delays, (said,))
 
 
-def check_runs(runs: Sequence[Trajectory], library: Library) -> None:
-    """Raise ValueError for a variable that no run has, or for runs that are too short."""
-    if missing := [v for v in library.variables if v not in runs[0].names]:
+def check_runs(task: Task) -> None:
+    """Raise ValueError for too few samples, or some outside the domain of a library's function."""
+    n_samples = sum(run.n_samples for run in task.runs)
+    if n_samples <= len(task.library):
         raise ValueError(
-            f"the library needs {missing}, and the runs have {list(runs[0].names)}: states and "
-            "coefficients can be estimated together only where every state is sampled; derive "
-            "the missing one (+exp=trace does, of one signal), or pass it as an input"
+            f"a library of {len(task.library)} terms needs more samples than terms: {n_samples} "
+            "came; use a smaller library or more data"
         )
-    n_samples = sum(run.n_samples for run in runs)
-    if n_samples <= len(library):
-        raise ValueError(
-            f"a library of {len(library)} terms needs more samples than terms: {n_samples} came; "
-            "use a smaller library or more data"
-        )
-    check_domain(runs, library)
-    check_repeats(runs)
-    for run in runs:
+    check_domain(task.runs, task.library)
+    for run in task.runs:
         if run.n_samples < 5:
             raise ValueError(
                 f"a run must have five samples or more: {run.label or 'one'} has "

@@ -263,11 +263,14 @@ def scale_problem(
     """Scale records and library, and collect the coefficients that may be in the model.
 
     relations: hold between coefficients. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation.
+    coefficients, all terms of that equation. Inputs that the library does not have are left out;
+    the others are taken by name, in the order of the first run.
     """
-    states, names = runs[0].state_names, runs[0].names
+    states = runs[0].state_names
+    inputs = [name for name in runs[0].input_names if name in library.variables]
+    names = [*states, *inputs]
     over = library.over(names)
-    values = np.concatenate([run.values for run in runs])
+    values = np.concatenate([run.columns(names) for run in runs])
     size = zero_to_one(np.sqrt(np.square(values).mean(axis=0)))
     step_s = float(np.mean(np.concatenate([np.diff(run.t) for run in runs])))
     scaled, numbers = over.scaled(size)
@@ -281,7 +284,7 @@ def scale_problem(
         library=scaled,
         term_names=over.names,
         states=tuple(states),
-        records=tuple(_record(run, size, step_s) for run in runs),
+        records=tuple(_record(run, inputs, size, step_s) for run in runs),
         equation=equation,
         column=column,
         C=held.C * to_SI[held.free] / to_SI[:, None],
@@ -294,12 +297,14 @@ def scale_problem(
     )
 
 
-def _record(run: Trajectory, size: np.ndarray, step_s: float) -> ScaledRecord:
+def _record(
+    run: Trajectory, inputs: Sequence[str], size: np.ndarray, step_s: float
+) -> ScaledRecord:
     d = len(run.state_names)
     return ScaledRecord(
         times=(run.t - run.t[0]) / step_s,
         samples=run.states / size[:d],
-        inputs=run.inputs / size[d:],
+        inputs=run.columns(inputs) / size[d:],
         limits=_limits(run, size[:d]),
     )
 

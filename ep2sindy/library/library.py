@@ -28,6 +28,7 @@ from ep2sindy.library.terms import (
     read_term,
 )
 from ep2sindy.runtime.screen import N_LINES, cut, html_table, one_screen, wrap
+from ep2sindy.runtime.values import check_list
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,7 @@ class Library:
     functions: Sequence[Function] = ()
 
     def __post_init__(self) -> None:
+        check_list("variables", self.variables)
         exponents = np.array(self.exponents, dtype=np.int64)
         exponents.flags.writeable = False
         object.__setattr__(self, "variables", tuple(self.variables))
@@ -292,6 +294,8 @@ def by_exponents(library: Library) -> Library:
 
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
     """Library of exactly these terms, in this order."""
+    check_list("variables", variables)
+    check_list("names", names)
     check_exponents(len(names), len(variables))
     terms = [read_term(name, variables) for name in names]
     if len(set(terms)) < len(terms):
@@ -316,6 +320,8 @@ def polynomial(
     Terms are ordered by degree, then by variable, functions last: 1, x, y, sin(x), x^2, ...
     Raises ValueError for a wrong degree, or for an unknown variable or function.
     """
+    check_list("variables", variables)
+    check_list("products", products)
     n, factors = len(variables), functions_named(functions, variables)
     check_degrees(degree, function_degree, n, len(factors))
     rows = [

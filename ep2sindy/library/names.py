@@ -44,7 +44,7 @@ _ARGUMENT = re.compile(
 )
 
 
-_FACTOR = r"[^\W\d]\w{,99}(?:\^\d{1,3})?"
+_AVERAGED = r"[^\W\d]\w{,99}(?:\^\d{1,3})?"
 
 
 def check_variable(name: str) -> None:
@@ -60,7 +60,7 @@ def check_variable(name: str) -> None:
 
 def check_state(name: str) -> None:
     """Raise ValueError unless a name is a valid variable or an average such as `<n_i*n_n>`."""
-    if not (isinstance(name, str) and re.fullmatch(rf"<{_FACTOR}(?:\*{_FACTOR})*>", name)):
+    if not (isinstance(name, str) and re.fullmatch(rf"<{_AVERAGED}(?:\*{_AVERAGED})*>", name)):
         check_variable(name)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import NUMBER, PRODUCT, VARIABLE
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import check_list, read_only
 
 ROUNDING = 1e-12  # a sum this small relative to its addends has cancelled and counts as zero
 
@@ -167,6 +167,8 @@ def constraint(
     >>> ep.constraint(library, support, ["x: x*y == -1 * y: x*y"]).C.shape
     (4, 3)
     """
+    for state, terms in support.items():
+        check_list(f"the support of {state!r}", terms)
     coefficients = tuple(
         (state, library.names[j])
         for state, terms in support.items()
@@ -176,7 +178,7 @@ def constraint(
     free = np.ones(len(coefficients), dtype=np.bool_)
     named: dict[int, None] = {}
     earlier: list[str] = []
-    for relation in (parse_relation(r) if isinstance(r, str) else r for r in relations):
+    for relation in relations_of(relations):
         row, size = np.zeros((2, len(coefficients)))
         for factor, state, term in relation.factors:
             k = place_of(library, coefficients, state, term, f"relation {relation.text!r}")
@@ -227,6 +229,7 @@ def _round(sums: np.ndarray | float, sizes: np.ndarray | float) -> np.ndarray:
 
 def relations_of(relations: Sequence[Relation | str]) -> tuple[Relation, ...]:
     """Parse relations given as texts; leave the others as they are."""
+    check_list("relations", relations)
     return tuple(parse_relation(r) if isinstance(r, str) else r for r in relations)
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import comb, prod
-from typing import Any
 
 from ep2sindy.library.functions import Function, function_names, function_of
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
 from ep2sindy.library.units import unit_product
+from ep2sindy.runtime.values import check_count, check_list
 from ep2sindy.trust.memory import check_memory
 
 
@@ -26,14 +26,8 @@ class VariableFactor:
     def variable(self) -> str:
         return self.name
 
-    def value(self, x: Any) -> Any:
-        return x
-
     def derivative(self) -> tuple[float, Factor | None]:
         return 1.0, None
-
-    def scaled(self, scale: float) -> tuple[float, Factor]:
-        return scale, self
 
     def unit(self, unit: str) -> str:
         return unit
@@ -120,8 +114,7 @@ def functions_named(names: Sequence[str], variables: Sequence[str]) -> list[Func
     A bare name such as `sin` gives one function of every variable; `sin(2*x)` gives that function.
     Raises ValueError for a name that is not a function.
     """
-    if isinstance(names, str):
-        raise ValueError(f"functions must be a list: {names!r} came; write [{names!r}]")
+    check_list("functions", names)
     found: list[Function] = []
     for name in names:
         texts = [f"{name}({v})" for v in variables] if name in function_names() else [name]
@@ -161,10 +154,8 @@ MAX_EXPONENTS = 4_000_000  # MAX_TERMS terms of 200 variables
 
 def check_degrees(degree: int, function_degree: int, n_variables: int, n_functions: int) -> None:
     """Raise ValueError for invalid degrees, or for degrees that give too many terms."""
-    if not isinstance(degree, int) or degree < 0:
-        raise ValueError(f"degree must be a whole number, zero or more: {degree!r} came")
-    if not isinstance(function_degree, int) or function_degree < 1:
-        raise ValueError(f"function_degree must be one or more: {function_degree!r} came")
+    degree = check_count("degree", degree, 0)
+    function_degree = check_count("function_degree", function_degree)
     if function_degree > 1 and not n_functions:
         raise ValueError(f"function_degree={function_degree} needs functions, such as ['sin']")
     _check_size("degree", degree, n_variables)

@@ -22,9 +22,9 @@ from ep2sindy.model.inputs import inputs_at_samples
 from ep2sindy.model.rollout import Rollout, rates, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
-from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import N_LINES
+from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:

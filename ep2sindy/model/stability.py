@@ -13,7 +13,7 @@ from scipy.integrate import DOP853, OdeSolution
 from ep2sindy.model.many import rk4_step
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scaled import ScaledModel
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 
 # A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
 # a thousand periods to change e-fold, longer than any record. The multipliers themselves are exact

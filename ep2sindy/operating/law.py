@@ -28,8 +28,8 @@ from ep2sindy.operating.shared_support import SharedDiscovery, SharedFront
 from ep2sindy.refinement.weighted_law import Basis
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.regression.whitening import whitened_rows
-from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.runtime.values import read_only
 from ep2sindy.selection.rule import FLOOR
 
 FORMAT = "ep2sindy.OperatingLaw/1"

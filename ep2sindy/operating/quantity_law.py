@@ -15,7 +15,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.quantities import PointResult
 from ep2sindy.operating.records import check_varying, left_out_predictions
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import check_count, read_only
 
 # Share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
@@ -105,8 +105,8 @@ def _check(
     if not (np.isfinite(values).all() and np.isfinite(parameters).all()):
         raise ValueError("values and parameters must be finite: leave out points that are not")
     check_varying(parameters, names, remedy="leave it out of the library")
-    if max_terms is not None and max_terms < 1:
-        raise ValueError(f"max_terms must be at least 1: {max_terms} came")
+    if max_terms is not None:
+        check_count("max_terms", max_terms)
 
 
 def _best_support(values: np.ndarray, theta: np.ndarray, max_terms: int | None) -> list[int]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.discovery.choice import assemble_model, fit_last
-from ep2sindy.discovery.method import Regression, check_kind, method_given
+from ep2sindy.discovery.method import Regression, method_given
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, usable_terms
@@ -20,6 +20,7 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.threads import one_thread
+from ep2sindy.runtime.values import check_kind
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.rule import Selection, SystemSelection, score_candidates
 
@@ -71,7 +72,7 @@ def discover_shared(
     out everywhere. The method's rule scores the fits at each point, and the scores are added: for
     AICc, BIC and EBIC the sum is the criterion of the joint likelihood, with the number of supports
     counted once. A term may vanish at some points, if it shows at others. For a single point the
-    result is that of `discover`.
+    result is that of `discover` by the same `Regression`.
     points: name -> trajectories. Points are assembled in the order of their names. method: None
     means Regression(). recipe: the old name of method, for one more version.
     Raises ValueError for a search that cannot serve several points, bootstraps (not available for

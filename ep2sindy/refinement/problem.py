@@ -24,8 +24,8 @@ from ep2sindy.refinement.windows import (
     cut_windows,
     dominant_window,
 )
-from ep2sindy.runtime.arrays import read_only
 from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.runtime.values import read_only
 
 Values = TypeVar("Values", bound=np.ndarray)
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import column_norms, zero_to_one
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 
 # Directions of a basis or of the information weaker than this share of the strongest are dropped.
 RANK = 1e-10

@@ -16,6 +16,7 @@ from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.rows import Grams, RegressionRows
 from ep2sindy.regression.searches import Search
 from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.runtime.values import set_counts
 
 
 @dataclass(frozen=True)
@@ -38,17 +39,12 @@ class Bootstraps:
     block: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("n", "n_culled"):
-            count = getattr(self, name)
-            if not isinstance(count, int) or count < 0:
-                raise ValueError(f"{name} must be a whole number, zero or more: {count!r} came")
+        set_counts(self, {"n": 0, "n_culled": 0, "block": 1})
         if not 0.0 < self.smallest <= self.largest:
             raise ValueError(
                 "shares must satisfy 0 < smallest <= largest: "
                 f"smallest={self.smallest}, largest={self.largest} came"
             )
-        if not isinstance(self.block, int) or self.block < 1:
-            raise ValueError(f"block must be a whole number, one or more: {self.block!r} came")
 
     def draw(
         self, problem: RegressionRows, terms: Bool[np.ndarray, " terms"], rng: np.random.Generator

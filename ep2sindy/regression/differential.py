@@ -12,6 +12,7 @@ from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.library import Library
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.splits import RandomSplit, Split
+from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 
@@ -26,6 +27,10 @@ class Differential:
     smoother: Smoother = field(default_factory=SavitzkyGolay)
     smooth_library: bool = True
     split: Split = field(default_factory=RandomSplit)
+
+    def __post_init__(self) -> None:
+        check_kind("smoother", self.smoother, Smoother, "ep.signals.SavitzkyGolay()")
+        check_kind("split", self.split, Split, "ep.RandomSplit()")
 
     def assemble(
         self,

@@ -15,6 +15,7 @@ from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks, solve_masks
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
+from ep2sindy.runtime.values import check_count
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,8 +222,7 @@ def front_order(
     sizes: Int[np.ndarray, " candidates"], errors: Float[np.ndarray, " candidates"], *, depth: int
 ) -> list[int]:
     """Indices of the front: the `depth` best of each size whose best beats all smaller sizes."""
-    if depth < 1:
-        raise ValueError(f"depth must be at least 1: {depth} came")
+    depth = check_count("depth", depth)
     front: list[int] = []
     lowest = np.inf
     for _, same_size in groupby(np.lexsort((errors, sizes)).tolist(), key=lambda k: sizes[k]):

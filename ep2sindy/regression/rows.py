@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
 

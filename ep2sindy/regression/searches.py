@@ -13,6 +13,7 @@ from ep2sindy.regression.search_kernels import (
     best_subsets,
     thresholded_supports,
 )
+from ep2sindy.runtime.values import set_counts
 from ep2sindy.trust.memory import check_memory
 
 Gram = Float[np.ndarray, "terms terms"]
@@ -47,7 +48,7 @@ class AdaptiveLasso:
     def __post_init__(self) -> None:
         if self.gamma <= 0.0:
             raise ValueError(f"gamma must be positive: {self.gamma} came")
-        _check_max_terms(self.max_terms)
+        set_counts(self, _where_set(self.max_terms))
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
         return adaptive_lasso_supports(xx, xy, self.gamma, self.max_terms or len(xy))
@@ -68,12 +69,12 @@ class STLSQ:
     max_terms: int | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.lowest < self.highest or self.n_thresholds < 2:
+        if not 0.0 < self.lowest < self.highest:
             raise ValueError(
-                "a threshold sweep needs 0 < lowest < highest and two thresholds or more: "
-                f"lowest={self.lowest}, highest={self.highest}, n_thresholds={self.n_thresholds}"
+                "a threshold sweep needs 0 < lowest < highest: "
+                f"lowest={self.lowest}, highest={self.highest} came"
             )
-        _check_max_terms(self.max_terms)
+        set_counts(self, {"n_thresholds": 2} | _where_set(self.max_terms))
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
         thresholds = np.sqrt(yy) * np.geomspace(self.lowest, self.highest, self.n_thresholds)
@@ -94,9 +95,7 @@ class BestSubset:
     n_best: int = 1
 
     def __post_init__(self) -> None:
-        _check_max_terms(self.max_terms)
-        if self.n_best < 1:
-            raise ValueError(f"n_best must be at least 1: {self.n_best} came")
+        set_counts(self, {"max_terms": 1, "n_best": 1})
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
         return self.shared_supports(xx[None], xy[None], np.array([yy]))
@@ -133,6 +132,6 @@ class BestSubset:
         return masks
 
 
-def _check_max_terms(max_terms: int | None) -> None:
-    if max_terms is not None and max_terms < 1:
-        raise ValueError(f"max_terms must be at least 1: {max_terms} came")
+def _where_set(max_terms: int | None) -> dict[str, int]:
+    """The least value of max_terms; nothing for None, which means all terms."""
+    return {} if max_terms is None else {"max_terms": 1}

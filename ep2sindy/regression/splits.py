@@ -8,6 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool
 
+from ep2sindy.runtime.values import set_counts
+
 
 @runtime_checkable
 class Split(Protocol):
@@ -22,8 +24,10 @@ class RandomSplit:
 
     test_fraction: float = 0.25
 
-    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+    def __post_init__(self) -> None:
         _check_fraction(self.test_fraction)
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
         chosen = rng.permutation(n_groups)[: round(self.test_fraction * n_groups)]
         return np.isin(np.arange(n_groups), chosen)
 
@@ -39,8 +43,11 @@ class BlockSplit:
     test_fraction: float = 0.25
     n_blocks: int = 20
 
-    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
+    def __post_init__(self) -> None:
         _check_fraction(self.test_fraction)
+        set_counts(self, {"n_blocks": 1})
+
+    def held_out(self, n_groups: int, rng: np.random.Generator) -> Bool[np.ndarray, " groups"]:
         n_blocks = min(self.n_blocks, n_groups)
         chosen = rng.permutation(n_blocks)[: round(self.test_fraction * n_blocks)]
         return np.isin(np.arange(n_groups) * n_blocks // max(n_groups, 1), chosen)

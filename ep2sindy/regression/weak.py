@@ -22,6 +22,7 @@ from ep2sindy.regression.sampling import stretches
 from ep2sindy.regression.splits import RandomSplit, Split
 from ep2sindy.regression.test_functions import Boxes, Bumps, WindowFunctions, WindowRows
 from ep2sindy.regression.whitening import whitened_rows
+from ep2sindy.runtime.values import check_kind, check_list, set_counts
 from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 from ep2sindy.signals.smoothers import Smoother
 
@@ -53,11 +54,10 @@ class Weak:
     exact_inputs: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.exact_inputs, str):
-            raise ValueError(
-                f"exact_inputs must be a list of names: {self.exact_inputs!r} came; write "
-                f"[{self.exact_inputs!r}]"
-            )
+        check_kind("test_functions", self.test_functions, WindowFunctions, "ep.Bumps()")
+        check_kind("smoother", self.smoother, Smoother, "ep.signals.KalmanSmoother()")
+        check_kind("split", self.split, Split, "ep.RandomSplit()")
+        check_list("exact_inputs", self.exact_inputs)
         if self.errors_in_variables and isinstance(self.test_functions, Boxes):
             raise ValueError(
                 "errors_in_variables needs smooth test functions: Boxes came; use Bumps, or set "
@@ -240,10 +240,10 @@ class WeightedWeak:
     n_steps: int = 2
 
     def __post_init__(self) -> None:
+        check_kind("weak", self.weak, Weak, "ep.Weak(split=ep.RandomSplit(0.0))")
         if not self.weak.errors_in_variables:
             raise ValueError("weights need the noise: set weak.errors_in_variables to true")
-        if self.n_steps < 0:
-            raise ValueError(f"n_steps must be zero or more: {self.n_steps} came")
+        set_counts(self, {"n_steps": 0})
 
     @property
     def smoother(self) -> Smoother:

@@ -20,6 +20,7 @@ from ep2sindy.model.stability import limit_cycle
 from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
+from ep2sindy.runtime.values import check_kind, check_list, set_counts
 from ep2sindy.selection.refined import RefinedScore
 from ep2sindy.selection.rule import (
     FLOOR,
@@ -124,14 +125,14 @@ class FreeRunScore:
     label: ClassVar[str] = "free-run error"
 
     def __post_init__(self) -> None:
+        check_kind("bounds", self.bounds, FreeRunBounds, "ep.FreeRunBounds()")
         least = dict.fromkeys(("n_windows", "n_confirmed", "max_combinations", "n_starts"), 1)
-        for name, fewest in ({"n_folds": 2} | least).items():
-            if getattr(self, name) < fewest:
-                raise ValueError(f"{name} must be at least {fewest}: {getattr(self, name)} came")
+        set_counts(self, {"n_folds": 2} | least)
         if not self.window_periods > 0.0:
             raise ValueError(f"window_periods must be positive: {self.window_periods} came")
         if not 0.0 < self.margin <= 1.0:
             raise ValueError(f"margin must lie between 0 and 1: {self.margin} came")
+        check_list("judged", self.judged)
 
     def scores(
         self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]

@@ -18,6 +18,7 @@ from ep2sindy.refinement.refine import refine_batch, smooth_batch
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows, dominant_window
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Advance, Progress, nothing
+from ep2sindy.runtime.values import set_counts
 from ep2sindy.selection.rule import (
     FLOOR,
     MAX_ERROR,
@@ -77,9 +78,7 @@ class RefinedScore:
             raise ValueError(
                 f"window_s must be positive: {self.window_s} came; leave it out to have it chosen"
             )
-        for name, least in (("n_windows", 2), ("max_combinations", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}: {getattr(self, name)} came")
+        set_counts(self, {"n_windows": 2, "max_combinations": 1})
 
     def scores(
         self, fronts: Sequence[ParetoFront], library: Library, runs: Sequence[Trajectory]

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float
 from scipy import fft
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
 
 MIN_PERIODS = 3.0  # fewest periods in a record that counts as repeating

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import check_time
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.kernels import likelihood, smooth
 
 # The range extends from a memory of about 200 samples to interpolation.

@@ -11,7 +11,7 @@ from scipy.linalg import cholesky_banded, solveh_banded
 from scipy.optimize import minimize_scalar
 
 from ep2sindy.data.trajectory import check_time
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.

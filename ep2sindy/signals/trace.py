@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.runtime.arrays import read_only
+from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
 from ep2sindy.signals.spectrum import dominant_frequency
 

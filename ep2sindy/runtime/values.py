@@ -1,0 +1,60 @@
+"""Fields of immutable values: read-only copies of arrays, and checks of the settings that came."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from operator import index
+from typing import Protocol, SupportsIndex, cast
+
+import numpy as np
+
+
+def read_only(values: np.ndarray) -> np.ndarray:
+    """Copy to float64 and lock, so that the data of an object cannot change from outside."""
+    copy = np.array(values, dtype=np.float64, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+COUNTS = ("zero", "one", "two")
+
+
+def check_count(name: str, value: object, least: int = 1) -> int:
+    """Return a whole number, also one of NumPy, as an int; raise ValueError for anything else."""
+    try:
+        count = least - 1 if isinstance(value, bool) else index(cast(SupportsIndex, value))
+    except TypeError:
+        count = least - 1
+    if count < least:
+        raise ValueError(f"{name} must be a whole number, {COUNTS[least]} or more: {value!r} came")
+    return count
+
+
+def set_counts(settings: object, least: Mapping[str, int]) -> None:
+    """Check fields of a frozen value that hold whole numbers, and keep each as an int.
+
+    least: name of a field -> its least value.
+    """
+    for name, fewest in least.items():
+        object.__setattr__(settings, name, check_count(name, getattr(settings, name), fewest))
+
+
+def check_list(name: str, value: object) -> None:
+    """Raise ValueError for a text where a list belongs: it would be read letter by letter."""
+    if isinstance(value, str):
+        raise ValueError(f"{name} must be a list: {value!r} came; write [{value!r}]")
+
+
+def check_kind(name: str, value: object, kind: type, example: str) -> None:
+    """Raise ValueError for a value of the wrong type, or a class instead of an instance.
+
+    kind: a class, or a protocol; then the error names the members that the value lacks.
+    """
+    start = f"{name} must be a {kind.__name__}, such as {example}"
+    if isinstance(value, type):
+        raise ValueError(f"{start}: the class {value.__name__} came; call it to make a value")
+    if not isinstance(value, kind):
+        members = [m for m in vars(kind) if not m.startswith("_")]
+        lacking = [m for m in members if m not in dir(value)] if Protocol in kind.__mro__ else []
+        end = f", which has no {' and no '.join(lacking)}" if lacking else ""
+        raise ValueError(f"{start}: {value!r} came{end}")

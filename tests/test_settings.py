@@ -1,0 +1,116 @@
+"""Settings of the wrong kind are refused where they are given, with the way out."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+
+T = np.linspace(0.0, 3.0, 31)
+X = np.column_stack([np.exp(-T), np.sin(T)])
+RUN = ep.Trajectory(T, X, ["x", "y"])
+LIBRARY = ep.polynomial(["x", "y"], degree=2)
+ROWS = ep.Regression(bootstraps=ep.Bootstraps(n=2))
+
+TEXTS = {
+    "relations": lambda: ep.discover(RUN, LIBRARY, relations="x: x == 1"),
+    "relations ": lambda: ep.estimate(RUN, LIBRARY, relations="x: x == 1"),
+    "relations  ": lambda: ep.constraint(LIBRARY, {"x": ["x"]}, "x: x == 1"),
+    "the terms of 'x'": lambda: ep.discover(RUN, LIBRARY, terms={"x": "x*y"}),
+    "the terms of 'x' ": lambda: ep.estimate(RUN, LIBRARY, terms={"x": "x*y"}),
+    "the support of 'x'": lambda: ep.constraint(LIBRARY, {"x": "x*y"}),
+    "products": lambda: ep.polynomial(["x", "y"], degree=1, products="x*y"),
+    "functions": lambda: ep.polynomial(["x", "y"], degree=1, functions="sin"),
+    "variables": lambda: ep.polynomial("xy", degree=1),
+    "variables ": lambda: ep.named_terms("xy", ["x", "y"]),
+    "variables  ": lambda: ep.Library("xy", np.eye(2, dtype=np.int64)),
+    "names": lambda: ep.named_terms(["x", "y"], "xy"),
+    "states": lambda: ep.discovery.PointSearch("xy", LIBRARY, ROWS),
+    "judged": lambda: ep.FreeRunScore(judged="x"),
+    "exact_inputs": lambda: ep.Weak(exact_inputs="u"),
+    "state_names": lambda: ep.Trajectory(T, X, "xy"),
+    "input_names": lambda: ep.Trajectory(T, X[:, :1], ["x"], X[:, 1:], "u"),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_text_where_a_list_belongs_is_refused(name: str) -> None:
+    call: Callable[[], object] = TEXTS[name]
+    with pytest.raises(ValueError, match=rf"{name.strip()} must be a list: '.*' came; write \['"):
+        call()
+
+
+NO_COUNTS: dict[str, Callable[[object], object]] = {
+    "max_terms": lambda n: ep.BestSubset(max_terms=n),
+    "n_best": lambda n: ep.BestSubset(n_best=n),
+    "max_terms ": lambda n: ep.AdaptiveLasso(max_terms=n),
+    "max_terms  ": lambda n: ep.STLSQ(max_terms=n),
+    "n_thresholds": lambda n: ep.STLSQ(n_thresholds=n),
+    "max_terms   ": lambda n: ep.TrajectorySearch(max_terms=n),
+    "depth": lambda n: ep.TrajectorySearch(depth=n),
+    "depth ": lambda n: ep.Regression(depth=n),
+    "max_terms    ": lambda n: ep.estimate(RUN, LIBRARY, max_terms=n),
+    "n": lambda n: ep.Bootstraps(n=n),
+    "n_culled": lambda n: ep.Bootstraps(n_culled=n),
+    "block": lambda n: ep.Bootstraps(block=n),
+    "n_blocks": lambda n: ep.BlockSplit(n_blocks=n),
+    "n_steps": lambda n: ep.WeightedWeak(n_steps=n),
+    "n_folds": lambda n: ep.FreeRunScore(n_folds=n),
+    "n_starts": lambda n: ep.FreeRunScore(n_starts=n),
+    "n_windows": lambda n: ep.RefinedScore(n_windows=n),
+    "degree": lambda n: ep.polynomial(["x"], degree=n),
+    "function_degree": lambda n: ep.polynomial(
+        ["x"], degree=1, functions=["sin"], function_degree=n
+    ),
+}
+
+
+@pytest.mark.parametrize("count", [2.5, -1, "2", True, None], ids=str)
+@pytest.mark.parametrize("name", NO_COUNTS)
+def test_what_is_no_whole_number_is_refused(name: str, count: object) -> None:
+    if count is None and name.strip() == "max_terms":
+        return  # of some searches, all terms
+    message = f"^{name.strip()} must be a whole number, (zero|one|two) or more: {count!r} came$"
+    with pytest.raises(ValueError, match=message):
+        NO_COUNTS[name](count)
+
+
+def test_whole_numbers_of_numpy_are_taken_and_kept_as_they_are_written() -> None:
+    two = np.int64(2)
+    assert repr(ep.Regression(depth=two).depth) == "2"
+    assert ep.BestSubset(two, two) == ep.BestSubset(2, 2)
+    assert repr(ep.TrajectorySearch(two, depth=two)) == repr(ep.TrajectorySearch(2, depth=2))
+    assert ep.polynomial(["x"], degree=two).names == ("1", "x", "x^2")
+
+
+def test_a_split_holds_out_what_it_says_or_is_refused() -> None:
+    for fraction in (1.0, 2.0, -0.1, float("nan")):
+        with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\): "):
+            ep.RandomSplit(fraction)
+        with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\): "):
+            ep.BlockSplit(fraction)
+    with pytest.raises(ValueError, match="n_blocks must be a whole number, one or more: 0 came"):
+        ep.BlockSplit(n_blocks=0)
+
+
+WRONG_KINDS = [
+    (lambda: ep.WeightedWeak(weak=ep.Differential()), "weak must be a Weak, such as ep.Weak"),
+    (lambda: ep.Weak(smoother=None), r"smoother must be a Smoother, such as ep.signals.Kalman"),
+    (lambda: ep.Weak(test_functions=ep.Bumps), "test_functions must be a WindowFunctions, such as"),
+    (lambda: ep.Weak(split=0.25), r"split must be a Split, such as ep.RandomSplit\(\): 0.25 came"),
+    (lambda: ep.Differential(smoother="kalman"), "smoother must be a Smoother, such as ep.sig"),
+    (lambda: ep.Differential(split=None), "split must be a Split, such as ep.RandomSplit"),
+    (lambda: ep.discovery.PointSearch(["x"], None, ROWS), "library must be a Library, such as"),
+    (lambda: ep.FreeRunScore(bounds=0.1), "bounds must be a FreeRunBounds, such as ep.FreeRunB"),
+    (lambda: ep.Regression(selection=ep.Evidence()), "Evidence weighs what a search of trajector"),
+    (lambda: ep.estimate(RUN, None), "library must be a Library, such as ep.polynomial"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG_KINDS)
+def test_a_setting_of_another_kind_is_refused_before_the_search(
+    call: Callable[[], object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()

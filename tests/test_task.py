@@ -1,0 +1,144 @@
+"""What a method is asked: records that agree, a library, and what is known of the equations."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.data.coerce import Task
+from ep2sindy.discovery.method import DiscoveryMethod
+from ep2sindy.library.relations import parse_relation
+from ep2sindy.runtime.values import check_kind
+
+PREY = ep.lotka_volterra()
+RUN = PREY.trajectory(noise=0.02, rng=0).window(0, 200)
+OTHER = PREY.trajectory(noise=0.02, initial=np.array([0.3, 1.2]), rng=1).window(0, 200)
+LIBRARY = ep.polynomial(["x", "y"], degree=2)
+METHODS = pytest.mark.parametrize(
+    "method", [ep.TrajectorySearch(), ep.Regression()], ids=["trajectories", "rows"]
+)
+
+WRONG = {
+    "units": (
+        replace(OTHER, units={"x": "m^-3"}),
+        r"units must agree: 'x' is in 1 in trajectory 0 and in m\^-3 in trajectory 1; convert",
+    ),
+    "order": (
+        replace(OTHER, states=OTHER.states[:, ::-1], state_names=["y", "x"]),
+        r"trajectory 1 has states \['y', 'x'\] and inputs \[\]; give all of them the same states",
+    ),
+    "fewer": (
+        ep.Trajectory(OTHER.t, OTHER.states[:, :1], ["x"]),
+        r"trajectory 1 has states \['x'\] and inputs \[\]; give all of them the same states",
+    ),
+    "more": (
+        ep.Trajectory(OTHER.t, np.column_stack([OTHER.states, np.sin(OTHER.t)]), ["x", "y", "z"]),
+        r"trajectory 1 has states \['x', 'y', 'z'\] and inputs \[\]; give all of them",
+    ),
+    "repeated": (RUN, "every sample must come once: 200 samples in a row stand in"),
+}
+
+
+@METHODS
+@pytest.mark.parametrize("wrong", WRONG)
+def test_runs_that_do_not_agree_are_refused_by_every_method(method, wrong: str) -> None:
+    other, message = WRONG[wrong]
+    with pytest.raises(ValueError, match=message):
+        ep.discover([RUN, other], LIBRARY, method)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_runs_that_do_not_agree_are_not_estimated(wrong: str) -> None:
+    other, message = WRONG[wrong]
+    with pytest.raises(ValueError, match=message):
+        ep.estimate([RUN, other], LIBRARY)
+
+
+ASKED = [
+    ({"terms": {"z": ["x"]}}, r"unknown state 'z'; there are \['x', 'y'\]"),
+    ({"terms": {"z": []}}, r"unknown state 'z'; there are \['x', 'y'\]"),
+    ({"terms": {"x": []}}, r"an equation whose terms are given must have some: \['x'\]"),
+    ({"terms": {"x": ["x^3"]}}, "unknown term 'x\\^3'; this library has"),
+    ({"relations": ["z: x == 1"]}, r"unknown state 'z'; there are \['x', 'y'\]"),
+    ({"relations": ["x: w == 1"]}, "unknown variable 'w'"),
+    ({"runs": []}, "needs at least one run: an empty list came"),
+    ({"library": ep.polynomial(["x", "u"], degree=1)}, r"the library needs \['u'\]: sample it as"),
+]
+
+
+@pytest.mark.parametrize(("asked", "message"), ASKED)
+def test_what_cannot_be_asked_is_not_estimated(asked: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ep.estimate(**({"runs": [RUN], "library": LIBRARY} | asked))
+
+
+def test_an_estimate_takes_runs_and_relations_as_discover_does() -> None:
+    whole = ep.estimate([RUN], LIBRARY, relations=["x: x*y == -1 * y: x*y"])
+    terms = whole.model.terms("x"), whole.model.terms("y")
+    assert terms[0]["x*y"] == pytest.approx(-terms[1]["x*y"], rel=1e-12)
+    alone = ep.estimate(RUN, LIBRARY, relations=["x: x*y == -1 * y: x*y"])
+    assert np.array_equal(alone.model.coef, whole.model.coef)
+
+
+def test_a_task_keeps_its_values_and_takes_a_tuple_of_runs() -> None:
+    terms = {"x": ["x", "x*y"]}
+    task = Task([RUN, OTHER], LIBRARY, [parse_relation("y: y == 1")], terms)
+    terms["x"].append("y")
+    assert task.states == ("x", "y")
+    assert task.terms == {"x": ("x", "x*y")}
+    assert [each.text for each in task.relations] == ["y: y == 1"]
+    assert replace(task, relations=()).runs == task.runs == (RUN, OTHER)
+    with pytest.raises(TypeError):
+        task.terms["y"] = ["y"]
+
+
+def driven(x0: float, f_Hz: float) -> ep.Trajectory:
+    """x' = -x + 2 u - v with u = sin(w t) and v = cos(w t), and an input that no term uses."""
+    t, w = np.linspace(0.0, 12.0, 241), 2.0 * np.pi * f_Hz
+    u, v = np.sin(w * t), np.cos(w * t)
+    forced = ((2.0 - w) * u - (1.0 + 2.0 * w) * v) / (1.0 + w**2)
+    x = forced + (x0 - forced[0]) * np.exp(-t)
+    return ep.Trajectory(t, x[:, None], ["x"], np.column_stack([u, v, t]), ["u", "v", "extra"])
+
+
+@METHODS
+def test_inputs_are_taken_by_name_in_every_run(method) -> None:
+    first, second = driven(1.0, 0.2), driven(-2.0, 0.35)
+    swapped = replace(second, inputs=second.inputs[:, [1, 0]], input_names=["v", "u"])
+    library = ep.polynomial(["x", "u", "v"], degree=1)
+    found = ep.discover([first, swapped], library, method)
+    assert found.model.terms("x") == pytest.approx({"x": -1.0, "u": 2.0, "v": -1.0}, rel=1e-2)
+    other = ep.discover([first, second], library, method)
+    assert np.array_equal(found.model.coef, other.model.coef)
+
+
+class Smallest:
+    """A method of one's own, which asks another one."""
+
+    selection = ep.Evidence()
+
+    def identify(self, task, *, rng, progress):
+        return ep.TrajectorySearch(max_terms=2).identify(task, rng=rng, progress=progress)
+
+
+def test_a_method_needs_no_more_than_a_rule_and_an_answer() -> None:
+    found = ep.discover(RUN, LIBRARY, Smallest())
+    assert set(found.model.terms("x")) == {"x", "x*y"}
+    assert "chosen by Evidence()" in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("value", "lacking"),
+    [
+        (ep.BestSubset(), "which has no selection and no identify"),
+        (ep.EBIC(), "which has no selection and no identify"),
+        (SimpleNamespace(selection=ep.EBIC()), "which has no identify"),
+        (ep.Regression, "the class Regression came; call it to make a value$"),
+    ],
+)
+def test_what_is_no_method_is_refused_with_what_it_lacks(value: object, lacking: str) -> None:
+    message = f"(?s)^method must be a DiscoveryMethod, such as ep.Regression.*{lacking}"
+    with pytest.raises(ValueError, match=message):
+        check_kind("method", value, DiscoveryMethod, "ep.Regression()")
