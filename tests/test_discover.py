@@ -5,10 +5,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery import choice
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.method import AnyMethod, Known, Regression, TrajectorySearch
+from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.names import split_factors
 from ep2sindy.library.relations import Relation, relations_of
@@ -210,8 +211,9 @@ def test_the_free_coefficients_of_related_equations_are_counted(
     relations: list[str], n_free: dict[str, int]
 ) -> None:
     run, library = lotka_volterra().trajectory(), named_terms(["x", "y"], ["x", "y", "x*y"])
-    known = Known(relations_of(relations), {"x": ["x", "x*y"], "y": ["y", "x*y"]})
-    found = Regression().identify([run], library, known, rng=np.random.default_rng(0))
+    terms = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
+    task = Task([run], library, relations_of(relations), terms)
+    found = Regression().identify(task, rng=np.random.default_rng(0))
     assert found.choice.n_free == n_free
 
 
