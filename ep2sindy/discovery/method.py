@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ep2sindy.data.coerce import Task
-from ep2sindy.data.numbers import column_norms, zero_to_one
+from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import Choice, choose, choose_by_runs
@@ -204,7 +204,6 @@ def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
     """Terms whose values at the samples cannot be told apart."""
     library = task.library
     theta = library.evaluate(np.concatenate([r.columns(library.variables) for r in task.runs]))
-    theta = theta / zero_to_one(np.abs(theta).max(axis=0))  # else squares of densities overflow
     theta = theta / column_norms(theta)
     return find_ambiguities(library, theta, theta.T @ theta)
 
