@@ -126,7 +126,7 @@ CALLS = [
     (old, call)
     for old, text in {**NOTES, **GONE}.items()
     for call in re.findall(r"[\w.]+\([^()]*\)", text)
-    if call.partition("(")[0].split(".")[0] not in {"front", "law", "model_at", "pysindy"}  # not the face's
+    if not call.startswith(("front.", "law.", "model_at(", "pysindy."))  # these are not the face's
 ]
 
 
