@@ -249,7 +249,7 @@ def cold_xenon(hottest_eV):
 
 
 def test_drift_beyond_the_table_is_no_divergence():
-    """T_e stays cold while a spike of the field drives T_e + 2K/3 beyond the 200 eV of the table."""
+    """T_e stays cold while a spike of the field drives T_e + 2K/3 beyond the table's 200 eV."""
     field = calibrated_run("withplume", duration_s=3e-5, n_cells=60)
     assert field.attrs["status"] != "diverged"
     assert field.sizes["time"] == 21
