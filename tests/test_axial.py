@@ -232,7 +232,26 @@ def test_a_result_names_its_cycle(amplitude, cycle):
     t = 1.5e-6 * np.arange(4000)
     current = 4.0 + amplitude * np.sin(2.0 * np.pi * 14e3 * t)
     field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
-    assert diagnose(field, diverged=False)["cycle"] == cycle
+    assert diagnose(field, diverged=False, flow_A=4.0)["cycle"] == cycle
+
+
+@pytest.mark.parametrize(("late_A", "status"), [(0.0, "out"), (0.39, "out"), (0.41, "steady")])
+def test_a_discharge_that_has_gone_out_is_not_steady(late_A, status):
+    current = np.append(np.full(2000, 4.0), np.full(2000, late_A))
+    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": 1.5e-6 * np.arange(4000)})
+    assert diagnose(field, diverged=False, flow_A=4.0)["status"] == status
+
+
+def test_efficiency_is_by_the_mean_power(run):
+    """A series resistor lowers the voltage where the current is high."""
+    resistive = simulate(ep.thruster.Thruster(series_resistance=10.0))
+    for field in (run, resistive):
+        power = float((field["I_d"] * field["V_d"]).mean())
+        squared = float(field["thrust"].mean()) ** 2
+        expected = squared / (2.0 * 1e-6 * POINT.mass_flow_mg_s * power)
+        assert field.attrs["anode_efficiency"] == pytest.approx(expected, rel=1e-12)
+    apart = float(resistive["I_d"].mean() * resistive["V_d"].mean())
+    assert power < 0.999 * apart
 
 
 def cold_xenon(hottest_eV):
