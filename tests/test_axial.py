@@ -6,6 +6,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
+from benchmarks.hallthruster import calibrated_run
 from ep2sindy.thruster.axial.electron_kernels import solve_from_both_ends
 from ep2sindy.thruster.axial.model import cell_faces
 from ep2sindy.thruster.verdict import diagnose, judge_status
@@ -231,7 +232,26 @@ def test_a_result_names_its_cycle(amplitude, cycle):
     t = 1.5e-6 * np.arange(4000)
     current = 4.0 + amplitude * np.sin(2.0 * np.pi * 14e3 * t)
     field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
-    assert diagnose(field, diverged=False)["cycle"] == cycle
+    assert diagnose(field, diverged=False, flow_A=4.0)["cycle"] == cycle
+
+
+@pytest.mark.parametrize(("late_A", "status"), [(0.0, "out"), (0.39, "out"), (0.41, "steady")])
+def test_a_discharge_that_has_gone_out_is_not_steady(late_A, status):
+    current = np.append(np.full(2000, 4.0), np.full(2000, late_A))
+    field = xr.Dataset({"I_d": ("time", current)}, coords={"time": 1.5e-6 * np.arange(4000)})
+    assert diagnose(field, diverged=False, flow_A=4.0)["status"] == status
+
+
+def test_efficiency_is_by_the_mean_power(run):
+    """A series resistor lowers the voltage where the current is high."""
+    resistive = simulate(ep.thruster.Thruster(series_resistance=10.0))
+    for field in (run, resistive):
+        power = float((field["I_d"] * field["V_d"]).mean())
+        squared = float(field["thrust"].mean()) ** 2
+        expected = squared / (2.0 * 1e-6 * POINT.mass_flow_mg_s * power)
+        assert field.attrs["anode_efficiency"] == pytest.approx(expected, rel=1e-12)
+    apart = float(resistive["I_d"].mean() * resistive["V_d"].mean())
+    assert power < 0.999 * apart
 
 
 def cold_xenon(hottest_eV):
@@ -247,9 +267,17 @@ def cold_xenon(hottest_eV):
     return ep.thruster.Thruster(propellant=table)
 
 
+def test_drift_beyond_the_table_is_no_divergence():
+    """T_e stays cold while a spike of the field drives T_e + 2K/3 beyond the table's 200 eV."""
+    field = calibrated_run("withplume", duration_s=3e-5, n_cells=60)
+    assert field.attrs["status"] != "diverged"
+    assert field.sizes["time"] == 21
+    assert float(field["T_e_eV"].max()) < 60.0
+
+
 def test_rates_that_do_not_cover_the_run_say_so():
     field = simulate(cold_xenon(12.0))
-    assert "cover T_e up to 12 eV, the run reached" in field.attrs["rates"]
+    assert "cover T_e up to 12 eV, and the run reached T_e + 2K/3" in field.attrs["rates"]
     field = simulate(cold_xenon(30.0))  # T_e stays below 30 eV, T_e + 2 K/3 does not
     assert float(field["T_e_eV"].max()) < 30.0
     assert "cover T_e up to 30 eV" in field.attrs["rates"]

@@ -263,7 +263,7 @@ def rows(points: Sequence[tuple]) -> pd.DataFrame:
     return table.assign(f_kHz=table["f_kHz"].where(moves))
 
 
-STATUSES = ("oscillating", "steady", "decaying", "transit", "diverged", "failed")
+STATUSES = ("oscillating", "steady", "decaying", "transit", "out", "diverged", "failed")
 
 
 def test_a_stability_map_names_every_cell() -> None:
@@ -274,7 +274,7 @@ def test_a_stability_map_names_every_cell() -> None:
     assert texts[0] == "0.00 A\n14.0 kHz\nweak"
     assert [text.splitlines()[-1] for text in texts[1:]] == list(STATUSES[1:])
     assert texts[3] == "1.50 A\n14.0 kHz\ntransit"
-    assert not any("A" in text for text in texts[4:])  # their current says nothing
+    assert not any("A" in text for text in texts[5:])  # their current says nothing
     hatches = [patch.get_hatch() for patch in panel.patches]
     assert hatches[0] is None
     assert len(set(hatches)) == len(STATUSES)
@@ -305,6 +305,7 @@ def test_curves_tell_statuses_by_markers(along: str) -> None:
         ({"status": "steady"}, "the simulation is steady: there is no oscillation"),
         ({"status": "decaying"}, "dies out"),
         ({"status": "diverged"}, "the simulation diverged"),
+        ({"status": "out"}, "the discharge has gone out"),
         ({"status": "transit", "f_kHz": 150.0}, "oscillates at 150 kHz, above 60 kHz"),
         ({"rates": "the rates of krypton cover T_e up to 100 eV"}, "the rates of krypton"),
         ({"mass_balance": 1.002}, "mass balance does not close: (out + stored)/in is 1.0020"),

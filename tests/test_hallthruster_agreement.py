@@ -6,9 +6,12 @@ from benchmarks.hallthruster import (
     DECAY,
     LANDMARK,
     RATE_TABLE,
+    STORED,
     TUTORIAL,
+    calibrated_run,
     decay_rate,
     deviations,
+    figures,
     landmark_run,
     late,
     net_thrust,
@@ -33,6 +36,18 @@ def test_spt100_tutorial_has_their_current_thrust_and_profiles():
     assert off["n_i"] < 0.05  # 0.030
     assert off["n_n"] < 0.03  # 0.014
     assert off["E_z"] < 0.015  # 0.008
+
+
+@pytest.mark.parametrize("name", list(STORED))
+def test_calibrated_spt100_has_their_current_beam_and_temperature(name):
+    """Their fields drive electrons to drift energies beyond the table of rates, at 25 to 40 eV."""
+    run = calibrated_run(name)
+    assert run.attrs["status"] != "diverged"
+    assert "T_e + 2K/3" in run.attrs["rates"]
+    ours, theirs = figures(run), STORED[name]
+    assert ours["I_d"] == pytest.approx(theirs["I_d"], rel=0.02)
+    assert ours["beam"] == pytest.approx(theirs["beam"], rel=0.03)
+    assert ours["T_e"] == pytest.approx(theirs["T_e"], rel=0.06)
 
 
 @needs_table

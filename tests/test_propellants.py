@@ -1,5 +1,7 @@
 """Rate coefficients of the propellants: against published figures, and tables that are refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -189,10 +191,14 @@ def test_rates_must_cover_the_ends_of_the_discharge():
 def test_a_run_beyond_the_table_says_how_far_it_got():
     assert describe_uncovered(ep.thruster.propellant("krypton"), 99.0) is None
     assert describe_uncovered(XenonFits(), 199.0) is None
+    krypton = ep.thruster.propellant("krypton")
     message = (
-        "the rates of krypton cover T_e up to 100 eV, the run reached 120 eV; extend the table"
+        "the rates of krypton cover T_e up to 100 eV, and the run reached T_e + 2K/3 (K: energy of "
+        "the electrons' drift) of 120 eV, where the value at 100 eV is taken; extend the table"
     )
-    assert describe_uncovered(ep.thruster.propellant("krypton"), 120.0) == message
+    assert describe_uncovered(krypton, 120.0) == message
+    still = replace(krypton, drift_weight=0.0)
+    assert "and the run reached T_e of 120 eV, where" in str(describe_uncovered(still, 120.0))
 
 
 def test_a_second_charge_needs_its_rates():

@@ -27,8 +27,11 @@ from ep2sindy.figures.style import (
 )
 
 BREATHES = "oscillating"
-HATCHES = {"steady": "//", "decaying": "\\\\", "transit": "..", "diverged": "xx", "failed": "++"}
-STATUS_MARKERS = {BREATHES: "o", "steady": "s", "decaying": "v", "transit": "D"}
+HATCHES = {
+    "steady": "//", "decaying": "\\\\", "transit": "..", "out": "--", "diverged": "xx",
+    "failed": "++",
+}  # fmt: skip
+STATUS_MARKERS = {BREATHES: "o", "steady": "s", "decaying": "v", "transit": "D", "out": "_"}
 WORTHLESS = ("diverged", "failed")  # statuses whose current is meaningless
 CURVES = {  # column -> title, factor
     "I_d_mean": ("discharge current (A)", 1.0),

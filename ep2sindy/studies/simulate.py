@@ -474,6 +474,6 @@ class ScanOutcome:
         return {"statuses": self._counts, "points": self.rows.to_dict("records")}
 
     def headline(self) -> dict[str, float]:
-        names = ("oscillating", "transit", "steady", "decaying", "diverged", FAILED)
+        names = ("oscillating", "transit", "steady", "decaying", "out", "diverged", FAILED)
         counts = {f"n_{name}": float(self._counts.get(name, 0)) for name in names}
         return {"n_points": float(len(self.points)), **counts}

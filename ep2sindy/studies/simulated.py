@@ -17,6 +17,7 @@ BALANCE_TOLERANCE = 1e-3  # relative to the inflow; a float32 record closes to 1
 BALANCES = {"mass_balance": "mass", "energy_balance": "energy"}
 VERDICTS = {
     "diverged": "the simulation diverged: the end of its record is no physics",
+    "out": "the discharge has gone out: there is no plasma to learn from",
     "steady": "the simulation is steady: there is no oscillation to learn from",
     "decaying": "the simulation's oscillation dies out: what is found describes a transient",
 }

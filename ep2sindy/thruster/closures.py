@@ -9,7 +9,7 @@ from ep2sindy.thruster.parameters import Thruster
 from ep2sindy.thruster.propellants import PropellantTable
 
 TABLE_STEP_EV = 0.02  # linear interpolation is then within 5e-4 of the formulas above 2 eV
-TABLE_TOP_EV = 200.0  # the fits end below; a larger mean energy counts as divergence
+TABLE_TOP_EV = 200.0  # the fits end below; a higher T_e counts as divergence
 
 # Columns, one row per temperature; coefficients in SI, energies in eV.
 (

@@ -201,7 +201,7 @@ def conduction_of(node: Node) -> tuple[float, float]:
 
 GASES = {"Xenon": "xenon", "Krypton": "krypton", "Argon": "argon"}
 GASES |= {"Xe": "xenon", "Kr": "krypton", "Ar": "argon"}
-# The stored runs of HallThruster.jl use a coarser xenon table than its later versions.
+# All releases of HallThruster.jl have this table of xenon; that of 1 eV steps is a side branch's.
 RATES_OF = {"xenon": "xenon_5eV", "krypton": "krypton", "argon": "argon"}
 # Keys that are supported at this value only; any other would change the simulation.
 CONFIG_AT_REST: dict[str, Any] = {

@@ -289,11 +289,16 @@ def gas_name(propellant: Propellant) -> str:
 
 
 def describe_uncovered(propellant: Propellant, reached_eV: float) -> str | None:
-    """Message if a run reached a T_e that the rates do not cover; otherwise None."""
+    """Message if a run needed rates beyond those that there are; otherwise None.
+
+    reached_eV: highest T_e + 2 K/3, at which rates are taken; K is the energy of the electrons'
+    drift, for propellants that count it.
+    """
     if propellant.range_eV is None or reached_eV <= propellant.range_eV[1]:
         return None
+    top = propellant.range_eV[1]
+    energy = "T_e + 2K/3 (K: energy of the electrons' drift)" if propellant.drift_weight else "T_e"
     return (
-        f"the rates of {gas_name(propellant)} cover T_e up to {propellant.range_eV[1]:g} eV, "
-        "the run "
-        f"reached {reached_eV:g} eV; extend the table"
+        f"the rates of {gas_name(propellant)} cover T_e up to {top:g} eV, and the run reached "
+        f"{energy} of {reached_eV:g} eV, where the value at {top:g} eV is taken; extend the table"
     )

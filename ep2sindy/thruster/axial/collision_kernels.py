@@ -23,11 +23,16 @@ from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 @compiled(**FAST)
 def table_rows(T, drift, weight, model, row, share):
-    """Row below T + 2 K/3 in the closure table, share of the row above; False off the table."""
+    """Row below T + 2 K/3 in the closure table, share of the row above; False off the table.
+
+    T alone must lie in the table. The drift energy K is large in a spike of the field, while
+    electrons stay cold: where it leads beyond the table, the table's end is taken.
+    """
     per_eV, top = 1.0 / model.table_step_eV, model.table.shape[0] - 2.0
     weight = weight * 2.0 / 3.0
+    most = top if weight > 0.0 else np.inf
     for i in range(T.size):
-        share[i] = (T[i] + weight * drift[i]) * per_eV
+        share[i] = min((T[i] + weight * drift[i]) * per_eV, most)
     n_off = 0
     for i in range(T.size):
         n_off += 0 if 0.0 <= share[i] <= top else 1
@@ -63,7 +68,7 @@ def collisions(state, model, rows, w):
     """Collision frequency w[0] and mobility w[1], losses w[3] and w[5] with slopes w[4] and w[6].
 
     w[3] is the inelastic loss and w[5] the loss to the walls, in eV/(m^3 s). rows: (n + 2,).
-    Returns False if the temperature leaves the table.
+    Returns False if T_e leaves the table.
     """
     table, row, share, T, drift = model.table, rows, w[8], state.T_e_eV, state.drift_eV
     nu, mobility, value, n, nn = w[0], w[1], w[7], state.n_e, state.n_n

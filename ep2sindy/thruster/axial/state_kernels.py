@@ -109,7 +109,7 @@ class AxialState(NamedTuple):
     rates: np.ndarray  # (3, n + 2), m^3/s: X -> X+, X -> X2+, X+ -> X2+
     wall_loss: np.ndarray  # (n + 2,), 1/s, of singly charged ions
     instant: np.ndarray  # (series,), the series' present values
-    hottest_eV: np.ndarray  # (1,), highest temperature that rates were taken at, sample by sample
+    hottest_eV: np.ndarray  # (1,), highest T_e + 2 K/3 at the ends of samples
 
 
 class Sums(NamedTuple):

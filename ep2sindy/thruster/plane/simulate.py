@@ -124,7 +124,7 @@ def simulate_as(
         "title": "2-D (z, r) Hall-thruster fluid model",
         "note": "electrons are quasi-one-dimensional: T_e_eV, R_ion and E_z depend on z alone",
         "parameters": to_json(parameters),
-        **diagnose(field, operating_point, diverged=len(rows.series) < n_samples),
+        **diagnose(field, operating_point, model.ion_mass, diverged=len(rows.series) < n_samples),
     }
     return field
 
@@ -194,9 +194,12 @@ def labelled(rows: Rows, sample_s: float, grid: MaskedGrid) -> xr.Dataset:
     return as_dataset(data, sample_s=sample_s, n_samples=len(rows.series), z=grid.z, r=grid.r)
 
 
-def diagnose(field: xr.Dataset, point: OperatingPoint, *, diverged: bool) -> dict[str, Any]:
+def diagnose(
+    field: xr.Dataset, point: OperatingPoint, ion_mass: float, *, diverged: bool
+) -> dict[str, Any]:
     """Status, cycle, frequency, current, performance and mass balance."""
-    found = {"initial": "guessed profiles", **outcome(field, point, diverged=diverged)}
+    found: dict[str, Any] = {"initial": "guessed profiles"}
+    found |= outcome(field, point, ion_mass=ion_mass, diverged=diverged)
     if field.sizes["time"] > 1:
         found["mass_balance"] = mass_balance(field, point)
     return found
