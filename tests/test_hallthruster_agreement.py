@@ -3,8 +3,10 @@
 import pytest
 
 from benchmarks.hallthruster import (
+    CASE_1_HZ,
     DECAY,
     LANDMARK,
+    NEUTRAL_SOUND,
     RATE_TABLE,
     STORED,
     TUTORIAL,
@@ -14,6 +16,7 @@ from benchmarks.hallthruster import (
     figures,
     landmark_run,
     late,
+    line_Hz,
     net_thrust,
     stored,
     tutorial_run,
@@ -48,6 +51,19 @@ def test_calibrated_spt100_has_their_current_beam_and_temperature(name):
     assert ours["I_d"] == pytest.approx(theirs["I_d"], rel=0.02)
     assert ours["beam"] == pytest.approx(theirs["beam"], rel=0.03)
     assert ours["T_e"] == pytest.approx(theirs["T_e"], rel=0.06)
+
+
+@needs_table
+def test_landmark_case_1_with_their_wave_speed_of_the_neutrals_is_theirs():
+    """Their neutrals' flux takes a speed of sound, which at first order damps the breathing."""
+    run = landmark_run(1, neutral_wave=NEUTRAL_SOUND)
+    part = late(run)["I_d"]
+    off = deviations(late(run).mean("time"), stored("hallthruster_landmark_1.csv"))
+    assert float(part.mean()) == pytest.approx(LANDMARK[1][0], rel=0.005)
+    assert float(part.std()) < 0.6  # 0.48, where theirs has 0.16; 3.4 without that speed
+    assert line_Hz(run) == pytest.approx(CASE_1_HZ, rel=0.03)
+    assert off["n_i"] < 0.02  # 0.011
+    assert max(off[name] for name in ("n_n", "T_e_eV", "E_z")) < 0.015  # 0.001, 0.004, 0.013
 
 
 @needs_table

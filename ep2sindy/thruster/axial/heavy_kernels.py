@@ -97,11 +97,18 @@ def births(n, g, nn, state, model, gain, momentum, consumed):
 
 @compiled(**FAST)
 def neutral_fluxes(nn, model, at_anode, slopes, f_nn):
-    """Fluxes of neutrals; ions that reached the anode return as neutrals."""
+    """Upwind fluxes of neutrals; ions that reached the anode return as neutrals.
+
+    With `neutral_wave` they are Rusanov fluxes at that much more than the neutrals' speed.
+    """
     half_slopes(nn, model, slopes)
     f_nn[0] = model.neutral_inflow - at_anode
     for i in inside(nn):
         f_nn[i] = model.neutral_speed * (nn[i] + slopes[i])
+    if model.neutral_wave > 0.0:
+        for i in range(1, nn.size - 2):
+            jump = nn[i + 1] - slopes[i + 1] - nn[i] - slopes[i]
+            f_nn[i] -= 0.5 * model.neutral_wave * jump
 
 
 @compiled(**FAST)

@@ -64,6 +64,7 @@ def build_model(
         ion_mass=mass,
         sound_speed_squared=K_BOLTZMANN * thruster.ion_temperature / mass,
         neutral_speed=point.neutral_speed,
+        neutral_wave=0.0,
         birth_speed=0.0 if thruster.ions_born_at_rest else point.neutral_speed,
         neutral_inflow=1e-6 * point.mass_flow_mg_s / (mass * thruster.area),
         voltage=point.voltage - thruster.cathode_potential,

@@ -68,6 +68,7 @@ class AxialModel(NamedTuple):
     ion_mass: float  # kg
     sound_speed_squared: float  # k_B T_i / m, m^2/s^2
     neutral_speed: float  # m/s
+    neutral_wave: float  # m/s: wave speed beyond it in the neutrals' flux, 0 but in comparisons
     birth_speed: float  # of ions born of neutrals, m/s
     neutral_inflow: float  # 1/(m^2 s)
     voltage: float  # V_0 - V_c, V
