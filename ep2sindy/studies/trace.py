@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
+from ep2sindy.data.conversion import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.discover import Discovery, discover
@@ -78,8 +80,8 @@ class Study:
     signal: the variable. unit: needed if the data group does not describe the signal, or to
     override its unit; None takes the described unit, or none. offset: added to the samples, in SI.
     embedding: auto, log_rate, rate or delays. harmonics: number of harmonics of the period that the
-    smoother follows. decimate, detrend: see `trace`. degree: of the library. held_out: the share at
-    the end of the record that is not fitted and serves as the test.
+    smoother follows. decimate, detrend: see `from_one_signal`. degree: of the library. held_out:
+    the share at the end of the record that is not fitted and serves as the test.
     """
 
     source: Source
@@ -125,6 +127,9 @@ class Study:
         space = [axis for axis, bounds in (("z", zone.z), ("r", zone.r)) if bounds is None]
         data = only(self.source.data, self.signal, self.unit, without=space)
         source = replace(self.source, data=data)
+        if self.unit is not None and data.settings.get("variables") is None:
+            step = partial(in_unit, signal=self.signal, unit=self.unit)
+            source = replace(source, prepare=[step, *source.prepare])
         with run.progress(None, "", "data"):
             field = source.field()
         sampled = source.sampled(field, [], run)
@@ -201,6 +206,21 @@ def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str
     if unit is not None:
         places[f"variables.{signal}.unit"] = unit
     return data.changed(places)
+
+
+def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
+    """A field whose signal, so far without a unit, is converted from this unit to SI.
+
+    Raises ValueError if the data already say the signal's unit.
+    """
+    if signal not in field:
+        return field  # the trajectory reports what the data hold
+    if (stated := field[signal].attrs.get("units", "1")) != "1":
+        raise ValueError(
+            f"unit is for a signal whose unit the data do not say: {signal} comes in {stated!r}, "
+            f"and unit={unit} came; leave unit out, or describe the file by data=file"
+        )
+    return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
 
 
 def count_fitted(signal: Trace, states: Trajectory, held_out: float) -> int:
