@@ -17,6 +17,8 @@ from ep2sindy.studies.libraries import Study
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
 
+NO_LIVING = ("living=null", "held_out=null", "compared=null")
+
 
 def breathing(path: Path, output: Path) -> list[str]:
     """Overrides that run `+exp=breathing` on a file."""
@@ -152,7 +154,7 @@ def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) 
 
 
 def test_a_fixed_seed_gives_the_same_summary(predator_prey: Path, tmp_path: Path) -> None:
-    small = ["~libraries.ionization", "~libraries.velocity", "living=null"]
+    small = ["~libraries.ionization", "~libraries.velocity", *NO_LIVING]
     texts = []
     for seed in (0, 0, 1):
         given = [*breathing(predator_prey, tmp_path), *small, f"seed={seed}"]
@@ -227,6 +229,7 @@ def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed
 
 
 def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
+    assert years.summary["models"]["model"]["note"] == ""  # the section on the samples says it
     found = years.summary["models"]["model"]["estimate"]
     spread = years.outcome.data.states.std(axis=0)
     # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
@@ -254,6 +257,22 @@ def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> 
     )
     equations = computed(config).summary["models"]["model"]["equations"]
     assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
+
+
+def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_path: Path) -> None:
+    found = computed(
+        composed(
+            "+exp=discover", "data=file", f"data.path={predator_prey}", f"output={tmp_path}",
+            "trajectory.states=[n_i,n_n]", "search=best_subset", "search.max_terms=2",
+            "selection=free_run", "selection.n_windows=6", "selection.n_folds=2", "depth=1",
+            "bootstraps.n=4",
+        )
+    )  # fmt: skip
+    model = found.summary["models"]["model"]
+    assert model["note"] == found.outcome.results["model"].discovery.note != ""
+    log = " ".join(found.log.split())
+    assert log.count(model["note"]) == 1
+    assert "equations selected by free runs or refinements; run freely" in found.page
 
 
 @pytest.mark.parametrize(
@@ -307,7 +326,7 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
             "depth=2",
             "~libraries.ionization",
             "~libraries.velocity",
-            "living=null",
+            *NO_LIVING,
         )
     )
     found = result.summary["models"]["simple"]["equations"]
@@ -339,7 +358,7 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         f"data.cache={tmp_path / 'cache'}",
         "bootstraps.n=4",
         "libraries.ionization.degree=2",
-        "living=null",
+        *NO_LIVING,
         f"output={tmp_path}",
     )
     found = computed(config)
@@ -355,6 +374,8 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+libraries.simple.degre=3"], "libraries.simple may have"),
         (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
+        (["living=null"], "held_out and compared would do nothing: they are for a model that"),
+        (["living=null", "held_out=null"], "compared would do nothing"),
         (["+seeds=1"], "unknown keys ['seeds']; there are "),
         (["seed=abc"], "seed must be a whole number"),
         (["depth=0"], "depth must be a whole number, one or more: 0 came"),
