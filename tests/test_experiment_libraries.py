@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,12 @@ from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
+from ep2sindy.studies.living import run_title
+from ep2sindy.systems.systems import lotka_volterra
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
 
@@ -92,6 +96,13 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     names = {path.name for path in (breathing_run / "tables").iterdir()}
     assert {"living.csv", "coefficients_living.csv", "roles_simple.csv"} <= names
     assert "simple: a model that lives" in (breathing_run / "run.log").read_text()
+
+
+def test_a_run_without_a_period_is_not_said_to_keep_none() -> None:
+    model = lotka_volterra().model
+    run = free_run(model, lotka_volterra().trajectory())
+    assert run_title(run).endswith(f"in phase for {round(run.periods)} periods")
+    assert run_title(replace(run, periods=np.nan)).endswith("over held-out time")
 
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:

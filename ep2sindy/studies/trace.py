@@ -32,7 +32,7 @@ from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.model.stability import LimitCycle, share_reaching
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.report.run import Run
@@ -41,7 +41,7 @@ from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
 from ep2sindy.signals.trace import MIN_PERIODS, Trace, from_one_signal
 from ep2sindy.studies.library_result import CandidateRow, candidate_rows
-from ep2sindy.studies.living import cycle_of, runs_from
+from ep2sindy.studies.living import WAVEFORM, FreeCycle, runs_from
 from ep2sindy.studies.source import Source, data_summary, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
 from ep2sindy.studies.views import (
@@ -67,7 +67,7 @@ CAPTIONS = {
     "(grey): the first periods, and the last.",
     "plane": "The model's cycle in the plane of both states, over the data (grey), and runs from "
     "other starts.",
-    "waveform": "One period by phase, shown twice: samples, their waveform, and the model's.",
+    "waveform": WAVEFORM,
     "front": "Error of the derivative against number of terms: every candidate that was refined "
     "and run freely; the star is selected, by its free runs.",
 }
@@ -251,18 +251,16 @@ def evaluate(
     """Run the model freely over the held-out part, and compare it to the measured signal."""
     measured = as_measured(signal, held)
     run: FreeRun = free_run(found.model, measured, initial=held.states[0], judged=(signal.name,))
-    cycle = cycle_of(run)
-    share = float("nan") if cycle is None else share_reaching(found.model, cycle)
-    return Outcome(signal, chosen, found, states, measured, run, cycle, share, label)
+    return Outcome(signal, chosen, found, states, measured, FreeCycle.of(run), label)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """The model found from one signal, and its tests.
 
-    states: all of the record, smoothed. measured: the test data, with the signal as measured. run:
-    the model over them, from their first smoothed sample. cycle: the model's limit cycle, if it has
-    one. share: share of the starts that reach it. label: name of the scores.
+    states: all of the record, smoothed. measured: the test data, with the signal as measured. free:
+    the run of the model over them, from their first smoothed sample, and its cycle. label: name of
+    the scores.
     """
 
     signal: Trace
@@ -270,10 +268,16 @@ class Outcome:
     found: Discovery
     states: Trajectory
     measured: Trajectory
-    run: FreeRun
-    cycle: LimitCycle | None
-    share: float
+    free: FreeCycle
     label: str
+
+    @property
+    def run(self) -> FreeRun:
+        return self.free.run
+
+    @property
+    def cycle(self) -> LimitCycle | None:
+        return self.free.cycle
 
     @property
     def model(self) -> SparseModel:
@@ -382,19 +386,7 @@ class Outcome:
     def _stability(self) -> list[tuple[str, bool]]:
         if self.cycle is None:
             return [("the model has no cycle near its run", True)]
-        text = (
-            f"cycle {self.cycle.stability}: of a departure {self.multiplier:.3g} is left after a "
-            f"period (Floquet multiplier); {100.0 * self.share:.0f} % of starts from 0.3 to 3 "
-            "times the cycle's states reach it"
-        )
-        return [(text, self.run.verdict is not Verdict.LIVES)]
-
-    @property
-    def multiplier(self) -> float:
-        """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
-        if self.cycle is None:
-            return float("nan")
-        return float(np.abs(self.cycle.multipliers[1:]).max())
+        return [(self.free.text, self.run.verdict is not Verdict.LIVES)]
 
     def n_terms(self, *, known: bool) -> int:
         states = [s for s in self.model.states if (s not in self.searched) == known]
@@ -446,8 +438,8 @@ FREE_RUN: Metrics[Outcome] = [
         View.SCREEN,
     ),
     Metric("stability", lambda o: o.cycle.stability if o.cycle else None, View.JSON),
-    Metric("multiplier", lambda o: o.multiplier, COMPARED),
-    Metric("share_reaching", lambda o: o.share, COMPARED),
+    Metric("multiplier", lambda o: o.free.multiplier, COMPARED),
+    Metric("share_reaching", lambda o: o.free.share, COMPARED),
 ]  # fmt: skip
 CANDIDATES: Metrics[CandidateRow] = [
     Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
