@@ -17,9 +17,8 @@ from ep2sindy.thruster.plane.grid import MaskedGrid
 from ep2sindy.thruster.plane.kernels import advance
 from ep2sindy.thruster.plane.simulate import (
     OPERATING_POINT_2D,
-    PLANES,
-    PROFILES,
     THRUSTER_2D,
+    Rows,
     build_model,
     initial_state,
     state_of,
@@ -63,14 +62,15 @@ def cycle(n_z: int, n_r: int, *, cold: bool = False, warm_up_s: float = WARM_UP_
     grid = MaskedGrid(THRUSTER_2D, n_z, n_r)
     model = build_model(THRUSTER_2D, OPERATING_POINT_2D, grid)
     state = (cold_state if cold else initial_state)(grid, model)
-    planes = [np.empty((1, n_z, n_r), np.float32) for _ in PLANES]
-    advance(state, model, 1e-9, True, *planes, *rows(1, n_z))  # compiled
+    one = Rows.room(1, grid)
+    sample = (*one.planes, one.profiles, one.series)
+    advance(state, model, 1e-9, True, *sample)  # compiled
     n_warm_up, n_rows = round(warm_up_s / SAMPLE_S), round(DURATION_S / SAMPLE_S)
-    profiles, series = rows(n_warm_up + n_rows, n_z)
+    series = np.empty((n_warm_up + n_rows, one.series.shape[1]))
     n_steps, began = 0, time.process_time()
     for k in range(len(series)):
-        here = slice(k, k + 1)
-        done, steps = advance(state, model, SAMPLE_S, True, *planes, profiles[here], series[here])
+        done, steps = advance(state, model, SAMPLE_S, True, *sample)
+        series[k] = one.series[0]
         n_steps += steps
         if not done:
             raise RuntimeError(f"the run on {n_z} x {n_r} diverged at {1e3 * k * SAMPLE_S:.2f} ms")
@@ -85,11 +85,6 @@ def cycle(n_z: int, n_r: int, *, cold: bool = False, warm_up_s: float = WARM_UP_
         cpu_s_per_ms=spent / ms,
         step_ns=1e6 * ms / n_steps,
     )
-
-
-def rows(n_rows: int, n_z: int) -> tuple[np.ndarray, np.ndarray]:
-    """Room for the profiles and series of some samples."""
-    return np.empty((n_rows, len(PROFILES), n_z), np.float32), np.empty((n_rows, 4))
 
 
 def main(grids: Sequence[tuple[int, int]] = GRIDS) -> None:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,9 @@ def test_constrained_models_share_their_coefficient(predator_prey: Path, tmp_pat
         assert words in found.page
         assert words in found.log
     assert "status" not in found.page  # least squares has none
+    fit = found.outcome.judged["predator_prey_base"]
+    run = replace(fit.from_sample, frequency_Hz={"n_i": 2e4, "n_n": 3e4}, f_error=0.5)
+    assert found.outcome._frequency.value(replace(fit, from_sample=run)) == "20 kHz (+50.0 %)"
 
 
 def test_held_out_times_count_from_the_start_of_the_held_out_part(

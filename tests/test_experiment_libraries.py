@@ -13,13 +13,18 @@ from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.discover import discover
 from ep2sindy.library.library import polynomial
+from ep2sindy.model.free_run import free_run
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
 from ep2sindy.studies.libraries import Study
 from ep2sindy.studies.library_result import REPLACED
+from ep2sindy.studies.living import run_title
+from ep2sindy.systems.systems import lotka_volterra
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
+
+NO_LIVING = ("living=null", "held_out=null", "compared=null")
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -96,6 +101,13 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert "simple: a model that lives" in (breathing_run / "run.log").read_text()
 
 
+def test_a_run_without_a_period_is_not_said_to_keep_none() -> None:
+    model = lotka_volterra().model
+    run = free_run(model, lotka_volterra().trajectory())
+    assert run_title(run).endswith(f"in phase for {round(run.periods)} periods")
+    assert run_title(replace(run, periods=np.nan)).endswith("over held-out time")
+
+
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
     folder = breathing_run
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
@@ -156,7 +168,7 @@ def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) 
 
 
 def test_a_fixed_seed_gives_the_same_summary(predator_prey: Path, tmp_path: Path) -> None:
-    small = ["~libraries.ionization", "~libraries.velocity", "living=null"]
+    small = ["~libraries.ionization", "~libraries.velocity", *NO_LIVING]
     texts = []
     for seed in (0, 0, 1):
         given = [*breathing(predator_prey, tmp_path), *small, f"seed={seed}"]
@@ -231,6 +243,7 @@ def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed
 
 
 def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
+    assert years.summary["models"]["model"]["note"] == ""  # the section on the samples says it
     found = years.summary["models"]["model"]["estimate"]
     spread = years.outcome.data.states.std(axis=0)
     # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
@@ -267,6 +280,22 @@ def test_every_search_runs(search: str, predator_prey: Path, tmp_path: Path) -> 
     )
     equations = computed(config).summary["models"]["model"]["equations"]
     assert set(equations["n_i"]["terms"]) == {"n_i", "n_i*n_n"}
+
+
+def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_path: Path) -> None:
+    found = computed(
+        composed(
+            "+exp=discover", "data=file", f"data.path={predator_prey}", f"output={tmp_path}",
+            "trajectory.states=[n_i,n_n]", "search=best_subset", "search.max_terms=2",
+            "selection=free_run", "selection.n_windows=6", "selection.n_folds=2", "depth=1",
+            "bootstraps.n=4",
+        )
+    )  # fmt: skip
+    model = found.summary["models"]["model"]
+    assert model["note"] == found.outcome.results["model"].discovery.note != ""
+    log = " ".join(found.log.split())
+    assert log.count(model["note"]) == 1
+    assert "equations selected by free runs or refinements; run freely" in found.page
 
 
 @pytest.mark.parametrize(
@@ -321,7 +350,7 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
             "depth=2",
             "~libraries.ionization",
             "~libraries.velocity",
-            "living=null",
+            *NO_LIVING,
         )
     )
     found = result.summary["models"]["simple"]["equations"]
@@ -353,7 +382,7 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         f"data.cache={tmp_path / 'cache'}",
         "bootstraps.n=4",
         "libraries.ionization.degree=2",
-        "living=null",
+        *NO_LIVING,
         f"output={tmp_path}",
     )
     found = computed(config)
@@ -369,6 +398,8 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+libraries.simple.degre=3"], "libraries.simple may have"),
         (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
+        (["living=null"], "held_out and compared would do nothing: they are for a model that"),
+        (["living=null", "held_out=null"], "compared would do nothing"),
         (["+seeds=1"], "unknown keys ['seeds']; there are "),
         (["seed=abc"], "seed must be a whole number"),
         (["depth=0"], "depth must be a whole number, one or more: 0 came"),

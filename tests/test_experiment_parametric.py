@@ -16,7 +16,8 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.quantity_law import control_law
 from ep2sindy.report.page import page_html
-from ep2sindy.studies.parametric import Outcome, Study, with_error
+from ep2sindy.studies.parametric import Outcome, Study
+from ep2sindy.studies.views import with_error
 from tests import programs
 
 ESTIMATES = {
@@ -168,6 +169,7 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
         (0.99, 9.6e-5, "0.9900 ±0.0001"),
         (240.0, 0.0, "240 ±0"),
         (0.0241, np.inf, "0.0241 ±inf"),
+        (0.0364, np.nan, "0.0364"),
     ],
 )
 def test_values_have_the_digits_of_their_errors(value: float, reach: float, text: str) -> None:

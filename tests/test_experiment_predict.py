@@ -1,5 +1,6 @@
 import json
 import re
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -56,13 +57,21 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     assert {p.stem for p in (folder / "figures").glob("*.png")} == {
         "left_out", f"laws_{name}", f"map_{name}",
     }  # fmt: skip
-    assert branch["left_out"]["n_lives"] <= 4
+    assert branch["left_out"]["n_lives"] == (tables["left_out"]["verdict"] == "lives").sum()
     log = (folder / "run.log").read_text()
     assert "at V_D_V, mdot_mg_s = (150, 2)" in log
     assert "amplitude n_i" in log
     page = (folder / "report.html").read_text()
     assert "Points left out" in page
     assert "6 coefficients of 3 functions each, 18 numbers, from 4 records" in page
+
+
+def test_the_numbers_of_a_law_reach_to_the_digit_of_their_error(folder: Path) -> None:
+    log = (folder / "run.log").read_text()
+    shown = re.findall(r"(-?[\d.]+(?:e[+-]\d+)?) ±([\d.]+(?:e[+-]\d+)?)", log)
+    assert len(shown) == 18
+    for value, error in shown:
+        assert Decimal(value).as_tuple().exponent <= Decimal(error).adjusted(), (value, error)
 
 
 def test_the_law_of_a_run_gives_models_in_python(folder: Path) -> None:

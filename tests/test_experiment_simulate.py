@@ -17,7 +17,15 @@ from ep2sindy.figures import breathing
 from ep2sindy.figures.stability import curves_figure, stability_figure
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import parametric
-from ep2sindy.studies.simulate import Outcome, Simulated, Study, scan_points, value_text
+from ep2sindy.studies.simulate import (
+    Outcome,
+    Point,
+    Simulated,
+    Study,
+    run_point,
+    scan_points,
+    value_text,
+)
 from ep2sindy.studies.simulated import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from ep2sindy.studies.source import point_sources
 from tests import programs
@@ -229,6 +237,15 @@ def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: 
     on_file = ["data=file", f"data.path={predator_prey}", f"output={tmp_path}"]
     with pytest.raises(ValueError, match="data must be a simulation, .*open_field gave none; choo"):
         run_config(composed(*on_file))
+
+
+def test_a_point_of_a_scan_without_a_simulation_says_the_way_out(
+    predator_prey: Path, tmp_path: Path
+) -> None:
+    config = composed("data=file", f"data.path={predator_prey}", f"output={tmp_path}")
+    found = run_point(Point({}, Configured(config.data, "data")))
+    assert found.status == "failed"
+    assert "open_field gave none; choose data=simulation" in found.message
 
 
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:

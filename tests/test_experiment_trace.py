@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import DictConfig
 
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
@@ -123,6 +124,29 @@ def test_what_cannot_be_taken_is_refused(change, more, message, tmp_path: Path) 
     path = scope(tmp_path / "scope.csv", *change(*signal(10.0)))
     with pytest.raises(ValueError, match=message):
         computed(composed(*toy(path, tmp_path, *more)))
+
+
+def recognised(path: Path, header: str, *more: str) -> DictConfig:
+    """A glance at a file that names and units alone describe."""
+    t, x = signal(12.0)
+    np.savetxt(path, np.column_stack([t, x]), delimiter=",", header=header, comments="")
+    own = ("data=file", "signal=I", "unit=A")
+    few = [each for each in glance(path, path.parent) if each not in own]
+    return composed(*few, "data=recognised", *more)
+
+
+def test_a_recognised_signal_without_a_unit_takes_the_one_given(tmp_path: Path) -> None:
+    config = recognised(tmp_path / "scope.csv", "time [s],I", "signal=I", "unit=mA")
+    found = computed(config)
+    assert found.summary["data"]["units"] == {"I": "A", "g": "s^-1"}
+    mean = signal(12.0)[1].mean()
+    assert found.outcome.states.states[:, 0].mean() == pytest.approx(1e-3 * mean, rel=1e-2)
+
+
+def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
+    config = recognised(tmp_path / "scope.csv", "time [s],I_d [A]", "signal=I_d", "unit=mA")
+    with pytest.raises(ValueError, match="I_d comes in 'A', and unit=mA came; leave unit out"):
+        computed(config)
 
 
 def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> None:

@@ -209,7 +209,6 @@ FOREIGN = {
     "runtime.files": "an error of any kind, which may say what the system said",
     "trust.interruption": "os and signal, which have less on Windows",
     "trust.user_code": "whatever a user marked for configs",
-    "studies.simulate": "what a data group gave, which may be no xarray.Dataset",
 }
 
 

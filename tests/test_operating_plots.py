@@ -8,8 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ep2sindy.figures.operating import (
-    cycle_line_figure,
-    cycle_map_figure,
+    cycle_figure,
     frequency_scale,
     laws_figure,
     left_out_figure,
@@ -82,9 +81,7 @@ def test_two_cycles_left_out_are_told_apart() -> None:
 
 
 def test_a_map_shows_every_point_and_the_cycle_that_it_is_not_of() -> None:
-    figure = cycle_map_figure(
-        GRID, POINTS, FITTED, branch="strong", parameters=["a", "b"], labels={}
-    )
+    figure = cycle_figure(GRID, POINTS, FITTED, branch="strong", parameters=["a", "b"], labels={})
     assert {"record", "not oscillating", "record of another cycle"} <= set(drawn(figure))
     outline = figure.axes[0].lines[0].get_xydata()
     assert len(outline) == 4  # closed
@@ -93,16 +90,24 @@ def test_a_map_shows_every_point_and_the_cycle_that_it_is_not_of() -> None:
 
 def test_points_on_a_line_have_no_area() -> None:
     flat = np.array([[1.0, 0.0], [1.5, 0.5], [2.0, 1.0]])
-    figure = cycle_map_figure(GRID, POINTS, flat, branch="strong", parameters=["a", "b"], labels={})
+    figure = cycle_figure(GRID, POINTS, flat, branch="strong", parameters=["a", "b"], labels={})
     outline = np.unique(figure.axes[0].lines[0].get_xydata(), axis=0)
     np.testing.assert_array_equal(outline, flat[[0, 2]])
 
 
+def test_the_legend_of_a_map_names_the_boundaries_that_are_drawn() -> None:
+    alive = GRID.assign(fate="oscillates")
+    stable, ends = "its fixed point turns stable", "the model's cycle ends"
+    for rows, there in ((GRID, {ends, stable}), (alive, {stable})):
+        figure = cycle_figure(
+            rows, POINTS, FITTED, branch="strong", parameters=["a", "b"], labels={}
+        )
+        assert {stable, ends} & set(drawn(figure)) == there
+
+
 def test_one_parameter_has_a_line_that_ends_with_the_cycle() -> None:
     rows = GRID[GRID["b"] == 1.0]
-    figure = cycle_line_figure(
-        rows, POINTS, FITTED[:, :1], branch="strong", parameters=["a"], labels={}
-    )
+    figure = cycle_figure(rows, POINTS, FITTED[:, :1], branch="strong", parameters=["a"], labels={})
     assert {"the model's cycle", "record", "not oscillating"} <= set(drawn(figure))
     line = figure.axes[0].lines[0]
     assert line.get_xdata().tolist() == [1.0, 2.0]

@@ -23,6 +23,7 @@ from ep2sindy.thruster.plane.simulate import (
     PLANES,
     PROFILES,
     THRUSTER_2D,
+    Rows,
     build_model,
     initial_state,
     simulate_2d,
@@ -47,10 +48,10 @@ def set_up(*, plane=False, **changes):
     return grid, model, state, work, columns
 
 
-def rows_of(n_rows):
-    """Room for samples of the state."""
-    planes = [np.full((n_rows, N_Z, N_R), np.nan, np.float32) for _ in PLANES]
-    return [*planes, np.empty((n_rows, len(PROFILES), N_Z), np.float32), np.empty((n_rows, 4))]
+def rows_of(n_rows, grid):
+    """Room for samples of the state, as the kernels take it."""
+    rows = Rows.room(n_rows, grid)
+    return [*rows.planes, rows.profiles, rows.series]
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +133,7 @@ def test_a_uniform_stream_stays_uniform_away_from_the_walls():
 
 def test_a_plane_discharge_is_symmetric_about_mid_radius():
     grid, model, state, _, _ = set_up(plane=True)
-    rows = rows_of(20)
+    rows = rows_of(20, grid)
     assert kernels.advance(state, model, 1e-7, False, *rows)[0] == 20
     inside = grid.plasma
     for values, sign in ((state.gas.n, 1), (state.gas.u_z, 1), (state.gas.u_r, -1)):
@@ -143,17 +144,17 @@ def test_a_plane_discharge_is_symmetric_about_mid_radius():
 
 
 def test_a_round_discharge_is_not():
-    _, model, state, _, _ = set_up()
-    kernels.advance(state, model, 1e-7, False, *rows_of(20))
+    grid, model, state, _, _ = set_up()
+    kernels.advance(state, model, 1e-7, False, *rows_of(20, grid))
     assert np.abs(state.gas.n - state.gas.n[:, ::-1]).max() > 1e-3 * state.gas.n.max()
 
 
 def test_averages_are_means_of_the_states_in_between():
-    _, model, state, work, _ = set_up()
+    grid, model, state, work, _ = set_up()
     n, step_s = 10, 2e-9
     # 0.95 of a step fits into step_s: the same ten steps whichever way they are sampled
     model = model._replace(cfl=step_s / 0.95 * kernels.fastest_rate(state, model, work.born))
-    single, mean = rows_of(n), rows_of(1)
+    single, mean = rows_of(n, grid), rows_of(1, grid)
     assert kernels.advance(state, model, step_s, False, *single) == (n, n)
     _, _, again, _, _ = set_up()
     assert kernels.advance(again, model, n * step_s, True, *mean) == (1, n)

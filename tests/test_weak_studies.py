@@ -150,7 +150,6 @@ def fitted(run: Trajectory, settings: dict[str, Setting]) -> dict:
         true_library(lotka_volterra()),
         TERMS,
         settings,
-        f_data_Hz=1.0 / 15.0,
         rollout_s=None,
         rng=np.random.default_rng(0),
     )
@@ -167,7 +166,9 @@ def test_every_form_follows_exact_data() -> None:
     for name, found in fitted(run, settings).items():
         assert found.integrated.verdict == "lives"
         assert found.r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-5)
-        assert abs(found.f_error) < 0.2  # 40 s hold less than three periods
+        # 40 s hold less than three periods: a spectral line of that width, and no cycle to compare
+        assert found.integrated.frequency_Hz["x"] == pytest.approx(1.0 / 15.0, rel=0.2)
+        assert np.isnan(found.integrated.f_error)
         assert (found.integrated.model.covariance is not None) == (name == "automatic_weighted")
     bumps = fitted(run, {"automatic": Setting(AUTOMATIC)})["automatic"]
     for state, x in zip(run.state_names, run.states.T, strict=True):

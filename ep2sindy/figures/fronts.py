@@ -122,7 +122,7 @@ def _add_hovers(ax: Axes, front: ParetoFront, label: str) -> None:
         terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
         text = f"{front.equation}' of {each.n_terms} terms: {terms}"
         error = f" | 1 - R2 = {height:.3g}" if has_rows else ""
-        hover_spot(ax, each.n_terms, height, f"{text}{error} | {label} = {each.score:.4g}")
+        hover_spot(ax, float(each.n_terms), height, f"{text}{error} | {label} = {each.score:.4g}")
 
 
 def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:

@@ -48,6 +48,9 @@ _MARK = {"ls": "none", "color": COLOURS[1], "zorder": 4}
 CROSS: dict[str, Any] = {**_MARK, "marker": "x", "mew": 1.8, "ms": 6.5}
 DIAMOND: dict[str, Any] = {**_MARK, "marker": "D", "mfc": "white", "mew": 1.5, "ms": 6.0}
 
+# Records of a cycle, points that do not oscillate, and records of another cycle.
+Records = tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]
+
 
 def laws_figure(
     coefficients: pd.DataFrame,
@@ -206,7 +209,7 @@ def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:
     return 1e3 * factor, f"{prefix}Hz"
 
 
-def cycle_map_figure(
+def cycle_figure(
     rows: pd.DataFrame,
     points: pd.DataFrame,
     fitted: np.ndarray,
@@ -215,13 +218,26 @@ def cycle_map_figure(
     parameters: Sequence[str],
     labels: Mapping[str, str],
 ) -> Figure:
-    """Frequency and amplitude of a law's cycle over two parameters, with those of the records.
+    """Frequency and amplitude of a law's cycle, with those of the records.
 
-    rows: a grid whose second parameter varies fastest. points: branch (empty for points that do not
-    oscillate), f_kHz and relative_amplitude of the records. fitted: parameters of the law's points.
+    A map over two parameters, a line over one. rows: a grid whose second parameter varies fastest.
+    points: branch (empty for points that do not oscillate), f_kHz and relative_amplitude of the
+    records. fitted: parameters of the law's points.
     """
+    records = _split_records(points, branch)
+    draw = _draw_cycle_map if len(parameters) == 2 else _draw_cycle_line
+    return draw(rows, records, fitted, list(parameters), labels)
+
+
+def _draw_cycle_map(
+    rows: pd.DataFrame,
+    records: Records,
+    fitted: np.ndarray,
+    parameters: list[str],
+    labels: Mapping[str, str],
+) -> Figure:
     x, y = (np.unique(rows[name].to_numpy(float)) for name in parameters)
-    own, quiet, other = _split_records(points, branch)
+    own, quiet, other = records
     figure, (axes,) = make_panels(1, 2, (11.0, 4.4), sharex=True, sharey=True)
     for ax, quantity in zip(axes, QUANTITIES, strict=True):
         factor, title = _scale_quantity(quantity, own)
@@ -229,37 +245,28 @@ def cycle_map_figure(
         seen = factor * own[quantity].to_numpy(float)
         scale, colours = _colour_range(values, seen), colormaps["viridis"]
         ax.pcolormesh(x, y, values.T, norm=scale, cmap=colours, shading="nearest", rasterized=True)
-        _draw_boundaries(ax, x, y, rows, fitted)
-        at = own[list(parameters)].to_numpy(float)
+        boundaries = _draw_boundaries(ax, x, y, rows, fitted)
+        at = own[parameters].to_numpy(float)
         ax.scatter(*at.T, c=colours(scale(seen)), s=52, edgecolor="white", lw=1.2, zorder=4)
         for which, style in ((quiet, CROSS), (other, DIAMOND)):
-            ax.plot(*which[list(parameters)].to_numpy(float).T, **style)
+            ax.plot(*which[parameters].to_numpy(float).T, **style)
         xlabel, ylabel = (name_label(name, labels) for name in parameters)
         ax.set(xlabel=xlabel, ylabel=ylabel)
         bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, pad=0.02, extend="both")
         bar.set_label(title)
-    entries = _list_entries(quiet, other, face=GREY)
-    entries += [
-        Line2D([], [], color="black", lw=1.8, label="the model's cycle ends"),
-        Line2D([], [], color="black", lw=1.3, ls="--", label="its fixed point turns stable"),
-        Line2D([], [], color=GREY, lw=1.5, label="points fitted"),
-    ]
-    legend_above(figure, entries, size=9.0)
+    legend_above(figure, [*_list_entries(quiet, other, face=GREY), *boundaries], size=9.0)
     return figure
 
 
-def cycle_line_figure(
+def _draw_cycle_line(
     rows: pd.DataFrame,
-    points: pd.DataFrame,
+    records: Records,
     fitted: np.ndarray,
-    *,
-    branch: str,
-    parameters: Sequence[str],
+    parameters: list[str],
     labels: Mapping[str, str],
 ) -> Figure:
-    """The figure of `cycle_map_figure` for a law with a single parameter."""
     (name,) = parameters
-    own, quiet, other = _split_records(points, branch)
+    own, quiet, other = records
     figure, (axes,) = make_panels(1, 2, (8.4, 3.6))
     for ax, quantity in zip(axes, QUANTITIES, strict=True):
         factor, title = _scale_quantity(quantity, own)
@@ -279,9 +286,7 @@ def cycle_line_figure(
     return figure
 
 
-def _split_records(
-    points: pd.DataFrame, branch: str
-) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def _split_records(points: pd.DataFrame, branch: str) -> Records:
     """Records of this cycle, points that do not oscillate, and records of another cycle."""
     own, quiet = points["branch"] == branch, points["branch"] == ""
     return points[own], points[quiet], points[~own & ~quiet]
@@ -315,19 +320,25 @@ def _colour_range(values: np.ndarray, seen: np.ndarray) -> Normalize:
 
 def _draw_boundaries(
     ax: Axes, x: np.ndarray, y: np.ndarray, rows: pd.DataFrame, fitted: np.ndarray
-) -> None:
-    """Draw where cycles end, where the fixed point turns stable, and the hull of fitted points."""
+) -> list[Artist]:
+    """Draw where cycles end, where the fixed point turns stable, and the hull of fitted points.
+
+    Returns legend entries of those that there are.
+    """
     shape = (len(x), len(y))
+    entries: list[Artist] = []
     alive = (rows["fate"] == "oscillates").to_numpy().reshape(shape).astype(float)
     if min(shape) > 1 and 0.0 < alive.mean() < 1.0:
         ax.contour(x, y, alive.T, levels=[0.5], colors="black", linewidths=1.8)
+        entries.append(Line2D([], [], color="black", lw=1.8, label="the model's cycle ends"))
     growth = rows["growth_per_s"].to_numpy(float).reshape(shape)
     if min(shape) > 1 and (growth < 0.0).any() and (growth > 0.0).any():
-        ax.contour(
-            x, y, np.ma.masked_invalid(growth.T), levels=[0.0], colors="black", linewidths=1.3,
-            linestyles="--",
-        )  # fmt: skip
+        style: dict[str, Any] = {"linestyles": "--", "colors": "black", "linewidths": 1.3}
+        ax.contour(x, y, np.ma.masked_invalid(growth.T), levels=[0.0], **style)
+        label = "its fixed point turns stable"
+        entries.append(Line2D([], [], color="black", lw=1.3, ls="--", label=label))
     ax.plot(*_enclose(fitted).T, color=GREY, lw=1.5)
+    return [*entries, Line2D([], [], color=GREY, lw=1.5, label="points fitted")]
 
 
 def _enclose(points: np.ndarray) -> np.ndarray:

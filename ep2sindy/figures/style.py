@@ -39,6 +39,8 @@ OFF_SCALE, STOPS = "off scale", "diverged"
 
 SIGN = "#555555"  # colour of legend marks, which stand for marks of any colour
 
+HOVER = "hover: "  # prefix of the id of an artist with a hover text, which pages look for
+
 N_LINE = 60  # points on the line of a law
 
 
@@ -126,7 +128,7 @@ def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:
 
 def hover(artist: Artist, text: str) -> None:
     """Add a hover text to an artist, for pages read with a mouse; a bar separates its lines."""
-    artist.set_gid(f"hover: {text}")
+    artist.set_gid(f"{HOVER}{text}")
 
 
 def axis_label(name: str, unit: str) -> str:

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 SVG = "http://www.w3.org/2000/svg"
 PX_PER_INCH = 96  # of a page: letters have the same size in all figures
 DPI = 150  # of figures in a run folder
-HOVER = "hover: "  # prefix of the id of an artist with a hover text, see `figures.style.hover`
 
 
 @dataclass(frozen=True)
@@ -34,6 +33,8 @@ class Drawn:
 
 def draw(figure: Figure, png: bytes, caption: str) -> Drawn:
     """A figure for a page: its PNG, or its SVG if artists in it have a text on hover."""
+    from ep2sindy.figures.style import HOVER  # loads matplotlib, as a figure has
+
     width = round(figure.get_size_inches()[0] * PX_PER_INCH)
     speaks = figure.findobj(lambda artist: (artist.get_gid() or "").startswith(HOVER))
     if speaks:
@@ -55,6 +56,8 @@ def png_html(png: bytes) -> str:
 def svg_html(figure: Figure) -> str:
     """An SVG in which the hover texts of artists are titles, which browsers show on hover."""
     from matplotlib import rc_context
+
+    from ep2sindy.figures.style import HOVER
 
     buffer = BytesIO()
     with rc_context({"svg.hashsalt": "ep2sindy"}):  # the same figure gets the same ids

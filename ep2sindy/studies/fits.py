@@ -267,7 +267,7 @@ class Outcome:
 
         def text(judged: Evaluation) -> str:
             run = judged.from_sample
-            frequency = run.rollout.clock.frequency_text(self.f_data_Hz * (1.0 + run.f_error))
+            frequency = run.rollout.clock.frequency_text(run.frequency_Hz[run.model.states[0]])
             return _or_verdict(run, f"{frequency} ({100 * run.f_error:+.1f} %)")
 
         return Metric("f", text, View.SCREEN)

@@ -34,7 +34,7 @@ from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Source, data_summary, zone_length_m
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, Share
+from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
 from ep2sindy.studies.term_roles import Compared, term_roles
 from ep2sindy.studies.views import (
     INTEGRATED,
@@ -57,6 +57,7 @@ SCORED = (
     "Score against number of terms, the best of each size; the star is selected. States and "
     "coefficients were estimated together: there are no rows to have an error."
 )
+HELD_OUT = 0.25  # share of a record on which a model that lives is tested, unless a config says
 EVERY_RECORD = "the selected models, integrated from the first sample of every record"
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
@@ -105,8 +106,9 @@ class Study:
     end. thesis: published equations by library: state -> term -> SI coefficient. They are fitted as
     well if the library has the terms and the data can tell them from others. living: how libraries
     without inputs are searched for a model that lives; None leaves that out. held_out: the last
-    share of the record, on which such a model is tested. compared: the quantities that its terms
-    are compared to.
+    share of the record, on which such a model is tested; None means a quarter. compared: the
+    quantities that its terms are compared to.
+    Raises ValueError for held_out or compared without living, as they would do nothing.
     """
 
     source: Source
@@ -118,8 +120,18 @@ class Study:
     figures: PlotRange
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
-    held_out: Share = 0.25
+    held_out: ShareOrNone = None
     compared: Compared | None = None
+
+    def __post_init__(self) -> None:
+        idle = {"held_out": self.held_out, "compared": self.compared}
+        idle = {name: value for name, value in idle.items() if value is not None}
+        if self.living is None and idle:
+            leave = " ".join(f"{name}=null" for name in idle)
+            raise ValueError(
+                f"{' and '.join(idle)} would do nothing: they are for a model that lives, and "
+                f"living is null; give {leave} as well, or say in living how it is searched for"
+            )
 
     def compute(self, run: Run) -> Outcome:
         recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
@@ -173,7 +185,7 @@ class Study:
         refitted = refit(found, published, rows, runs, rng)
         lives = roles = None
         if self.living is not None and not found.model.inputs:
-            parts = split_in_time(data, self.held_out)
+            parts = split_in_time(data, self.held_out or HELD_OUT)
             lives = living_model(
                 *parts, library, rows, self.living, found.model, rng=rng, progress=progress
             )
@@ -332,10 +344,7 @@ class Outcome:
         for name, result in self.results.items():
             living, clock = result.living, self.data.clock
             run = result.selected if living is None else living.run
-            how = "selected by their derivatives" if living is None else "selected by free runs"
-            if result.discovery.estimate is not None and living is None:
-                how = "estimated together with the states"
-            text = f"{name}: equations {how}; run freely: {run.text}"
+            text = f"{name}: equations {result.how}; run freely: {run.text}"
             blocks.append(Text(text, page_only=True))
             for state in run.model.states:
                 blocks.append(display_equation(run.model, state, clock, on_screen=False))

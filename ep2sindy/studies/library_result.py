@@ -24,6 +24,7 @@ from ep2sindy.regression.front import Candidate, ParetoFront, fit_support
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
+from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.studies.living import Living
 from ep2sindy.studies.term_roles import Roles
 
@@ -78,6 +79,27 @@ class LibraryResult:
         """The name of the selection score."""
         return self.recipe.selection.label
 
+    @property
+    def by_runs(self) -> bool:
+        """Whether the selection runs or refines whole models, rather than scoring candidates."""
+        return isinstance(self.recipe.selection, SystemSelection)
+
+    @property
+    def how(self) -> str:
+        """How the equations shown first were found: those that live, if such were searched for."""
+        if self.living is not None:
+            return "selected by free runs"
+        if self.by_runs:
+            return "selected by free runs or refinements"
+        if self.discovery.estimate is not None:
+            return "estimated together with the states"
+        return "selected by their derivatives"
+
+    @property
+    def decision(self) -> str:
+        """How a rule for whole models decided; other notes are shown as warnings or estimates."""
+        return self.discovery.note if self.by_runs else ""
+
     def front_tables(self, name: str) -> dict[str, pd.DataFrame]:
         """Fronts as in the thesis's Tables I-III, and terms that the data cannot tell apart."""
         found = self.discovery
@@ -105,6 +127,7 @@ class LibraryResult:
         metrics = candidate_metrics(self.label)
         return {
             "equations": {s: facts(_chosen(self, s), metrics) for s in states},
+            "note": self.decision,
             "trajectory": facts(self.selected, TRAJECTORY),
             "thesis_terms": self.published and _published_summary(self.published, self.refitted),
             "living": self.living and self.living.summary(),
@@ -231,6 +254,7 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
             f"{len(library)} terms in {', '.join(library.variables)}; "
             f"selection: {result.recipe.selection}"
         ),
+        *([Text(f"selected: {result.decision}")] if result.decision else []),
         *(Text(f"note: {each}") for each in found.remarks),
         *(Text(f"note: {each.message}") for each in found.ambiguities if each.exact),
     ]

@@ -45,12 +45,13 @@ from ep2sindy.studies.views import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
 CAPTIONS = {
     "free_run": "The living model (colour) integrated freely from the first sample of held-out "
     "time, over the data (grey): the first and the last periods.",
     "cycle": "Its cycle in the plane of two states, over the data (grey), and runs from other "
     "starts.",
-    "waveform": "One period by phase, shown twice: samples, their waveform, and the model's.",
+    "waveform": WAVEFORM,
 }
 STARTS = ((0.5, 0.5), (0.5, 2.0), (1.0, 1.0), (2.0, 0.5), (2.0, 2.0))  # times the cycle's mean
 N_PERIODS = 12.0  # duration of a run from another start, in periods
@@ -90,6 +91,43 @@ class LivingSearch:
 
 
 @dataclass(frozen=True, eq=False)
+class FreeCycle:
+    """A free run and the limit cycle of its model.
+
+    cycle: None if the run ends on none. share: the share of starts around the cycle that reach it;
+    NaN without a cycle.
+    """
+
+    run: FreeRun
+    cycle: LimitCycle | None
+    share: float
+
+    @staticmethod
+    def of(run: FreeRun) -> FreeCycle:
+        """The cycle on which a free run ends, and how many starts reach it."""
+        cycle = cycle_of(run)
+        return FreeCycle(run, cycle, np.nan if cycle is None else share_reaching(run.model, cycle))
+
+    @property
+    def multiplier(self) -> float:
+        """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
+        if self.cycle is None:
+            return float("nan")
+        return float(np.abs(self.cycle.multipliers[1:]).max(initial=0.0))
+
+    @property
+    def text(self) -> str:
+        """The stability of the cycle, in a sentence; empty without a cycle."""
+        if self.cycle is None:
+            return ""
+        return (
+            f"The cycle is {self.cycle.stability}: of a departure {self.multiplier:.3g} is left "
+            f"after a period (Floquet multiplier); {100.0 * self.share:.0f} % of starts from 0.3 "
+            "to 3 times the cycle's mean reach it."
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Refined:
     """A refinement of the model selected by derivatives: its status and its free run."""
 
@@ -101,18 +139,23 @@ class Refined:
 class Living:
     """A closed model and its run over the held-out part.
 
-    run: starts at the first held-out sample, smoothed by a Kalman smoother so that the sample's
-    noise is not attributed to the model. cycle: the limit cycle of the model; None if none was
-    found. share: the share of starts around it that reach it. by_derivatives: the equations
+    free: the run, which starts at the first held-out sample, smoothed by a Kalman smoother so that
+    the sample's noise is not attributed to the model, and its cycle. by_derivatives: the equations
     selected by their derivatives, refined with the same terms.
     """
 
     discovery: Discovery
     held: Trajectory
-    run: FreeRun
-    cycle: LimitCycle | None
-    share: float | None
+    free: FreeCycle
     by_derivatives: Refined
+
+    @property
+    def run(self) -> FreeRun:
+        return self.free.run
+
+    @property
+    def cycle(self) -> LimitCycle | None:
+        return self.free.cycle
 
     @property
     def model(self) -> SparseModel:
@@ -129,7 +172,7 @@ class Living:
         blocks: list[Block] = [
             *(display_equation(model, state, clock) for state in model.states),
             *interval_table(model, clock=clock),
-            Table(rows, title=_title(self)),
+            Table(rows, title=run_title(self.run)),
             *(Text(text) for text in (_note(self), _by_derivatives(self))),
             *pictures(self.figures(name)),
         ]
@@ -180,7 +223,7 @@ LIVING: Metrics[Living] = [
     Metric("periods", lambda found: found.run.periods),
     Metric("floquet", lambda found: found.cycle and _multipliers(found.cycle), View.JSON),
     Metric("stability", lambda found: found.cycle and str(found.cycle.stability)),
-    Metric("share_reaching", lambda found: found.share),
+    Metric("share_reaching", lambda found: found.free.share),
     Metric("status_by_derivatives", lambda found: found.by_derivatives.status, View.CSV),
     Metric("verdict_by_derivatives", lambda found: str(found.by_derivatives.run.verdict), View.CSV),
     Metric("coefficients", lambda found: _with_intervals(found.model), View.JSON),
@@ -228,20 +271,16 @@ def _ending(living: Living) -> str:
     return "lives" if living.run.verdict == "lives" else f"does not live ({living.run.text})"
 
 
-def _title(living: Living) -> str:
-    n = round(living.run.periods) if living.run.periods == living.run.periods else 0
-    return f"run freely from one sample over held-out time; in phase for {n} periods"
+def run_title(run: FreeRun) -> str:
+    """The title of the table of a run, with how long it is in phase if the record has a period."""
+    in_phase = "" if np.isnan(run.periods) else f"; in phase for {round(run.periods)} periods"
+    return f"run freely from one sample over held-out time{in_phase}"
 
 
 def _note(living: Living) -> str:
     """Note on the selection, the stability, and the columns of the table."""
     found = [f"Selection: {living.discovery.note}."]
-    if living.cycle is not None and living.share is not None:
-        moduli = ", ".join(f"{abs(m):.3g}" for m in living.cycle.multipliers[1:])
-        found.append(
-            f"Its cycle is {living.cycle.stability}: Floquet multiplier {moduli}; "
-            f"{100 * living.share:.0f} % of starts around reach it."
-        )
+    found += [living.free.text] if living.free.text else []
     found.append(
         "Amplitude: ratio of standard deviations; waveform error: RMS difference in standard "
         "deviations of the data."
@@ -309,9 +348,8 @@ def living_model(
     with progress.stage(None, "", "free run and limit cycle"):
         start = start_of(held, found.model)
         run = free_run(found.model, held, initial=start, bounds=settings.bounds)
-        cycle = cycle_of(run)
-        share = None if cycle is None else share_reaching(found.model, cycle)
-    return Living(found, held, run, cycle, share, _refined(selected, train, held, progress))
+        free = FreeCycle.of(run)
+    return Living(found, held, free, _refined(selected, train, held, progress))
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:

@@ -36,7 +36,7 @@ from ep2sindy.runtime.parallel import Workers
 from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.source import Source, open_points, point_sources
 from ep2sindy.studies.study import Check, Count
-from ep2sindy.studies.views import coefficients
+from ep2sindy.studies.views import coefficients, with_error
 
 INTERVALS = (
     "±: half the 95 % interval; of least squares by a moving-block bootstrap over time, of "
@@ -369,16 +369,6 @@ def _cell(row: Mapping[Any, Any]) -> str:
     """`0.0241 ±0.0001 (0.025)`: value, half the interval's width, published value."""
     text = with_error(row["value"], 0.5 * (row["high"] - row["low"]))
     return text if np.isnan(row["thesis"]) else f"{text} ({row['thesis']:.3g})"
-
-
-def with_error(value: float, reach: float) -> str:
-    """`0.03640 ±2e-05`: the value to the digit of its error, with at least three digits."""
-    digits = 3
-    if np.isfinite(reach) and reach > 0.0 and value != 0.0:
-        # Digits of the error as it is printed: 9.6e-05 reads 1e-04.
-        places = np.floor(np.log10([abs(value), float(f"{reach:.1g}")]))
-        digits = int(np.clip(places[0] - places[1] + 1, 3, 8))
-    return f"{f'{value:#.{digits}g}'.removesuffix('.')} ±{reach:.1g}"
 
 
 def _table(rows: pd.DataFrame, by: Sequence[str]) -> list[Block]:

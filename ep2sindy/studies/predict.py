@@ -12,8 +12,7 @@ import pandas as pd
 from scipy.special import ndtri
 
 from ep2sindy.figures.operating import (
-    cycle_line_figure,
-    cycle_map_figure,
+    cycle_figure,
     frequency_scale,
     laws_figure,
     left_out_figure,
@@ -49,6 +48,7 @@ from ep2sindy.studies.fits import Terms, terms_of
 from ep2sindy.studies.simulated import compile_kernels
 from ep2sindy.studies.source import Source, expand, open_points, point_sources
 from ep2sindy.studies.study import Check, Count, Counts, Positive
+from ep2sindy.studies.views import with_error
 
 INTERVALS = (
     "In SI units, and the parameters in theirs. ±: half the 95 % interval, from a sandwich with "
@@ -300,14 +300,12 @@ class Outcome:
             )
             found[f"laws_{name}"] = Captioned(draw, CAPTIONS["laws"])
             if branch.map:
-                drawn, caption = (cycle_map_figure, "map") if len(self.parameters) == 2 else (
-                    cycle_line_figure, "line",
-                )  # fmt: skip
+                caption = CAPTIONS["map" if len(self.parameters) == 2 else "line"]
                 draw = partial(
-                    drawn, self._of("map", name), self._tables["points"], branch.law.points,
+                    cycle_figure, self._of("map", name), self._tables["points"], branch.law.points,
                     branch=name, parameters=self.parameters, labels=self.labels,
                 )  # fmt: skip
-                found[f"map_{name}"] = Captioned(draw, CAPTIONS[caption])
+                found[f"map_{name}"] = Captioned(draw, caption)
         return found
 
     def _of(self, table: str, branch: str) -> pd.DataFrame:
@@ -367,7 +365,10 @@ class Outcome:
         shown = [
             {
                 "coefficient": f"{state}: {term}",
-                **{r["function"]: _with_error(r) for r in group.to_dict("records")},
+                **{
+                    r["function"]: with_error(r["value"], 0.5 * (r["high"] - r["low"]))
+                    for r in group.to_dict("records")
+                },
             }
             for (state, term), group in rows.groupby(["state", "term"], sort=False)
         ]
@@ -443,11 +444,6 @@ class Outcome:
 def n_points(n: int) -> str:
     """`1 point`, `3 points`."""
     return f"{n} point" if n == 1 else f"{n} points"
-
-
-def _with_error(row: Mapping[Any, Any]) -> str:
-    reach = 0.5 * (row["high"] - row["low"])
-    return f"{row['value']:.3g}" + ("" if np.isnan(reach) else f" ±{reach:.1g}")
 
 
 def points_table(

@@ -30,6 +30,7 @@ from ep2sindy.studies.simulated import (
     compile_kernels,
     doubts,
     is_simulation,
+    quiet,
     say_simulation,
     status_text,
 )
@@ -179,29 +180,19 @@ def scan_points(data: Deferred, scan: Mapping[str, Sequence[Any]]) -> list[Point
     return found
 
 
-def quiet(data: Deferred) -> Deferred:
-    """Turn off progress bars: points run in parallel, and their bars would mix."""
-    try:
-        return data.changed({"progress": False})
-    except ValueError:
-        return data  # these data show no progress
-
-
 def run_point(point: Point) -> Simulated:
     """Run a point; if it cannot be run, record the reason, so that other points still run.
 
     Raises WriteError if the simulation cannot be kept: that is not the point's fault.
     """
     try:
-        run = point.data.build()
+        run: Any = point.data.build()
+        check_simulation(run, point.data)
     except WriteError:
         raise
     except (ValueError, OSError, ArithmeticError) as error:
         return Simulated(FAILED, message=str(error) or type(error).__name__)
-    attributes = getattr(run, "attrs", {})
-    if not is_simulation(attributes):
-        came = point.data.settings["_target_"]
-        return Simulated(FAILED, message=f"data must be a simulation: {came} gave none")
+    attributes = run.attrs
     return Simulated(
         attributes["status"],
         attributes.get("cycle", "none"),

@@ -94,6 +94,14 @@ def status_text(attributes: Mapping[str, Any]) -> str:
     return attributes["status"] + (f", {cycle} cycle" if cycle != "none" else "")
 
 
+def quiet(data: Deferred) -> Deferred:
+    """Turn off progress bars: points run in parallel, and their bars would mix."""
+    try:
+        return data.changed({"progress": False})
+    except ValueError:
+        return data  # these data show no progress
+
+
 def compile_kernels(data: Sequence[Deferred]) -> None:
     """Run a few samples in this process, so that workers find the compiled kernels on disk."""
     with TemporaryDirectory() as folder:

@@ -29,6 +29,7 @@ from ep2sindy.studies.simulated import (
     amiss,
     check_recorded,
     is_simulation,
+    quiet,
     say_simulation,
 )
 from ep2sindy.studies.study import Deferred
@@ -309,8 +310,4 @@ def _changed(data: Deferred, places: Mapping[str, float], more: Mapping[str, Any
         raise ValueError(
             f"parameters must name numbers of the data group, or be null: {error}"
         ) from error
-    data = data.changed({}, more)
-    try:
-        return data.changed({"progress": False})  # points run in parallel: their bars would mix
-    except ValueError:
-        return data  # these data show no progress
+    return quiet(data.changed({}, more))

@@ -95,6 +95,13 @@ def _is_count(value: Any) -> bool:
 
 Count = Annotated[int, Check("a whole number, one or more", _is_count)]
 Share = Annotated[float, Check("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
+ShareOrNone = Annotated[
+    float | None,
+    Check(
+        "a number between 0 and 1, or null",
+        lambda x: x is None or (_is_positive(x) and x < 1),
+    ),
+]
 Positive = Annotated[float, Check("a positive number", _is_positive)]
 PositiveOrAll = Annotated[
     float | None,

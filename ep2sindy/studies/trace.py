@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
+from ep2sindy.data.conversion import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.discover import Discovery, discover
@@ -30,7 +32,7 @@ from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.model.stability import LimitCycle, share_reaching
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.report.run import Run
@@ -39,7 +41,7 @@ from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import Chosen, Delays, Embedding, LogRate, Rate, embed
 from ep2sindy.signals.trace import MIN_PERIODS, Trace, from_one_signal
 from ep2sindy.studies.library_result import CandidateRow, candidate_rows
-from ep2sindy.studies.living import cycle_of, runs_from
+from ep2sindy.studies.living import WAVEFORM, FreeCycle, runs_from
 from ep2sindy.studies.source import Source, data_summary, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
 from ep2sindy.studies.views import (
@@ -65,7 +67,7 @@ CAPTIONS = {
     "(grey): the first periods, and the last.",
     "plane": "The model's cycle in the plane of both states, over the data (grey), and runs from "
     "other starts.",
-    "waveform": "One period by phase, shown twice: samples, their waveform, and the model's.",
+    "waveform": WAVEFORM,
     "front": "Error of the derivative against number of terms: every candidate that was refined "
     "and run freely; the star is selected, by its free runs.",
 }
@@ -78,8 +80,8 @@ class Study:
     signal: the variable. unit: needed if the data group does not describe the signal, or to
     override its unit; None takes the described unit, or none. offset: added to the samples, in SI.
     embedding: auto, log_rate, rate or delays. harmonics: number of harmonics of the period that the
-    smoother follows. decimate, detrend: see `trace`. degree: of the library. held_out: the share at
-    the end of the record that is not fitted and serves as the test.
+    smoother follows. decimate, detrend: see `from_one_signal`. degree: of the library. held_out:
+    the share at the end of the record that is not fitted and serves as the test.
     """
 
     source: Source
@@ -125,6 +127,9 @@ class Study:
         space = [axis for axis, bounds in (("z", zone.z), ("r", zone.r)) if bounds is None]
         data = only(self.source.data, self.signal, self.unit, without=space)
         source = replace(self.source, data=data)
+        if self.unit is not None and data.settings.get("variables") is None:
+            step = partial(in_unit, signal=self.signal, unit=self.unit)
+            source = replace(source, prepare=[step, *source.prepare])
         with run.progress(None, "", "data"):
             field = source.field()
         sampled = source.sampled(field, [], run)
@@ -203,6 +208,21 @@ def only(data: Deferred, signal: str, unit: str | None, *, without: Sequence[str
     return data.changed(places)
 
 
+def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
+    """A field whose signal, so far without a unit, is converted from this unit to SI.
+
+    Raises ValueError if the data already say the signal's unit.
+    """
+    if signal not in field:
+        return field  # the trajectory reports what the data hold
+    if (stated := field[signal].attrs.get("units", "1")) != "1":
+        raise ValueError(
+            f"unit is for a signal whose unit the data do not say: {signal} comes in {stated!r}, "
+            f"and unit={unit} came; leave unit out, or describe the file by data=file"
+        )
+    return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
+
+
 def count_fitted(signal: Trace, states: Trajectory, held_out: float) -> int:
     """Number of samples to fit; all of them if the record is too short to hold out a part."""
     n_fitted = round((1.0 - held_out) * states.n_samples)
@@ -231,18 +251,16 @@ def evaluate(
     """Run the model freely over the held-out part, and compare it to the measured signal."""
     measured = as_measured(signal, held)
     run: FreeRun = free_run(found.model, measured, initial=held.states[0], judged=(signal.name,))
-    cycle = cycle_of(run)
-    share = float("nan") if cycle is None else share_reaching(found.model, cycle)
-    return Outcome(signal, chosen, found, states, measured, run, cycle, share, label)
+    return Outcome(signal, chosen, found, states, measured, FreeCycle.of(run), label)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """The model found from one signal, and its tests.
 
-    states: all of the record, smoothed. measured: the test data, with the signal as measured. run:
-    the model over them, from their first smoothed sample. cycle: the model's limit cycle, if it has
-    one. share: share of the starts that reach it. label: name of the scores.
+    states: all of the record, smoothed. measured: the test data, with the signal as measured. free:
+    the run of the model over them, from their first smoothed sample, and its cycle. label: name of
+    the scores.
     """
 
     signal: Trace
@@ -250,10 +268,16 @@ class Outcome:
     found: Discovery
     states: Trajectory
     measured: Trajectory
-    run: FreeRun
-    cycle: LimitCycle | None
-    share: float
+    free: FreeCycle
     label: str
+
+    @property
+    def run(self) -> FreeRun:
+        return self.free.run
+
+    @property
+    def cycle(self) -> LimitCycle | None:
+        return self.free.cycle
 
     @property
     def model(self) -> SparseModel:
@@ -362,19 +386,7 @@ class Outcome:
     def _stability(self) -> list[tuple[str, bool]]:
         if self.cycle is None:
             return [("the model has no cycle near its run", True)]
-        text = (
-            f"cycle {self.cycle.stability}: of a departure {self.multiplier:.3g} is left after a "
-            f"period (Floquet multiplier); {100.0 * self.share:.0f} % of starts from 0.3 to 3 "
-            "times the cycle's states reach it"
-        )
-        return [(text, self.run.verdict is not Verdict.LIVES)]
-
-    @property
-    def multiplier(self) -> float:
-        """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
-        if self.cycle is None:
-            return float("nan")
-        return float(np.abs(self.cycle.multipliers[1:]).max())
+        return [(self.free.text, self.run.verdict is not Verdict.LIVES)]
 
     def n_terms(self, *, known: bool) -> int:
         states = [s for s in self.model.states if (s not in self.searched) == known]
@@ -426,8 +438,8 @@ FREE_RUN: Metrics[Outcome] = [
         View.SCREEN,
     ),
     Metric("stability", lambda o: o.cycle.stability if o.cycle else None, View.JSON),
-    Metric("multiplier", lambda o: o.multiplier, COMPARED),
-    Metric("share_reaching", lambda o: o.share, COMPARED),
+    Metric("multiplier", lambda o: o.free.multiplier, COMPARED),
+    Metric("share_reaching", lambda o: o.free.share, COMPARED),
 ]  # fmt: skip
 CANDIDATES: Metrics[CandidateRow] = [
     Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),

@@ -201,3 +201,17 @@ def equation_sections(
         )
         for name, model in models.items()
     ]
+
+
+def with_error(value: float, reach: float) -> str:
+    """`0.03640 ±2e-05`: the value to the digit of its error, with at least three digits.
+
+    An error that is not known (NaN) is left out.
+    """
+    digits = 3
+    if np.isfinite(reach) and reach > 0.0 and value != 0.0:
+        # Digits of the error as it is printed: 9.6e-05 reads 1e-04.
+        places = np.floor(np.log10([abs(value), float(f"{reach:.1g}")]))
+        digits = int(np.clip(places[0] - places[1] + 1, 3, 8))
+    text = f"{value:#.{digits}g}".removesuffix(".")
+    return text if np.isnan(reach) else f"{text} ±{reach:.1g}"

@@ -81,18 +81,16 @@ class Study:
         with run.progress(None, "", "data"):
             record = self.source.field()
         data = self.source.sampled(record, [library], run)
-        f_data_Hz = dominant_frequency(data.t, data.states[:, 0])
         fitted = fit_settings(
             data,
             library,
             terms,
             settings,
-            f_data_Hz=f_data_Hz,
             rollout_s=self.rollout_s,
             rng=np.random.default_rng(run.seed),
             progress=run.watch,
         )
-        return Outcome(self, data, f_data_Hz, fitted)
+        return Outcome(self, data, dominant_frequency(data.t, data.states[:, 0]), fitted)
 
 
 @dataclass(frozen=True)
@@ -130,15 +128,12 @@ class SettingFit:
 
     r2: by state, on the setting's own rows, which differ from setting to setting.
     half_width: by state, in samples, for smooth windows; empty for others.
-    f_error: dominant frequency of the first state relative to the data's, minus one; NaN if the
-    integrated model diverges or dies out.
     """
 
     setting: Setting
     r2: Mapping[str, float]
     half_width: Mapping[str, int]
     integrated: FreeRun
-    f_error: float
 
     def by_state(self, value: Callable[[str], Any]) -> dict[str, Any]:
         return {state: value(state) for state in self.integrated.model.states}
@@ -229,15 +224,14 @@ def fit_settings(
     terms: Mapping[str, Sequence[str]],
     settings: Mapping[str, Setting],
     *,
-    f_data_Hz: float,
     rollout_s: float | None,
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> dict[str, SettingFit]:
     """Fit the same terms in every setting and integrate each model from the first sample.
 
-    terms: state -> its terms. f_data_Hz: frequency of the data, to which models are compared.
-    rollout_s: integration time; None, or a time beyond the data, means to the data's end.
+    terms: state -> its terms. rollout_s: integration time; None, or a time beyond the data, means
+    to the data's end.
     Each setting draws its windows from its own random stream.
     Raises ValueError, before any fit, for windows longer than the data.
     """
@@ -260,7 +254,6 @@ def fit_settings(
             r2={state: _r2_own_rows(*pair) for state, pair in found.items()},
             half_width=widths[name],
             integrated=integrated,
-            f_error=integrated.frequency_Hz[run.state_names[0]] / f_data_Hz - 1.0,
         )
     return results
 
@@ -349,8 +342,11 @@ class Outcome:
         clock, dt_s = self.data.clock, self.data.dt_s
 
         def frequency(fitted: SettingFit) -> str:
-            text = clock.frequency_text(first_frequency_Hz(fitted))
-            return f"{text} ({100 * fitted.f_error:+.0f} %)" if np.isfinite(fitted.f_error) else "-"
+            f_Hz, error = first_frequency_Hz(fitted), fitted.integrated.f_error
+            if not np.isfinite(f_Hz):
+                return "-"
+            text = clock.frequency_text(f_Hz)
+            return f"{text} ({100 * error:+.0f} %)" if np.isfinite(error) else text
 
         return [
             Metric("n_points", lambda f: f.setting.boxes and f.setting.boxes.n_points, View.CSV),
@@ -377,7 +373,7 @@ class Outcome:
             Metric("f", frequency, View.SCREEN),
             Metric("f_Hz", lambda f: f.integrated.frequency_Hz, View.CSV),
             Metric("f_kHz", lambda f: 1e-3 * first_frequency_Hz(f), View.JSON),
-            Metric("f_error", lambda f: f.f_error, View.FILES | View.HEADLINE),
+            Metric("f_error", lambda f: f.integrated.f_error, View.FILES | View.HEADLINE),
             Metric("nrmse", lambda f: f.integrated.nrmse, View.ALL, format="{:.2f}"),
             Metric("verdict", lambda f: f.integrated.text, View.SHOWN),
         ]  # fmt: skip
