@@ -89,8 +89,8 @@ def misfits(systems: Sequence[str], n: int) -> None:
             for k, kept in enumerate(
                 (np.arange(len(library)) != left_out, np.full(len(library), True))
             ):
-                for r, recipe in enumerate(ROUTES.values()):
-                    found = ep.discover(run, library.take(kept), recipe)
+                for r, method in enumerate(ROUTES.values()):
+                    found = ep.discover(run, library.take(kept), method)
                     if k == 0 or ((found.model.coef != 0.0) == true).all():
                         counts[k, r] += bool(found.misfit), 1
         totals += counts
@@ -120,8 +120,8 @@ def thruster() -> None:
         fitted, held = parts(record(label, DOWNSTREAM_MM), "last")
         for rule in (ep.Evidence(), ep.FreeRunScore()):
             start = time.process_time()
-            recipe = ep.TrajectorySearch(max_terms=4, selection=rule, depth=2)
-            found = ep.discover(fitted, ep.polynomial(["n_i", "n_n"], degree=2), recipe)
+            method = ep.TrajectorySearch(max_terms=4, selection=rule, depth=2)
+            found = ep.discover(fitted, ep.polynomial(["n_i", "n_n"], degree=2), method)
             cpu_s = time.process_time() - start
             run = ep.free_run(found.model, held, initial=start_of(held, found.model))
             print(

@@ -28,13 +28,13 @@ from ep2sindy.runtime.parallel import Loky, Workers
 from ep2sindy.selection.criteria import EBIC
 
 
-def find(recipe: AnyMethod, points: Mapping[str, Sequence[Trajectory]]) -> SharedDiscovery:
+def find(method: AnyMethod, points: Mapping[str, Sequence[Trajectory]]) -> SharedDiscovery:
     """The same search for all points jointly and for one alone."""
-    return discover_shared(points, LIBRARY, recipe, seed=0)
+    return discover_shared(points, LIBRARY, method, seed=0)
 
 
 def run_family(
-    recipe: AnyMethod,
+    method: AnyMethod,
     *,
     noises: Sequence[float],
     n_realizations: int,
@@ -56,20 +56,20 @@ def run_family(
         )
     tasks = [(noise, number) for noise in noises for number in range(n_realizations)]
     rows = {}
-    for k, row in workers.run(partial(outcome, recipe, seed=seed), tasks):
+    for k, row in workers.run(partial(outcome, method, seed=seed), tasks):
         rows[k] = row
         progress(len(rows))
     return pd.DataFrame([rows[k] for k in range(len(tasks))])
 
 
-def outcome(recipe: AnyMethod, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
+def outcome(method: AnyMethod, task: tuple[float, int], *, seed: int = 0) -> dict[str, float]:
     """One realization: one row of `run_family`."""
     noise, number = task
     points = realization(noise, number, seed=seed)
-    joint = find(recipe, points)
-    pooled = find(recipe, {"all": [run for runs in points.values() for run in runs]})
+    joint = find(method, points)
+    pooled = find(method, {"all": [run for runs in points.values() for run in runs]})
     row = {"noise": noise, "number": number, "joint": _right(joint), "pooled": _right(pooled)}
-    row |= {point: _right(find(recipe, {point: runs})) for point, runs in points.items()}
+    row |= {point: _right(find(method, {point: runs})) for point, runs in points.items()}
     return row | (_errors(joint) if row["joint"] else dict.fromkeys(ERRORS, np.nan))
 
 

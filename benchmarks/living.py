@@ -64,7 +64,7 @@ def record(label: str, zone_mm: tuple[int, int]) -> ep.Trajectory:
 
 def selected(fitted: ep.Trajectory, *, seed: int, weak: bool = False) -> ep.Discovery:
     """By free runs, from the library of degree 2, up to 4 + 4 terms."""
-    recipe = ep.Regression(
+    method = ep.Regression(
         ep.WeightedWeak() if weak else ep.Differential(),
         ep.BestSubset(max_terms=4, n_best=2),
         ep.FreeRunScore(seed=seed),
@@ -72,7 +72,7 @@ def selected(fitted: ep.Trajectory, *, seed: int, weak: bool = False) -> ep.Disc
         depth=2,
     )
     library = ep.polynomial(["n_i", "n_n"], degree=2)
-    return ep.discover([fitted], library, recipe, seed=seed)
+    return ep.discover([fitted], library, method, seed=seed)
 
 
 def case(fitted: ep.Trajectory, judged: ep.Trajectory, *, seed: int, weak: bool = False) -> Case:

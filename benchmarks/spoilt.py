@@ -154,14 +154,14 @@ def main() -> None:
     parser.add_argument("--align", action="store_true", help="bring late channels together")
     parser.add_argument("--words", action="store_true", help="what was said of doubtful ones")
     asked = parser.parse_args()
-    recipe = ep.TrajectorySearch(align=asked.align)
+    method = ep.TrajectorySearch(align=asked.align)
     total: Counter[str] = Counter()
     for kind, name in product(asked.kinds, asked.systems):
         counts: Counter[str] = Counter()
         start = time.process_time()
         for number in range(asked.n):
             system, run = spoilt(name, kind, number, asked.noise)
-            found = ep.discover(run, system.model.library, recipe)
+            found = ep.discover(run, system.model.library, method)
             what = _what(system, found)
             counts[what] += 1
             if asked.words and what not in ("right", "wrong, a misfit"):

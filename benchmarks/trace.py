@@ -3,7 +3,7 @@
     python -m benchmarks.trace
     python -m benchmarks.trace --seeds 1 --points 300/5
 
-The simulator's current at four operating points, the recipe of +exp=trace; three quarters are
+The simulator's current at four operating points, the method of +exp=trace; three quarters are
 fitted, the rest is run freely from one sample and compared with the current itself, without noise.
 Noise: white, 2 % of the mean current, then 8 bits over the range. A row per point, record and
 seed, of the noise and of the windows that are drawn: frequency error, amplitude and waveform of
@@ -63,10 +63,10 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     bounds = ep.FreeRunBounds(frequency=0.005, amplitude=0.05)
     rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
     search = BestSubset(max_terms=5, n_best=8)
-    recipe = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
+    method = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
     library = polynomial(states.state_names, degree=3)
     known = {"relations": chosen.embedded.relations, "terms": chosen.embedded.terms}
-    model = discover(states.window(0, n), library, recipe, **known).model
+    model = discover(states.window(0, n), library, method, **known).model
     seconds = time.process_time() - begin
     record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
     held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)

@@ -43,7 +43,7 @@ class Inner:
 class Toy:
     """A study's signature with every kind of key."""
 
-    recipe: AnyMethod
+    method: AnyMethod
     n: Count
     share: Share
     span: PositiveOrAll
@@ -92,8 +92,8 @@ def config(*changes: str) -> DictConfig:
 
 def test_a_study_is_built_from_its_signature() -> None:
     study = study_of(Toy, config())
-    assert study.recipe.depth == 2
-    assert isinstance(study.recipe.search, ep.BestSubset)
+    assert study.method.depth == 2
+    assert isinstance(study.method.search, ep.BestSubset)
     assert (study.n, study.share, study.span, study.switch) == (3, 0.25, None, False)
     assert (study.names, study.lengths, study.noises) == (["a", "b"], [10, 20], [0.0, 0.1])
     assert study.inner == Inner(1.0)
@@ -107,7 +107,7 @@ def test_a_study_is_built_from_its_signature() -> None:
 def test_a_recipe_stands_for_its_groups() -> None:
     groups = {"formulation", "search", "bootstraps", "selection", "depth"}
     assert groups < keys_of(Toy)
-    assert "recipe" not in keys_of(Toy)
+    assert "method" not in keys_of(Toy)
 
 
 @pytest.mark.parametrize(

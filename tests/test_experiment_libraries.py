@@ -319,7 +319,7 @@ def test_every_formulation_and_selection_finds_predator_and_prey(
     )
     study = study_of(Study, config)
     run = study.source.trajectory.trajectory(study.source.field(), inputs=[], label="")
-    found = discover(run, polynomial(["n_i", "n_n"], degree=2), study.recipe, seed=0)
+    found = discover(run, polynomial(["n_i", "n_n"], degree=2), study.method, seed=0)
     # Least exact are the differential form, as above, and boxes of a hundred samples, over which
     # the trapezoidal rule leaves 0.1 %.
     truth = {"n_i": -1.64e5, "n_i*n_n": 4.66e-14}
@@ -336,7 +336,7 @@ def test_a_selection_on_the_command_line_is_every_librarys(rule: str, tmp_path: 
     config = composed(*breathing(tmp_path, tmp_path), *search, f"selection={rule}")
     study = study_of(Study, config)
     for case in study.libraries.values():
-        assert type(case.recipe(study.recipe).selection) is type(study.recipe.selection)
+        assert type(case.method(study.method).selection) is type(study.method.selection)
 
 
 def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(

@@ -74,7 +74,7 @@ def study(*, weak: bool = True) -> PointStudy:
         bootstrap=TimeBootstrap(n_draws=60, periods=1.0),
         refining=Refining(n_windows=10, periods=0.5, max_iter=50),
         searched=SEARCHED,
-        recipe=Regression(rows, BestSubset(max_terms=3), selection=Knee(n_norm="max_terms")),
+        method=Regression(rows, BestSubset(max_terms=3), selection=Knee(n_norm="max_terms")),
         formulation=rows,
     )
 
@@ -191,7 +191,7 @@ def test_there_is_no_joint_search_of_one_point_or_without_best_subsets(
     law, rng = polynomial(["V", "m"], degree=1), np.random.default_rng(0)
     alone = [points[0], points[3]], [results[0], results[3]]
     assert search_shared(*alone, study(), law, rng=rng) is None
-    lasso = replace(study(), recipe=replace(study().recipe, search=AdaptiveLasso()))
+    lasso = replace(study(), method=replace(study().method, search=AdaptiveLasso()))
     assert search_shared(points, results, lasso, law, rng=rng) is None
 
 
@@ -511,7 +511,7 @@ def test_smoothing_biases_least_squares_and_not_refinements(
 ) -> None:
     run = forced(**TRUTHS[0], dt=1.0 / samples_per_period, periods=20)
     form = Differential(split=RandomSplit(0.0))
-    smoothed = replace(study(), recipe=replace(study().recipe, formulation=form), formulation=form)
+    smoothed = replace(study(), method=replace(study().method, formulation=form), formulation=form)
     (result,) = results_of([OperatingRecord({"V": 1.0}, run)], smoothed)
     for name, value in TRUTHS[0].items():
         fitted, refined = (result.fits[f"constrained{end}"].estimates for end in ("", "_refined"))

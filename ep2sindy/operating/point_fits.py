@@ -75,7 +75,7 @@ class PointStudy:
     """Settings of the fits and searches at every operating point.
 
     library: holds the terms of all cases, which are fitted to the rows of the formulation.
-    searched: the library in which the recipe searches for terms.
+    searched: the library in which the method searches for terms.
     Raises ValueError for a quantity whose coefficient a case does not have.
     """
 
@@ -84,7 +84,7 @@ class PointStudy:
     bootstrap: TimeBootstrap
     refining: Refining
     searched: Library
-    recipe: AnyMethod
+    method: AnyMethod
     formulation: Formulation
 
     def __post_init__(self) -> None:
@@ -229,7 +229,7 @@ def _refined(
 
 
 def _search_point(run: Trajectory, study: PointStudy, *, rng: np.random.Generator) -> Fitted:
-    found = discover(run, study.searched, study.recipe, seed=rng)
+    found = discover(run, study.searched, study.method, seed=rng)
     fronts = found.fronts.values()
     problems = list(dict.fromkeys(front.problem for front in fronts if front.problem is not None))
     no_rows = dict.fromkeys(found.model.states, float("nan"))  # a search of trajectories has none
@@ -370,7 +370,7 @@ def search_shared(
         for point, result in zip(points, results, strict=True)
         if result.fits and point.trajectory is not None
     }
-    method = study.recipe
+    method = study.method
     if len(used) < 2:
         return None
     if not (isinstance(method, Regression) and isinstance(method.search, BestSubset)):

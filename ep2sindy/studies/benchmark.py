@@ -235,10 +235,10 @@ def first_realizations(
     The search is the same as in the benchmark. Other variants give supports only; the result is
     None if no variant makes models.
     """
-    recipes = [(name, each) for name, each in variants.items() if isinstance(each, DiscoveryMethod)]
-    if not recipes:
+    methods = [(name, each) for name, each in variants.items() if isinstance(each, DiscoveryMethod)]
+    if not methods:
         return None
-    name, recipe = recipes[-1]
+    name, method = methods[-1]
     found = []
     pairs = list(product(systems, sorted(noises)))
     for label, noise in count_pieces(progress, pairs, "model", "first realizations"):
@@ -247,7 +247,7 @@ def first_realizations(
             for level in (noise, 0.0)
         )
         rng = np.random.default_rng([seed, 0, *name.encode()])
-        model = discover(runs, system.model.library, recipe, seed=rng, progress=progress).model
+        model = discover(runs, system.model.library, method, seed=rng, progress=progress).model
         right = np.array_equal(model.coef != 0.0, system.model.coef != 0.0)
         found.append(Identified(label, noise, runs[0], truth, model.rollout(truth), right))
     return FirstRealizations(name, found)

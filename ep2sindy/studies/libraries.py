@@ -68,7 +68,7 @@ class LibraryCase:
 
     functions, function_degree: as in `ep.polynomial`; `my_module.tanh` is the function that
     my_module registers by that name. n_norm: the knee's norm for this library, if it differs from
-    the recipe's.
+    the method's.
     """
 
     variables: Sequence[str]
@@ -90,18 +90,18 @@ class LibraryCase:
             function_degree=self.function_degree,
         )
 
-    def recipe(self, recipe: AnyMethod) -> AnyMethod:
-        """The shared recipe, with this library's norm if the selection rule has one."""
-        if self.n_norm is None or not isinstance(recipe.selection, Knee):
-            return recipe
-        return replace(recipe, selection=replace(recipe.selection, n_norm=self.n_norm))
+    def method(self, method: AnyMethod) -> AnyMethod:
+        """The shared method, with this library's norm if the selection rule has one."""
+        if self.n_norm is None or not isinstance(method.selection, Knee):
+            return method
+        return replace(method, selection=replace(method.selection, n_norm=self.n_norm))
 
 
 @dataclass(frozen=True)
 class Study:
     """Discover a model with every library, integrate it from the first sample, and compare.
 
-    formulation, bootstraps: those of the regression rows, also used where the recipe searches
+    formulation, bootstraps: those of the regression rows, also used where the method searches
     trajectories. rollout_s: integration time; None, or a time beyond the data, means to the data's
     end. thesis: published equations by library: state -> term -> SI coefficient. They are fitted as
     well if the library has the terms and the data can tell them from others. living: how libraries
@@ -112,7 +112,7 @@ class Study:
     """
 
     source: Source
-    recipe: AnyMethod
+    method: AnyMethod
     formulation: Formulation
     bootstraps: Bootstraps
     libraries: Mapping[str, LibraryCase]
@@ -134,7 +134,7 @@ class Study:
             )
 
     def compute(self, run: Run) -> Outcome:
-        recipes = {name: case.recipe(self.recipe) for name, case in self.libraries.items()}
+        methods = {name: case.method(self.method) for name, case in self.libraries.items()}
         with run.progress(None, "", "data"):
             opened = self.source.fields()
         libraries = {name: case.library(opened[0]) for name, case in self.libraries.items()}
@@ -150,7 +150,7 @@ class Study:
         length_m = zone_length_m(self.source, opened[0])
         results = {
             name: self._result(
-                runs, name, library, recipes[name], length_m, rng=rng, progress=run.watch
+                runs, name, library, methods[name], length_m, rng=rng, progress=run.watch
             )
             for (name, library), rng in count_pieces(run.watch, pairs, "library")
         }
@@ -165,7 +165,7 @@ class Study:
         runs: Sequence[Trajectory],
         name: str,
         library: Library,
-        recipe: AnyMethod,
+        method: AnyMethod,
         length_m: float | None,
         *,
         rng: np.random.Generator,
@@ -179,7 +179,7 @@ class Study:
         s = self.rollout_s
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
         data, n_samples = first
-        found = discover(list(runs), library, recipe, seed=rng, progress=progress)
+        found = discover(list(runs), library, method, seed=rng, progress=progress)
         published = self.thesis.get(name, {})
         rows = Regression(self.formulation, bootstraps=self.bootstraps)
         refitted = refit(found, published, rows, runs, rng)
@@ -196,7 +196,7 @@ class Study:
                 )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
-                recipe=recipe,
+                method=method,
                 discovery=found,
                 selected=free_run(found.model, data, n_samples=n_samples),
                 given=published,

@@ -64,7 +64,7 @@ class LibraryResult:
     model. elsewhere: free runs of the selected model over the records after the first.
     """
 
-    recipe: AnyMethod
+    method: AnyMethod
     discovery: Discovery
     selected: FreeRun
     given: Mapping[str, Mapping[str, float]]
@@ -77,12 +77,12 @@ class LibraryResult:
     @property
     def label(self) -> str:
         """The name of the selection score."""
-        return self.recipe.selection.label
+        return self.method.selection.label
 
     @property
     def by_runs(self) -> bool:
         """Whether the selection runs or refines whole models, rather than scoring candidates."""
-        return isinstance(self.recipe.selection, SystemSelection)
+        return isinstance(self.method.selection, SystemSelection)
 
     @property
     def how(self) -> str:
@@ -252,7 +252,7 @@ def _candidates_section(name: str, result: LibraryResult, clock: Clock) -> Secti
     blocks: list[Block] = [
         Text(
             f"{len(library)} terms in {', '.join(library.variables)}; "
-            f"selection: {result.recipe.selection}"
+            f"selection: {result.method.selection}"
         ),
         *([Text(f"selected: {result.decision}")] if result.decision else []),
         *(Text(f"note: {each}") for each in found.remarks),

@@ -133,7 +133,7 @@ class Study:
     """
 
     source: Source
-    recipe: AnyMethod
+    method: AnyMethod
     formulation: Formulation
     parallel: Workers
     parameters: Mapping[str, str | None]
@@ -199,7 +199,7 @@ class Study:
             bootstrap=self.bootstrap,
             refining=self.refining,
             searched=self.library.library(),
-            recipe=self.recipe,
+            method=self.method,
             formulation=self.formulation,
         )
 

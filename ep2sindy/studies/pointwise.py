@@ -74,7 +74,7 @@ class Study:
 
     data: Deferred
     prepare: Sequence[Step]
-    recipe: AnyMethod
+    method: AnyMethod
     parallel: Workers
     states: Names
     terms: Annotated[Sequence[str | int], A_LIST]  # 1, the constant, is a number to YAML
@@ -96,7 +96,7 @@ class Study:
         return named_terms(list(used), terms)
 
     def search(self, library: Library, *, seed: int) -> PointSearch:
-        method = regression_of(self.recipe)
+        method = regression_of(self.method)
         return PointSearch(self.states, library, method, self.least_variation, seed)
 
     def compute(self, run: Run) -> Outcome:

@@ -85,7 +85,7 @@ class Study:
     """
 
     source: Source
-    recipe: AnyMethod
+    method: AnyMethod
     signal: str
     offset: float
     embedding: str
@@ -120,7 +120,7 @@ class Study:
         found = self._found(chosen, states.window(0, n_fitted), run)
         held = states if n_fitted == states.n_samples else states.window(n_fitted, states.n_samples)
         with run.progress(None, "", "free run and limit cycle"):
-            return evaluate(signal, chosen, found, states, held, label=self.recipe.selection.label)
+            return evaluate(signal, chosen, found, states, held, label=self.method.selection.label)
 
     def _sampled(self, run: Run) -> Trajectory:
         zone = zone_of(self.source) or Zone()
@@ -146,20 +146,20 @@ class Study:
         )  # fmt: skip
 
     def _found(self, chosen: Chosen, states: Trajectory, run: Run) -> Discovery:
-        recipe, rule = self.recipe, self.recipe.selection
+        method, rule = self.method, self.method.selection
         if isinstance(rule, SystemSelection):  # the measured signal is judged, not derived states
             from ep2sindy.selection.free_run import (
                 FreeRunScore,  # loads torch, only for this rule
             )
 
             if isinstance(rule, FreeRunScore):
-                recipe = replace(recipe, selection=replace(rule, judged=(self.signal,)))
+                method = replace(method, selection=replace(rule, judged=(self.signal,)))
         if not chosen.embedded.terms:
-            recipe = replace(recipe, depth=min(recipe.depth, DEPTH_OF_BOTH))
+            method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
         return discover(
             states,
             polynomial(states.state_names, degree=self.degree),
-            recipe,
+            method,
             relations=chosen.embedded.relations,
             terms=chosen.embedded.terms,
             seed=run.seed,
