@@ -107,12 +107,11 @@ def test_a_hull_may_be_flat_or_a_triangle() -> None:
     assert not in_hull(triangle, np.array([0.51, 0.51]))
 
 
-def test_every_number_survives_a_file(tmp_path: object) -> None:
+def test_every_number_survives_a_file() -> None:
     again = OperatingLaw.from_json(law().to_json())
     assert again.to_json() == law().to_json()
     np.testing.assert_array_equal(again.coef, law().coef)
     np.testing.assert_array_equal(again.covariance, law().covariance)
-    assert again.intervals() == law().intervals()
     with pytest.raises(ValueError, match="a law file must hold ep2sindy.OperatingLaw/1 JSON"):
         OperatingLaw.from_json("{}")
 

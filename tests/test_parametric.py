@@ -41,6 +41,7 @@ from ep2sindy.runtime.parallel import Loky, Serial
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.oscillation import oscillation
 from ep2sindy.signals.smoothers import NoSmoothing
+from tests.models import plain_rows
 
 LIBRARY = named_terms(["x", "y", "R", "u"], ["1", "x*u", "x*y*R"])
 TERMS = {"x": ["x*u", "x*y*R"], "y": ["1", "x*y*R"]}
@@ -351,14 +352,8 @@ def correlated_problem(rng: np.random.Generator, *, n_rows: int, memory: int) ->
     kernel = np.ones(memory) / np.sqrt(memory)
     smooth = np.stack([np.convolve(column, kernel, "valid")[:n_rows] for column in white.T], 1)
     theta = smooth[:, :2]
-    return RegressionRows(
-        theta=theta,
-        target=(theta @ [2.0, -3.0] + 0.3 * smooth[:, 2])[:, None],
-        library=named_terms(["a", "b"], ["a", "b"]),
-        equations=["z"],
-        groups=np.arange(n_rows),
-        test=np.zeros(n_rows, dtype=bool),
-    )
+    target = theta @ [2.0, -3.0] + 0.3 * smooth[:, 2]
+    return plain_rows(theta, target[:, None], ["a", "b"], ["z"])
 
 
 def coverage(*, block: int, n_seeds: int) -> float:
