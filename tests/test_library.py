@@ -44,14 +44,6 @@ def test_numpy_and_torch_agree_to_the_last_bit() -> None:
     )
 
 
-def test_evaluation_is_differentiable_in_torch() -> None:
-    library = named_terms(["x", "y"], ["1", "x^2*y"])
-    point = torch.tensor([3.0, 5.0], dtype=torch.float64, requires_grad=True)
-    library.evaluate(point)[1].backward()
-    assert point.grad is not None
-    assert point.grad.tolist() == [30.0, 9.0]
-
-
 def test_averages_of_products_are_variables() -> None:
     library = named_terms(["n_i", "<n_i*n_n>"], ["n_i*<n_i*n_n>^2"])
     assert library.names == ("n_i*<n_i*n_n>^2",)
