@@ -210,15 +210,12 @@ def test_a_cycle_is_no_status() -> None:
         OperatingRecord(record.parameters, record.run, record.cycle)  # as in version 0.2
 
 
-def test_a_structure_must_name_every_state() -> None:
+def test_a_fit_needs_terms_of_every_state_and_no_constraint() -> None:
     with pytest.raises(ValueError, match=r"terms for each of \['x', 'y'\]"):
         operating_fit(records(), LIBRARY, {"x": ["x"]})
-
-
-def test_a_constraint_is_refused() -> None:
-    settings = replace(SETTINGS, constraint=constraint(LIBRARY, STRUCTURE))
+    tied = replace(SETTINGS, constraint=constraint(LIBRARY, STRUCTURE))
     with pytest.raises(ValueError, match="laws of the operating point take no constraint"):
-        operating_fit(records(), LIBRARY, STRUCTURE, settings=settings)
+        operating_fit(records(), LIBRARY, STRUCTURE, settings=tied)
 
 
 def test_a_start_that_is_given_leaves_the_method_as_it_was_set() -> None:
