@@ -76,10 +76,13 @@ def test_every_state_has_a_regression_of_its_own() -> None:
 
 def test_rows_are_means_of_terms_and_slopes_over_windows() -> None:
     run = noisy(lotka_volterra())
+    run = replace(run, inputs=np.sin(run.t)[:, None], input_names=["u"])
+    library = polynomial(["u", "x", "y"], degree=2)  # in an order of its own
     form = replace(EVERY_ROW, smooth_library=False)
-    for state, problem in enumerate(assembled(form, [run])):
+    for state, problem in enumerate(assembled(form, [run], library)):
         mean, slope = dense(problem)
-        assert problem.theta == pytest.approx(mean @ problem.library.evaluate(run.states))
+        values = run.columns(library.variables)
+        assert problem.theta == pytest.approx(mean @ library.evaluate(values))
         assert problem.target[:, 0] == pytest.approx(slope @ run.states[:, state])
 
 
