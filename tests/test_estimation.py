@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -180,10 +180,14 @@ def fit_of_truth(problem: EstimationProblem, model: ep.SparseModel) -> Trajector
     )
 
 
-def test_a_fit_is_where_the_squares_have_no_slope() -> None:
+def fitted_lorenz(process: float) -> tuple[EstimationProblem, Level, TrajectoryFit]:
     problem, _ = lorenz_problem()
-    level = Level((np.full((200, 3), 0.05),), 0.01)
-    fit = fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    level = Level((np.full((200, 3), 0.05),), process)
+    return problem, level, fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
+
+
+def test_a_fit_is_where_the_squares_have_no_slope() -> None:
+    problem, level, fit = fitted_lorenz(0.01)
     step = np.where(fit.support, 1e-4 * np.abs(fit.free), 0.0)
     for j in np.flatnonzero(fit.support):
         change = step * (np.arange(len(step)) == j)
@@ -193,9 +197,7 @@ def test_a_fit_is_where_the_squares_have_no_slope() -> None:
 
 
 def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
-    problem, _ = lorenz_problem()
-    level = Level((np.full((200, 3), 0.05),), 0.1)
-    fit = fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    problem, level, fit = fitted_lorenz(0.1)
     pair = gram(problem, fit, level)
     nothing = np.zeros(len(fit.free))
     assert penalise(pair, fit.support, nothing).score == pytest.approx(fit.total, abs=0.01)
@@ -209,9 +211,7 @@ def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
 
 
 def test_block_by_block_finds_the_best_support_of_all() -> None:
-    problem, _ = lorenz_problem()
-    level = Level((np.full((200, 3), 0.05),), 0.1)
-    fit = fit_paths(problem, fit_of_truth(problem, ep.lorenz().model), level)
+    problem, level, fit = fitted_lorenz(0.1)
     pair, prices = gram(problem, fit, level), term_prices(problem, 200.0)
     full = best_support(problem, pair, prices, np.ones_like(fit.support), max_terms=10)
     empty = best_support(problem, pair, prices, np.zeros_like(fit.support), max_terms=10)
@@ -474,24 +474,33 @@ def test_the_search_is_the_same_in_other_units() -> None:
     scaled = ep.Trajectory(run.t * 1e-6, run.states * [1e18, 1e19], run.state_names)
     one, other = (ep.estimate([r], system.model.library).model for r in (run, scaled))
     assert np.array_equal(one.coef != 0, other.coef != 0)
-    factor = (
-        1e6
-        * np.array([1e18, 1e19])
-        / system.model.library.evaluate(np.array([1e18, 1e19]))[:, None]
-    )
+    size = np.array([1e18, 1e19])
+    factor = 1e6 * size / system.model.library.evaluate(size)[:, None]
     np.testing.assert_allclose(other.coef, one.coef * factor, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("recipe", "message"),
+    ("method", "settings", "message"),
     [
-        ({"selection": ep.Knee()}, r"selection must be Evidence\(\)"),
-        ({"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
+        (ep.TrajectorySearch, {"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
+        (ep.TrajectorySearch, {"max_terms": 0}, "max_terms must be a whole number, one or more: 0"),
+        (
+            ep.Recipe,
+            {"search": ep.TrajectorySearch(), "bootstraps": ep.Bootstraps(n=2)},
+            r"draws no bootstraps: .*bootstraps=none",
+        ),
+        (
+            ep.Recipe,
+            {"search": ep.TrajectorySearch(), "formulation": ep.Weak()},
+            r"makes no rows: Weak\(.*; leave the formulation out, or",
+        ),
     ],
 )
-def test_a_rule_of_rows_is_refused_for_trajectories(recipe: dict, message: str) -> None:
+def test_settings_that_do_not_go_with_trajectories_are_refused(
+    method: Callable[..., object], settings: dict[str, object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
-        ep.TrajectorySearch(**recipe)
+        method(**settings)
 
 
 RULE = ep.FreeRunScore(n_folds=2)
@@ -538,30 +547,16 @@ def test_the_old_name_of_the_argument_warns() -> None:
     assert old.text() == ep.discover(run, method=rows).model.text()
 
 
-def test_bootstraps_are_refused_where_there_are_no_rows() -> None:
-    with pytest.raises(ValueError, match=r"draws no bootstraps: .*bootstraps=none"):
-        ep.Recipe(search=ep.TrajectorySearch(), bootstraps=ep.Bootstraps(n=2))
-
-
-def test_a_formulation_is_refused_where_there_are_no_rows() -> None:
-    with pytest.raises(ValueError, match=r"makes no rows: Weak\(.*; leave the formulation out, or"):
-        ep.Recipe(search=ep.TrajectorySearch(), formulation=ep.Weak())
-
-
 NO_ROWS = (ep.WeightedWeak(), ep.Bootstraps(n=0))
+RULED = ep.TrajectorySearch(selection=RULE, depth=2)
 
 
 @pytest.mark.parametrize(
     ("search", "selection", "depth", "expected"),
     [
         (ep.TrajectorySearch(depth=3), ep.Evidence(), 1, ep.TrajectorySearch(depth=3)),
-        (ep.TrajectorySearch(), RULE, 2, ep.TrajectorySearch(selection=RULE, depth=2)),
-        (
-            ep.TrajectorySearch(selection=RULE, depth=2),
-            ep.Evidence(),
-            2,
-            ep.TrajectorySearch(selection=RULE, depth=2),
-        ),
+        (ep.TrajectorySearch(), RULE, 2, RULED),
+        (RULED, ep.Evidence(), 2, RULED),
     ],
 )
 def test_settings_of_a_given_search_hold(
@@ -600,8 +595,6 @@ def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
         ep.estimate([run.window(0, 6)], ep.polynomial(["x", "y"], degree=2))
     with pytest.raises(ValueError, match="a run must have five samples or more: .* has 2"):
         ep.estimate([run, run.window(0, 2)], ep.polynomial(["x", "y"], degree=2))
-    with pytest.raises(ValueError, match="max_terms must be a whole number, one or more: 0 came"):
-        ep.TrajectorySearch(max_terms=0)
 
 
 def test_a_library_without_the_constant_where_a_state_drifts_is_a_misfit() -> None:

@@ -16,7 +16,7 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.quantity_law import control_law
 from ep2sindy.report.page import page_html
-from ep2sindy.studies.parametric import Outcome, Study
+from ep2sindy.studies.parametric import Study
 from ep2sindy.studies.views import with_error
 from tests import programs
 
@@ -34,16 +34,6 @@ LIBRARY_KEYS = "library may have ['degree', 'products', 'variables'] and needs v
 
 def composed(*overrides: str) -> DictConfig:
     return programs.composed("+exp=parametric", *overrides)
-
-
-def computed(config: DictConfig) -> tuple[Outcome, str, str]:
-    """What a study finds, its page and its log: all but figures, which take long to draw."""
-    with start_run(config) as run:
-        outcome = study_of(Study, config).compute(run)
-        sections = outcome.sections()
-        run.screen.show(sections)
-        log = " ".join((run.folder.path / "run.log").read_text().split())
-    return outcome, page_html(config.experiment, sections, {}), log
 
 
 def toy(output: Path) -> list[str]:
@@ -262,7 +252,12 @@ def test_laws_of_different_fits_are_different_lines() -> None:
     assert all(ax.get_window_extent().y1 < lowest for ax in figure.axes)
 
 
-def own_files(output: Path, *points: str) -> list[str]:
+def own_files(output: Path, *paths: Path) -> list[str]:
+    """Overrides that take these files for operating points of 200 V, 300 V and so on."""
+    points = (
+        f"{{V_D_V: {200.0 + 100.0 * k}, mdot_mg_s: 5.0, data: {{path: {path}}}}}"
+        for k, path in enumerate(paths)
+    )
     return [
         *toy(output)[:1],
         *toy(output)[5:],
@@ -275,24 +270,23 @@ def own_files(output: Path, *points: str) -> list[str]:
     ]
 
 
-def test_own_files_and_a_point_that_does_not_oscillate(tmp_path: Path) -> None:
+def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     first = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
     second = breathing_file(tmp_path / "b.nc", amplitude=0.4, dt_s=2e-6, rate=1.1)
     still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
-    places = {first: "200.0", second: "300.0", still: "400.0"}
-    points = [f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {p}}}}}" for p, V in places.items()]
-    outcome, *texts = computed(composed(*own_files(tmp_path, *points)))
-    summary = outcome.summary()
-    assert [p["status"] for p in summary["points"]] == ["oscillating", "oscillating", "steady"]
-    assert [p["dt_s"] for p in summary["points"]] == pytest.approx([1.5e-6, 2e-6, 1.5e-6])
+    dead = breathing_file(tmp_path / "d.nc", amplitude=0.0, dt_s=1.5e-6)
+    found = programs.computed(composed(*own_files(tmp_path, first, second, still, dead)))
+    summary = found.summary
+    assert [p["status"] for p in summary["points"]] == ["oscillating"] * 2 + ["steady"] * 2
+    assert [p["dt_s"] for p in summary["points"][:3]] == pytest.approx([1.5e-6, 2e-6, 1.5e-6])
     steady = summary["points"][2]
     assert steady["constrained"] == {"L_m": None, "g_inj": None, "eps": None}
     assert steady["ci95"]["free"] is None
     assert summary["laws"] == {}
     assert {row["n_points"] for row in summary["trends"] if row["along"] == "V_D_V"} == {2}
     words = "a.nc; average over z 15 to 25 mm (all 3 points), the last 40% of the channel's 25 mm"
-    assert words.replace(" ", "") in texts[-1].replace(" ", "")  # a long path is broken anywhere
-    for text in texts:
+    assert words.replace(" ", "") in "".join(found.log.split())  # a long path is broken anywhere
+    for text in (found.page, " ".join(found.log.split())):
         assert "V_D_V=400, mdot_mg_s=5: steady; 1000 samples of 1.5 µs; left out of t" in text
         assert "one: 2 points fitted; a law needs 3" in text
         assert "Search left out" not in text  # there are no laws whose errors it could explain
@@ -301,30 +295,21 @@ def test_own_files_and_a_point_that_does_not_oscillate(tmp_path: Path) -> None:
 def test_without_published_values_nothing_speaks_of_a_thesis(tmp_path: Path) -> None:
     first = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
     second = breathing_file(tmp_path / "b.nc", amplitude=0.4, dt_s=1.5e-6, rate=1.1)
-    places = {first: "200.0", second: "300.0"}
-    points = [f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {p}}}}}" for p, V in places.items()]
-    outcome, page, log = computed(composed(*own_files(tmp_path, *points), "thesis=null"))
+    config = composed(*own_files(tmp_path, first, second), "thesis=null")
+    with start_run(config) as run:
+        outcome = study_of(Study, config).compute(run)
+        run.screen.show(outcome.sections())
+        log = (run.folder.path / "run.log").read_text()
+    page = page_html(config.experiment, outcome.sections(), {})
     assert "thesis" not in page + log + outcome.figures()["trends"].caption
-    assert outcome.tables()["trends"]["low"].isna().all()  # of two points at most
-
-
-def test_a_state_that_never_moves_makes_a_point_steady(tmp_path: Path) -> None:
-    swinging = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
-    dead = breathing_file(tmp_path / "b.nc", amplitude=0.0, dt_s=1.5e-6)
-    places = {swinging: "200.0", dead: "300.0"}
-    points = [f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {p}}}}}" for p, V in places.items()]
-    outcome, _, _ = computed(composed(*own_files(tmp_path, *points)))
-    assert [p["status"] for p in outcome.summary()["points"]] == ["oscillating", "steady"]
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
     still = breathing_file(tmp_path / "c.nc", amplitude=1e-3, dt_s=1.5e-6)
-    point = f"{{V_D_V: 300.0, mdot_mg_s: 5.0, data: {{path: {still}}}}}"
-    folder = run_config(composed(*own_files(tmp_path, point), "trajectory.zone=null")).folder
+    folder = run_config(composed(*own_files(tmp_path, still), "trajectory.zone=null")).folder
     assert not (folder / "figures").exists()
-    assert "None: 0 points fitted; a law needs 3" in " ".join(
-        (folder / "run.log").read_text().split()
-    )
+    log = " ".join((folder / "run.log").read_text().split())
+    assert "None: 0 points fitted; a law needs 3" in log
     assert summary_of(folder)["points"][0]["status"] == "steady"
 
 
@@ -332,12 +317,8 @@ def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
     whole = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
     with xr.open_dataset(whole, decode_times=False) as field:
         write_field(field.load().drop_vars("u_iz"), tmp_path / "b.nc")
-    points = [
-        f"{{V_D_V: {V}, mdot_mg_s: 5.0, data: {{path: {tmp_path / name}}}}}"
-        for V, name in ((200.0, "a.nc"), (300.0, "b.nc"))
-    ]
     with pytest.raises(ValueError, match=r"operating point V_D_V=300, mdot_mg_s=5: .*'u_iz'"):
-        computed(composed(*own_files(tmp_path, *points)))
+        programs.computed(composed(*own_files(tmp_path, whole, tmp_path / "b.nc")))
 
 
 @pytest.mark.parametrize(
@@ -375,6 +356,6 @@ def test_settings_that_cannot_work_are_refused(
     overrides: list[str], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises((ValueError, OmegaConfBaseException)) as caught:
-        computed(composed(*toy(tmp_path), *overrides))
+        programs.computed(composed(*toy(tmp_path), *overrides))
     assert message in str(caught.value)
     assert not (tmp_path / "cache").exists()

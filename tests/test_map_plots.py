@@ -242,6 +242,8 @@ def test_a_regime_map_gives_every_regime_its_equations(regime: Figure) -> None:
     }
     assert all(r"$\dot{n}_{i} = - 40 \, n_{i} \, u_{iz}$" in entry for entry in entries)
     assert any(r"$\dot{n}_{n} = 3 \cdot 10^{4} \, n_{n}$" in entry for entry in entries)
+    title = regime.legends[0].get_title().get_text()
+    assert title.startswith("terms that act, with medians over the")
 
 
 def test_an_equation_without_terms_reads_zero() -> None:
@@ -291,20 +293,13 @@ def test_no_value_is_drawn_in_a_shade_near_white(regime: Figure) -> None:
     assert ax.collections[0].get_cmap() == SHARE_COLOURS
 
 
-def test_the_figure_says_that_coefficients_are_medians(regime: Figure) -> None:
-    (found,) = regime.legends
-    assert found.get_title().get_text().startswith("terms that act, with medians over the")
-
-
 @pytest.mark.parametrize(("cut", "ends"), [({"r": 1}, (-0.05, 2.45)), ({"z": 1}, (3.383, 5.117))])
 def test_over_one_axis_every_panel_ends_with_the_outermost_cells(
     cut: dict[str, int], ends: tuple[float, float]
 ) -> None:
     result = study().isel(cut, drop=True)
-    for draw in (coefficient_maps, quality_maps):
-        for ax in draw(result).axes:
-            assert ax.get_xlim() == pytest.approx(ends, abs=1e-3)
-    for ax in regime_map(grouped(result)).axes:
+    figures = coefficient_maps(result), quality_maps(result), regime_map(grouped(result))
+    for ax in (ax for figure in figures for ax in figure.axes):
         assert ax.get_xlim() == pytest.approx(ends, abs=1e-3)
 
 

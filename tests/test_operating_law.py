@@ -107,12 +107,11 @@ def test_a_hull_may_be_flat_or_a_triangle() -> None:
     assert not in_hull(triangle, np.array([0.51, 0.51]))
 
 
-def test_every_number_survives_a_file(tmp_path: object) -> None:
+def test_every_number_survives_a_file() -> None:
     again = OperatingLaw.from_json(law().to_json())
     assert again.to_json() == law().to_json()
     np.testing.assert_array_equal(again.coef, law().coef)
     np.testing.assert_array_equal(again.covariance, law().covariance)
-    assert again.intervals() == law().intervals()
     with pytest.raises(ValueError, match="a law file must hold ep2sindy.OperatingLaw/1 JSON"):
         OperatingLaw.from_json("{}")
 
@@ -211,15 +210,12 @@ def test_a_cycle_is_no_status() -> None:
         OperatingRecord(record.parameters, record.run, record.cycle)  # as in version 0.2
 
 
-def test_a_structure_must_name_every_state() -> None:
+def test_a_fit_needs_terms_of_every_state_and_no_constraint() -> None:
     with pytest.raises(ValueError, match=r"terms for each of \['x', 'y'\]"):
         operating_fit(records(), LIBRARY, {"x": ["x"]})
-
-
-def test_a_constraint_is_refused() -> None:
-    settings = replace(SETTINGS, constraint=constraint(LIBRARY, STRUCTURE))
+    tied = replace(SETTINGS, constraint=constraint(LIBRARY, STRUCTURE))
     with pytest.raises(ValueError, match="laws of the operating point take no constraint"):
-        operating_fit(records(), LIBRARY, STRUCTURE, settings=settings)
+        operating_fit(records(), LIBRARY, STRUCTURE, settings=tied)
 
 
 def test_a_start_that_is_given_leaves_the_method_as_it_was_set() -> None:

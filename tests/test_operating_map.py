@@ -6,20 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.library.library import polynomial
 from ep2sindy.operating.choice import StructureTrial, candidate_structures, choose, try_structures
 from ep2sindy.operating.fit import SETTINGS
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate, eigenvalues, fixed_point, law_map
+from tests.models import model_of
 from tests.test_operating_law import LIBRARY, STATES, STRUCTURE, recorded, records
-
-# Radius r' = r (a - r^2), phase' = 1: a cycle of radius sqrt(a) and period 2 pi where a > 0.
-HOPF = {
-    "x": {"x": 1.0, "y": -1.0, "x^3": -1.0, "x*y^2": -1.0},
-    "y": {"x": 1.0, "y": 1.0, "x^2*y": -1.0, "y^3": -1.0},
-}
-
+from tests.test_stability import HOPF
 
 ONES = np.ones(2)
 SHORT = replace(SETTINGS, n_windows=3, periods=1.0)
@@ -34,15 +28,12 @@ def tries() -> list[StructureTrial]:
 
 
 def hopf() -> OperatingLaw:
-    names = list(dict.fromkeys(name for terms in HOPF.values() for name in terms))
+    """r' = r (a - r^2), phase' = 1: a cycle of radius sqrt(a) and period 2 pi where a > 0."""
     pairs = tuple((state, term) for state, terms in HOPF.items() for term in terms)
-    coef = np.array([[c, 0.0] for terms in HOPF.values() for c in terms.values()])
-    for k, pair in enumerate(pairs):
-        if pair in (("x", "x"), ("y", "y")):
-            coef[k] = [0.0, 1.0]
+    coef = np.array([[0.0, 1.0] if s == t else [HOPF[s][t], 0.0] for s, t in pairs])
     return OperatingLaw(
         functions=polynomial(["a"], degree=1),
-        library=named_terms(("x", "y"), names),
+        library=model_of(HOPF).library,
         states=("x", "y"),
         coefficients=pairs,
         coef=coef,
@@ -65,15 +56,7 @@ def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
 
 
 def test_a_model_that_runs_away_has_no_cycle() -> None:
-    law = hopf()
-    wild = OperatingLaw(
-        functions=law.functions,
-        library=law.library,
-        states=law.states,
-        coefficients=law.coefficients,
-        coef=np.abs(law.coef),
-        points=law.points,
-    )
+    wild = replace(hopf(), coef=np.abs(hopf().coef))
     near = replace(recorded(1.0, 0.0), parameters={"a": 1.0})
     (found,) = law_map(wild, [near], [{"a": 1.0}])
     assert found.fate is Fate.DIVERGES
@@ -81,18 +64,13 @@ def test_a_model_that_runs_away_has_no_cycle() -> None:
 
 
 def test_fixed_points_and_their_eigenvalues_are_exact() -> None:
-    library = polynomial(["x", "y"], degree=2)
-    terms = [{"x": 2.0, "x*y": -1.0}, {"x*y": 1.0, "y": -3.0}]
-    model = SparseModel(library, ("x", "y"), coef_matrix(library, terms))
+    model = model_of({"x": {"x": 2.0, "x*y": -1.0}, "y": {"x*y": 1.0, "y": -3.0}})
     state = fixed_point(model, np.array([2.5, 2.5]), scale=ONES, positive=ONES > 0.0)
     assert state is not None
     np.testing.assert_allclose(state, [3.0, 2.0], rtol=1e-8)
-    np.testing.assert_allclose(
-        np.sort_complex(eigenvalues(model, state, scale=ONES)),
-        [-1j * 6**0.5, 1j * 6**0.5],
-        atol=1e-8,
-    )
-    drift = SparseModel(library, ("x", "y"), coef_matrix(library, [{"1": 1.0}, {"1": 1.0}]))
+    turning = np.sort_complex(eigenvalues(model, state, scale=ONES))
+    np.testing.assert_allclose(turning, [-1j * 6**0.5, 1j * 6**0.5], atol=1e-8)
+    drift = model_of({"x": {"1": 1.0}, "y": {"1": 1.0}})
     assert fixed_point(drift, ONES, scale=ONES, positive=ONES > 0.0) is None
 
 

@@ -1,9 +1,7 @@
 import errno
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -109,12 +107,7 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     field = noisy()
     result = pointwise(field, search, workers=Serial()).isel(z=2, r=1)
     run = point_samples(field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"])
-    found = discover(
-        [run],
-        LIBRARY,
-        search.method,
-        seed=search.seed,
-    )
+    found = discover([run], LIBRARY, search.method, seed=search.seed)
     np.testing.assert_allclose(result["coef"].sel(equation="x"), found.model.coef[:, 0], rtol=1e-12)
     chosen = found.chosen["x"]
     assert result["r2_test"].item() == pytest.approx(chosen.r2_test)
@@ -136,16 +129,6 @@ def test_a_grid_may_be_one_point() -> None:
     assert result["coef"].sel(term="u").item() == pytest.approx(-50.0 * R[0])
 
 
-@pytest.fixture
-def cluster() -> Iterator[Any]:
-    from distributed import LocalCluster  # takes a second: not while tests are collected
-
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-    ) as cluster:
-        yield cluster
-
-
 @pytest.mark.parametrize("block_points", [1, 5, 1000])
 def test_blocks_do_not_show_in_the_result(block_points: int, noisy_bytes: dict[str, bytes]) -> None:
     result = pointwise(noisy(), searching(), workers=Serial(), block_points=block_points)
@@ -159,19 +142,21 @@ def test_processes_give_the_same_bits(noisy_bytes: dict[str, bytes]) -> None:
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_bits_even_if_a_worker_is_killed(
-    cluster: Any, noisy_bytes: dict[str, bytes]
+    noisy_bytes: dict[str, bytes],
 ) -> None:
-    pids = [worker.pid for worker in cluster.workers.values()]
+    from distributed import LocalCluster  # takes a second: not while tests are collected
 
-    def kill_one(_: int) -> None:
-        if pids:
-            os.kill(pids.pop(), signal.SIGKILL)
-            pids.clear()
+    at = {"host": "127.0.0.1", "dashboard_address": None}
+    with LocalCluster(n_workers=2, threads_per_worker=1, **at) as cluster:
+        pids = [worker.pid for worker in cluster.workers.values()]
 
-    spread = pointwise(
-        noisy(), searching(), workers=Dask(cluster.scheduler_address), block_points=1,
-        progress=kill_one,
-    )  # fmt: skip
+        def kill_one(_: int) -> None:
+            if pids:
+                os.kill(pids.pop(), signal.SIGKILL)
+                pids.clear()
+
+        workers = Dask(cluster.scheduler_address)
+        spread = pointwise(noisy(), searching(), workers=workers, block_points=1, progress=kill_one)
     assert bytes_of(spread) == noisy_bytes
 
 
@@ -204,12 +189,11 @@ def test_masked_inputs_mask_the_point() -> None:
 
 
 def test_a_setting_that_fits_nowhere_is_an_error(tmp_path: Path) -> None:
-    few = searching(formulation=Differential(), library=LIBRARY)
     short = parabolas().isel(time=slice(0, 8))
     kept = Kept(tmp_path)
     for _ in range(2):  # the second time from kept blocks
         with pytest.raises(ValueError, match="could be fitted: smoothing needs at least 11"):
-            pointwise(short, few, workers=Serial(), kept=kept)
+            pointwise(short, searching(), workers=Serial(), kept=kept)
 
 
 def test_a_field_without_plasma_is_an_error() -> None:

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,21 +37,10 @@ def test_crop_keeps_both_ends() -> None:
     assert crop(ramp()).equals(ramp())
 
 
-def test_a_crop_outside_the_record_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"0.01 to 0.001999 s leaves 0 of 2000, .* 0 to 0.001999"):
-        crop(ramp(), start_s=0.01)
-
-
 def test_decimate_keeps_every_nth_sample() -> None:
     part = decimate(ramp(), factor=500)
     assert part["I_d"].values.tolist() == [0, 500, 1000, 1500]
     assert part["time"].values == pytest.approx([0, 5e-4, 1e-3, 1.5e-3])
-
-
-@pytest.mark.parametrize("factor", [0, -2, 2000])
-def test_a_factor_that_leaves_no_series_is_refused(factor: int) -> None:
-    with pytest.raises(ValueError, match=f"{factor} came with 2000 samples"):
-        decimate(ramp(), factor=factor)
 
 
 def tone(f_Hz: float) -> np.ndarray:
@@ -77,27 +67,37 @@ def test_low_pass_keeps_masked_cells_units_and_static_variables() -> None:
     assert after["B"].identical(before["B"])
 
 
-def test_low_pass_refuses_a_gap_instead_of_spreading_it() -> None:
-    wave = tone(2e3)
-    wave[70] = np.nan
-    with pytest.raises(ValueError, match="I_d = nan at time = 7e-05 s"):
-        low_pass(field(I_d=(("time",), wave, "A")), cutoff_Hz=1e5)
+RAMP = ramp()
+GAP = RAMP.assign(I_d=RAMP["I_d"].where(np.arange(N) != 70))
 
 
 @pytest.mark.parametrize(
-    ("samples", "settings", "message"),
+    ("step", "field", "setting", "message"),
     [
-        (np.arange(N), {"cutoff_Hz": 5e5}, "half the sampling rate, 500000 Hz: 500000 came"),
-        (np.arange(N), {"cutoff_Hz": 0.0}, "cutoff_Hz must lie between 0"),
-        (np.arange(15), {"cutoff_Hz": 1e5}, "of order 4 needs more than 15 samples: 15 came"),
-        (np.r_[0:70, 71:90], {"cutoff_Hz": 1e5}, r"t\[70\] - t\[69\] = 2e-06 s, the mean is"),
+        (crop, RAMP, {"start_s": 0.01}, r"0.01 to 0.001999 s leaves 0 of 2000, .* 0 to 0.001999"),
+        *((decimate, RAMP, {"factor": n}, f"{n} came with 2000 samples") for n in (0, -2, 2000)),
+        (low_pass, RAMP, {"cutoff_Hz": 5e5}, "half the sampling rate, 500000 Hz: 500000 came"),
+        (low_pass, RAMP, {"cutoff_Hz": 0.0}, "cutoff_Hz must lie between 0"),
+        (
+            low_pass,
+            RAMP.isel(time=slice(15)),
+            {"cutoff_Hz": 1e5},
+            "of order 4 needs more than 15 samples: 15 came",
+        ),
+        (
+            low_pass,
+            RAMP.isel(time=np.r_[0:70, 71:90]),
+            {"cutoff_Hz": 1e5},
+            r"t\[70\] - t\[69\] = 2e-06 s, the mean is",
+        ),
+        (low_pass, GAP, {"cutoff_Hz": 1e5}, "I_d = nan at time = 7e-05 s"),
     ],
 )
-def test_low_pass_says_what_it_cannot_filter(
-    samples: np.ndarray, settings: dict, message: str
+def test_steps_say_what_they_cannot_do(
+    step: Callable[..., xr.Dataset], field: xr.Dataset, setting: dict[str, float], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        low_pass(ramp().isel(time=samples), **settings)
+        step(field, **setting)
 
 
 def test_low_pass_then_decimate_matches_a_slow_tone() -> None:
@@ -266,8 +266,8 @@ def test_other_gases_have_rates_of_their_own(gas: str) -> None:
 
 
 def test_a_gas_has_its_range_and_its_own_table(tmp_path: Path) -> None:
-    hot = warm().assign(T_e_eV=20 * warm()["T_e_eV"].assign_attrs(units="eV"))
-    hot["T_e_eV"].attrs["units"] = "eV"
+    hot = warm()
+    hot["T_e_eV"] *= 20
     with pytest.raises(ValueError, match="T_e_eV must stay in the rate table, 0 to 100 eV"):
         ionization_rate(hot, gas="krypton")
     with pytest.raises(ValueError, match="there are the propellants .*: 'neon' came"):

@@ -9,9 +9,8 @@ import pytest
 
 from benchmarks.breathing_family import LAW, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import constraint
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import fit_and_judge, is_stationary
 from ep2sindy.refinement.law import LawRefinement, refine_law
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
@@ -20,6 +19,7 @@ from ep2sindy.refinement.problem import LawMap, RefinementSettings
 from ep2sindy.refinement.problem import RefinementProblem as Problem
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.weighted_law import information_of, weighted_law
+from tests.models import model_of
 
 POINTS = list(PARAMETERS)
 WINDOW, N_WINDOWS = 60, 4
@@ -143,17 +143,13 @@ def test_units_change_nothing() -> None:
     np.testing.assert_allclose(kilovolts.law, found.law * [1.0, 1e3, 1.0], rtol=1e-7)
     factor = 1e18
     larger = [[replace(run, states=run.states * factor) for run in at_point] for at_point in data]
-    rescaled = [replace(m, coef=m.coef / _sizes(m, factor)) for m in near()]
+    ones = np.full((1, 2), factor)
+    rescaled = [replace(m, coef=m.coef * factor / m.library.evaluate(ones).T) for m in near()]
     other = tied(rescaled, larger)
     by_term = dict(zip(found.coefficients, found.law, strict=True))
     for (state, term), row in zip(other.coefficients, other.law, strict=True):
         degree = {"1": 0, "n_i*n_n": 2}.get(term, 1)
         np.testing.assert_allclose(row * factor ** (degree - 1), by_term[state, term], rtol=1e-7)
-
-
-def _sizes(model: SparseModel, factor: float) -> np.ndarray:
-    ones = np.full((1, 2), factor)
-    return model.library.evaluate(ones).T / factor
 
 
 def test_the_order_of_points_does_not_matter() -> None:
@@ -231,18 +227,16 @@ def test_an_information_of_one_direction_still_gives_a_law() -> None:
         ({"basis": BASIS * np.nan}, "a basis must be finite"),
         ({"basis": BASIS[:5]}, "must be one per point: 6, 6 and 5 came"),
         ({"window": 600}, "a window must fit into a trajectory"),
+        ({"method": NelderMead(), "free_start": False}, "MultipleShooting alone: NelderMead"),
+        (
+            {"models": [model_of({"n_i": {"n_i": 1.0}, "n_n": {"n_n": 1.0}}), *truths()[1:]]},
+            "must have the same terms: 2 structures came",
+        ),
     ],
 )
 def test_what_cannot_be_tied_says_why(change: Mapping[str, object], message: str) -> None:
-    basis = change.get("basis", BASIS)
-    settings = replace(SETTINGS, window=change.get("window", WINDOW))
     with pytest.raises(ValueError, match=message):
-        refine_law(near(), runs(), basis, settings, rng=0)
-
-
-def test_other_methods_know_no_law() -> None:
-    with pytest.raises(ValueError, match="a law is refined by MultipleShooting alone: NelderMead"):
-        tied(near(), runs(), method=NelderMead(), free_start=False)
+        tied(**{"models": near(), "data": runs(), **change})
 
 
 def problem_of(models: Sequence[SparseModel], data: Sequence[Sequence[Trajectory]]) -> Problem:
@@ -262,14 +256,6 @@ def test_a_law_of_identities_is_no_law_to_rounding(free_start: bool) -> None:
     np.testing.assert_allclose(tied.nodes, free.nodes, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(law.covariance, own.covariance, rtol=1e-9)
     np.testing.assert_allclose(law.window_loss, own.window_loss, rtol=1e-10)
-
-
-def test_models_of_different_structure_cannot_be_tied() -> None:
-    models = near()
-    library = polynomial(["n_i", "n_n"], degree=2)
-    other = SparseModel(library, ("n_i", "n_n"), coef_matrix(library, [{"n_i": 1.0}, {"n_n": 1.0}]))
-    with pytest.raises(ValueError, match="must have the same terms: 2 structures came"):
-        tied([other, *models[1:]], runs())
 
 
 def test_records_of_unlike_length_need_as_many_windows() -> None:

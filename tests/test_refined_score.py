@@ -12,12 +12,12 @@ from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
-from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.selection import refined as refined_score
 from ep2sindy.selection.refined import RefinedScore, _refined
 from ep2sindy.selection.rule import FLOOR, MAX_ERROR
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra
+from tests.models import plain_rows
 
 PREY = lotka_volterra()
 Terms = dict[str, float]
@@ -30,15 +30,9 @@ def fronts_of(
 ) -> list[ParetoFront]:
     """One front per equation, of given candidates after the empty one."""
     values = np.concatenate([run.columns(library.variables) for run in runs])
-    problem = RegressionRows(
-        theta=library.evaluate(values),
-        target=np.concatenate([run.states for run in runs]),
-        library=library,
-        equations=runs[0].state_names,
-        groups=np.arange(len(values)),
-        test=np.zeros(len(values), dtype=np.bool_),
-        trajectories=tuple(runs),
-    )
+    target = np.concatenate([run.states for run in runs])
+    rows = plain_rows(library.evaluate(values), target, library, runs[0].state_names)
+    rows = replace(rows, trajectories=tuple(runs))
     fronts = []
     for equation, given in choices.items():
         candidates = [
@@ -53,7 +47,7 @@ def fronts_of(
             )
             for k, coef in enumerate([{}, *sorted(given, key=len)])
         ]
-        fronts.append(ParetoFront(equation, candidates, problem))
+        fronts.append(ParetoFront(equation, candidates, rows))
     return fronts
 
 
@@ -90,12 +84,10 @@ WRONG = {
 
 
 @pytest.mark.parametrize(
-    ("system", "n_samples"),
-    [(PREY, 600), pytest.param(lorenz(), 600, marks=pytest.mark.slow)],
-    ids=["prey", "Lorenz"],
+    "system", [PREY, pytest.param(lorenz(), marks=pytest.mark.slow)], ids=lambda s: s.name
 )
-def test_the_truth_is_selected_from_exact_samples(system: System, n_samples: int) -> None:
-    run = system.trajectory().window(0, n_samples)
+def test_the_truth_is_selected_from_exact_samples(system: System) -> None:
+    run = system.trajectory().window(0, 600)
     fronts = fronts_of([run], system.model.library, next_to_truth(system, WRONG[system.name]))
     found = scores_by(RefinedScore(), fronts)
     chosen = [f.with_scores(scores).best for f, scores in zip(fronts, found, strict=True)]
@@ -203,22 +195,23 @@ def test_windows_without_a_jump_do_not_decide_alone(number: int) -> None:
     )
 
 
-def models_of_different_terms() -> list[SparseModel]:
+def batch_of(run: Trajectory, *, n_windows: int = 3, window: int = 50) -> WindowBatch:
+    rng = np.random.default_rng(1)
+    return cut_windows(
+        [run], states=("x", "y"), inputs=(), n_windows=n_windows, window=window, rng=rng
+    )
+
+
+def test_models_of_different_terms_refined_together_are_those_refined_alone() -> None:
+    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(0))
+    batch = batch_of(run, n_windows=4, window=100)
     library = PREY.model.library
     given: list[list[Terms]] = [
         [{"x": 0.6, "x*y": -0.9}, {"y": -0.3, "x*y": 0.9}],
         [{"1": 0.1, "x": 0.5, "x*y": -0.9, "x^2": 0.01}, {"y": -0.3, "x*y": 0.9, "y^2": 0.01}],
         [{"x": 0.6, "x*y": -0.9}, {"1": 0.01, "y": -0.3, "x*y": 0.9}],
     ]
-    return [SparseModel(library, ["x", "y"], coef_matrix(library, terms)) for terms in given]
-
-
-def test_models_of_different_terms_refined_together_are_those_refined_alone() -> None:
-    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(0))
-    batch = cut_windows(
-        [run], states=("x", "y"), inputs=(), n_windows=4, window=100, rng=np.random.default_rng(1)
-    )
-    models = models_of_different_terms()
+    models = [SparseModel(library, ["x", "y"], coef_matrix(library, terms)) for terms in given]
     method = MultipleShooting()
     found = refine_batch(models, batch, method=method)
     together = found.models
@@ -242,10 +235,7 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
     truth = {s: PREY.model.terms(s) for s in ("x", "y")}
     wild = SparseModel(library, ["x", "y"], coef_matrix(library, [{"x^2*y^2": 1e200}, {"y": 1e3}]))
     sound = SparseModel(library, ["x", "y"], coef_matrix(library, list(truth.values())))
-    batch = cut_windows(
-        [PREY.trajectory()], states=("x", "y"), inputs=(), n_windows=3, window=50,
-        rng=np.random.default_rng(0),
-    )  # fmt: skip
+    batch = batch_of(PREY.trajectory())
     found = refine_batch([wild, sound], batch, method=MultipleShooting())
     kept, good = found.models
     assert found.finished.tolist() == [False, True]
@@ -268,10 +258,7 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept(
         return BatchRefinement([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
 
     monkeypatch.setattr("ep2sindy.selection.refined.refine_batch", unfinished)
-    run = PREY.trajectory()
-    batch = cut_windows(
-        [run], states=("x", "y"), inputs=(), n_windows=3, window=50, rng=np.random.default_rng(0)
-    )
+    batch = batch_of(PREY.trajectory())
     both = Ensemble(PREY.model.library, ["x", "y"], np.repeat(off.coef[:, :, None], 2, axis=2))
     found = _refined(both, batch, [unconstrained(off)] * 2, lambda n_more: None)
     np.testing.assert_array_equal(found.coef[:, :, 0], PREY.model.coef)

@@ -12,7 +12,6 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.differential import Differential
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.selection.criteria import EBIC
 from ep2sindy.systems.regions import REGIONS, STATES, RegionField, three_regions
 
 SIZES = {"fast": (8, 7, 600), "full": (20, 15, 1500)}
@@ -35,10 +34,7 @@ def studied(size: str, noise: float, *, seed: int = 0, one_equation: bool = Fals
         states=STATES,
         library=truth.library,
         method=Regression(
-            formulation=Differential(),
-            search=BestSubset(max_terms=5),
-            selection=EBIC(),
-            bootstraps=Bootstraps(n=8, n_culled=0),
+            Differential(), BestSubset(max_terms=5), bootstraps=Bootstraps(n=8, n_culled=0)
         ),
         seed=seed,
     )
@@ -181,8 +177,7 @@ def test_the_largest_regime_comes_first() -> None:
 
 
 def test_bootstraps_that_disagree_lower_the_confidence_of_their_point() -> None:
-    result = patched()
-    draws = np.array(result["weight_draws"].values)
+    draws = np.array(patched()["weight_draws"].values)
     draws[0, 0, 1, 3, 2] = 1.0  # one of the two says source
     confidence = found_in(patched(weight_draws=draws)).confidence.values
     assert confidence[3, 2] == pytest.approx(0.5, abs=0.01)
@@ -192,9 +187,8 @@ def test_bootstraps_that_disagree_lower_the_confidence_of_their_point() -> None:
 def test_a_bootstrap_without_a_fit_supports_no_regime() -> None:
     draws = np.array(patched()["weight_draws"].values)
     draws[1, :, :, 3, 2] = np.nan
-    assert found_in(patched(weight_draws=draws)).confidence.values[3, 2] == pytest.approx(
-        0.5, abs=0.01
-    )
+    confidence = found_in(patched(weight_draws=draws)).confidence.values
+    assert confidence[3, 2] == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("gone", "left"), [("z", "r"), ("r", "z")])
@@ -274,9 +268,8 @@ def test_fewer_points_than_regimes_are_grouped(n: int) -> None:
 
 def test_points_that_are_all_alike_are_one_regime_beyond_doubt() -> None:
     weights = np.tile([0.6, -0.4], (10, 1))
-    labels, confidence = group_points(
-        weights, np.stack([weights] * 4), rng=np.random.default_rng(0)
-    )
+    draws = np.stack([weights] * 4)
+    labels, confidence = group_points(weights, draws, rng=np.random.default_rng(0))
     assert (labels == 0).all()
     assert (confidence == 1.0).all()
 

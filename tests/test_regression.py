@@ -8,23 +8,13 @@ from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.regression.ambiguity import ambiguities, few_rows, largest_support, usable_terms
 from ep2sindy.regression.bootstraps import Bootstraps, pooled_supports
 from ep2sindy.regression.differential import Differential
-from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
+from ep2sindy.regression.weak import Weak
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay
 from ep2sindy.systems.systems import lotka_volterra
-
-
-def problem_of(theta: np.ndarray, target: np.ndarray, names: list[str]) -> RegressionRows:
-    """Columns named as variables of their own, none held out."""
-    return RegressionRows(
-        theta=theta,
-        target=target,
-        library=named_terms(names, names),
-        equations=["y"],
-        groups=np.arange(len(theta)),
-        test=np.zeros(len(theta), dtype=bool),
-    )
+from tests.models import plain_rows
 
 
 def cubic(t: np.ndarray, label: str) -> Trajectory:
@@ -73,7 +63,7 @@ def test_impossible_shares_are_refused(split: type, share: float) -> None:
 def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
     rng = np.random.default_rng(0)
     theta, target = rng.normal(size=(30, 3)) * [1e18, 1.0, 1e-14], rng.normal(size=(30, 1))
-    problem = problem_of(theta, target, ["a", "b", "c"])
+    problem = plain_rows(theta, target, ["a", "b", "c"])
     assert np.diag(problem.train_gram.xx[0]) == pytest.approx(1.0)
     counts = rng.integers(0, 3, size=30).astype(float)
     repeated = np.repeat(theta / np.linalg.norm(theta, axis=0), counts.astype(int), axis=0)
@@ -84,7 +74,7 @@ def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
 
 def test_columns_at_the_edge_of_the_number_format_keep_finite_norms() -> None:
     theta = np.array([[1e200, 1.0], [2e200, 3.0], [-1e200, 2.0]])
-    problem = problem_of(theta, np.ones((3, 1)), ["a", "b"])
+    problem = plain_rows(theta, np.ones((3, 1)), ["a", "b"])
     assert problem.theta_scale[0] == pytest.approx(np.sqrt(6.0) * 1e200)
 
 
@@ -101,21 +91,27 @@ def test_an_overflowing_term_is_named() -> None:
         Differential().assemble([run], polynomial(["n"], degree=3), rng=np.random.default_rng(0))
 
 
-def test_trajectories_must_agree() -> None:
-    t = np.linspace(0, 1, 40)
-    library = polynomial(["x"], degree=1)
-    rng = np.random.default_rng(0)
-    metre = Trajectory(t=t, states=t[:, None], state_names=["x"], units={"x": "m"})
-    foot = Trajectory(t=t, states=t[:, None], state_names=["x"], units={"x": "ft"})
-    other = Trajectory(t=t, states=t[:, None], state_names=["y"])
-    with pytest.raises(ValueError, match="'x' is in m in trajectory 0 and in ft in trajectory 1"):
-        Differential().assemble([metre, foot], library, rng=rng)
-    with pytest.raises(ValueError, match=r"trajectory 1 has states \['y'\]"):
-        Differential().assemble([metre, other], library, rng=rng)
-    with pytest.raises(ValueError, match="at least one trajectory"):
-        Differential().assemble([], library, rng=rng)
-    with pytest.raises(ValueError, match=r"trajectory 0 has states \['x'\] and inputs \[\]"):
-        Differential().assemble([metre], polynomial(["x", "u"], degree=1), rng=rng)
+METRE, FOOT = (
+    Trajectory(np.arange(40.0), np.arange(40.0)[:, None], ["x"], units={"x": unit})
+    for unit in ("m", "ft")
+)
+
+
+@pytest.mark.parametrize("formulation", [Differential(), Weak()])
+@pytest.mark.parametrize(
+    ("runs", "variables", "message"),
+    [
+        ([METRE, FOOT], ["x"], "'x' is in m in trajectory 0 and in ft in trajectory 1"),
+        ([METRE, replace(FOOT, state_names=["y"])], ["x"], r"trajectory 1 has states \['y'\]"),
+        ([], ["x"], "at least one trajectory"),
+        ([METRE], ["x", "u"], r"trajectory 0 has states \['x'\] and inputs \[\]"),
+    ],
+)
+def test_trajectories_must_agree(
+    formulation: Formulation, runs: list[Trajectory], variables: list[str], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        formulation.assemble(runs, polynomial(variables, degree=1), rng=np.random.default_rng(0))
 
 
 def test_without_smoothing_the_derivative_is_the_plain_difference() -> None:
@@ -130,7 +126,7 @@ def degenerate() -> RegressionRows:
     a, b = rng.normal(size=(2, 50))
     columns = [np.ones(50), a, np.zeros(50), -3.0 * a, b, a + 2.0 * b, a + 1e-3 * b]
     names = ["one", "a", "zero", "minus_3a", "b", "a_plus_2b", "nearly_a"]
-    return problem_of(np.stack(columns, axis=1), (a + b)[:, None], names)
+    return plain_rows(np.stack(columns, axis=1), (a + b)[:, None], names)
 
 
 def test_zero_repeated_and_dependent_terms_are_left_out() -> None:
@@ -144,7 +140,7 @@ def test_of_dependent_terms_the_simplest_are_kept() -> None:
     names = ["u^2", "x*u^2", "x", "x*u", "u", "s^2", "c^2", "1"]
     library = named_terms(["x", "u", "s", "c"], names)
     theta = library.evaluate(np.stack([x, u, np.sin(x), np.cos(x)], axis=1))
-    problem = replace(problem_of(theta, x[:, None], list("abcdefgh")), library=library)
+    problem = plain_rows(theta, x[:, None], library)
     kept = {name for name, k in zip(names, usable_terms(problem), strict=True) if k}
     assert kept == {"x", "x*u", "u", "s^2", "1"}
     assert [a.message for a in ambiguities(problem)] == [
@@ -166,7 +162,7 @@ def test_the_user_is_told_what_cannot_be_told_apart() -> None:
 def test_a_combination_of_many_terms_is_named_and_stays_in_the_search() -> None:
     theta = np.random.default_rng(0).normal(size=(50, 5))
     theta[:, 4] = theta[:, :4].sum(axis=1)
-    problem = problem_of(theta, theta[:, 4:], list("abcde"))
+    problem = plain_rows(theta, theta[:, 4:], list("abcde"))
     assert usable_terms(problem).all()
     (found,) = ambiguities(problem)
     assert found.message == "'e' is a linear combination of ['a', 'b', 'c', 'd'] on every row"
@@ -175,7 +171,7 @@ def test_a_combination_of_many_terms_is_named_and_stays_in_the_search() -> None:
 @pytest.mark.parametrize(("n_rows", "largest"), [(18, 6), (17, 3), (13, 2), (6, 1)])
 def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> None:
     theta = np.random.default_rng(0).normal(size=(n_rows, 6))
-    problem = problem_of(theta, theta[:, :1], list("abcdef"))
+    problem = plain_rows(theta, theta[:, :1], list("abcdef"))
     assert largest_support(problem) == largest
     (supports,) = pooled_supports(
         problem, BestSubset(), Bootstraps(n=0), rng=np.random.default_rng(0)
@@ -186,4 +182,4 @@ def test_few_rows_hold_the_size_of_supports_down(n_rows: int, largest: int) -> N
 
 def test_a_healthy_library_has_no_ambiguities() -> None:
     theta = np.random.default_rng(0).normal(size=(50, 3))
-    assert ambiguities(problem_of(theta, theta[:, :1], ["a", "b", "c"])) == ()
+    assert ambiguities(plain_rows(theta, theta[:, :1], ["a", "b", "c"])) == ()

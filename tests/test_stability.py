@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ep2sindy.library.library import named_terms, polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import (
     CycleStability,
     LimitCycle,
@@ -16,6 +16,7 @@ from ep2sindy.model.stability import (
     limit_cycle,
     share_reaching,
 )
+from tests.models import model_of
 
 Equations = Mapping[str, Mapping[str, float]]
 
@@ -33,12 +34,6 @@ BREATHING = {
 }
 FEW = 10.0  # periods, after which these cycles hold whoever starts in their basin
 SOLVED = 1e-8  # of the integration at 1e-11, over a period, with room for what it amplifies
-
-
-def model_of(equations: Equations, *, variables: tuple[str, ...] | None = None) -> SparseModel:
-    names = list(dict.fromkeys(name for terms in equations.values() for name in terms))
-    library = named_terms(variables or tuple(equations), names)
-    return SparseModel(library, tuple(equations), coef_matrix(library, list(equations.values())))
 
 
 def reversed_in_time(equations: Equations) -> Equations:
@@ -259,7 +254,7 @@ def test_stability_is_that_of_the_largest_multiplier(modulus: float, stability: 
 
 
 def test_a_model_with_inputs_has_no_cycle_of_its_own() -> None:
-    model = model_of({"x": {"y": 1.0}, "y": {"u": 1.0}}, variables=("x", "y", "u"))
+    model = model_of({"x": {"y": 1.0}, "y": {"u": 1.0}}, inputs=["u"])
     cycle = LimitCycle(1.0, np.zeros((8, 2)), np.array([1.0 + 0j, 0.5]))
     with pytest.raises(ValueError, match=r"without inputs: this one has \['u'\]"):
         limit_cycle(model, np.ones(2), period_s=1.0)

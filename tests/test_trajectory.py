@@ -52,7 +52,7 @@ BACKWARDS[30] = 0.1
         ({"inputs": np.ones((49, 1)), "input_names": ["u"]}, "inputs must have shape"),
         ({"inputs": np.ones((50, 1))}, "one name per column"),
         ({"t": np.zeros(1), "states": np.ones((1, 1))}, "at least two samples"),
-        ({"states": np.full((50, 1), 2.5)}, "'x' stays at 2.5 over all 50 samples"),
+        ({"states": np.full((50, 1), 2.5)}, "'x' stays at 2.5 over all 50 samples; leave it out"),
         ({"state_names": ["x", "y"]}, "one name per column: 1 columns"),
         ({"inputs": np.ones((50, 1)), "input_names": ["x"]}, r"unique: \['x'\]"),
     ],

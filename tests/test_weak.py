@@ -8,13 +8,10 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.names import split_factors
-from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.searches import BestSubset
 from ep2sindy.regression.splits import BlockSplit, RandomSplit
 from ep2sindy.regression.test_functions import Boxes, Bumps
 from ep2sindy.regression.weak import Weak
-from ep2sindy.selection.criteria import EBIC
 from ep2sindy.signals.smoothers import NoSmoothing
 from ep2sindy.systems.systems import (
     System,
@@ -46,9 +43,7 @@ def found_in(run: Trajectory, library: Library, form: Weak = EVERY_ROW) -> Disco
     return discover(
         [run],
         library,
-        Regression(
-            formulation=form, search=BestSubset(), selection=EBIC(), bootstraps=Bootstraps(n=0)
-        ),
+        Regression(form),
         seed=np.random.default_rng(1),
     )
 
@@ -81,10 +76,13 @@ def test_every_state_has_a_regression_of_its_own() -> None:
 
 def test_rows_are_means_of_terms_and_slopes_over_windows() -> None:
     run = noisy(lotka_volterra())
+    run = replace(run, inputs=np.sin(run.t)[:, None], input_names=["u"])
+    library = polynomial(["u", "x", "y"], degree=2)  # in an order of its own
     form = replace(EVERY_ROW, smooth_library=False)
-    for state, problem in enumerate(assembled(form, [run])):
+    for state, problem in enumerate(assembled(form, [run], library)):
         mean, slope = dense(problem)
-        assert problem.theta == pytest.approx(mean @ problem.library.evaluate(run.states))
+        values = run.columns(library.variables)
+        assert problem.theta == pytest.approx(mean @ library.evaluate(values))
         assert problem.target[:, 0] == pytest.approx(slope @ run.states[:, state])
 
 
@@ -99,9 +97,6 @@ def test_windows_of_two_points_are_the_differential_form() -> None:
     assert problem.theta == pytest.approx(0.5 * (terms[k] + terms[k + 1]), rel=1e-12)
     quotient = (x[k + 1] - x[k]) / (t[k + 1] - t[k])
     assert problem.target[:, 0] == pytest.approx(quotient, rel=1e-12)
-    # Second-order about the middle of the step: (7 h)^2 / 24 at steps of up to 15 ms.
-    middle = 0.5 * (t[k] + t[k + 1])
-    assert problem.target[:, 0] == pytest.approx(7 * np.cos(7 * middle), abs=7 * 5e-4)
 
 
 @pytest.mark.parametrize("smooth_library", [True, False])
@@ -210,63 +205,16 @@ def test_permuting_the_library_changes_nothing() -> None:
         assert permuted == pytest.approx(terms, rel=1e-9)
 
 
-def driven(u: np.ndarray, t: np.ndarray) -> Trajectory:
-    """x' = -x + 2 u, exact for inputs that are straight between samples."""
-    x, h = np.zeros_like(t), t[1] - t[0]
-    decay = np.exp(-h)
-    for k in range(len(t) - 1):
-        a, b = u[k], (u[k + 1] - u[k]) / h
-        x[k + 1] = decay * x[k] + 2 * (a * (1 - decay) + b * (h - 1 + decay))
-    return Trajectory(
-        t=t, states=x[:, None], state_names=["x"], inputs=u[:, None], input_names=["u"]
-    )
-
-
-def test_the_model_may_use_inputs() -> None:
-    t = np.linspace(0.0, 30.0, 1501)
-    found = found_in(driven(np.sin(t) + 0.5 * np.sin(2.3 * t), t), polynomial(["x", "u"], degree=2))
-    # The input's corners: its curvature of 3.6 times h^2 / 12 = 3e-5.
-    assert found.model.terms("x") == pytest.approx({"x": -1.0, "u": 2.0}, rel=2e-4)
-
-
 def test_an_input_that_never_changes_is_no_obstacle() -> None:
-    t = np.linspace(0.0, 8.0, 801)
-    found = found_in(driven(np.full(801, 1.5), t), polynomial(["x", "u"], degree=1))
+    """x' = -x + 2 u with u = 1.5."""
+    t = np.linspace(0.0, 8.0, 801)[:, None]
+    run = Trajectory(t[:, 0], 3.0 - 3.0 * np.exp(-t), ["x"], np.full_like(t, 1.5), ["u"])
+    found = found_in(run, polynomial(["x", "u"], degree=1))
     assert found.model.terms("x") == pytest.approx({"1": 3.0, "x": -1.0}, rel=1e-7)
     messages = [a.message for a in found.ambiguities]
     assert "'u' is a multiple of '1' on every row and is left out" in messages
 
 
-@pytest.mark.parametrize(
-    ("state", "message"),
-    [
-        (np.full(50, 2.5), "'x' stays at 2.5 over all 50 samples; leave it out"),
-        (np.where(np.arange(50) == 12, np.nan, np.arange(50.0)), r"x\[12\] = nan at t = 12 s"),
-    ],
-)
-def test_states_without_change_or_samples_never_reach_the_rows(
-    state: np.ndarray, message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        Trajectory(t=np.arange(50.0), states=state[:, None], state_names=["x"])
-
-
 def test_overlapping_boxes_have_no_errors_in_variables() -> None:
     with pytest.raises(ValueError, match="needs smooth test functions: Boxes came; use Bumps, or"):
         Weak(test_functions=Boxes())
-
-
-def test_trajectories_must_agree() -> None:
-    run = noisy(lotka_volterra())
-    other = Trajectory(t=run.t, states=run.states, state_names=["x", "z"])
-    with pytest.raises(ValueError, match=r"trajectory 1 has states \['x', 'z'\]"):
-        assembled(Weak(), [run, other])
-    with pytest.raises(ValueError, match="at least one trajectory"):
-        Weak().assemble([], polynomial(["x"], degree=1), rng=np.random.default_rng(0))
-
-
-def test_fewer_windows_than_terms_are_refused() -> None:
-    run = noisy(lotka_volterra())
-    form = replace(EVERY_ROW, test_functions=Bumps(half_width_s=45.0))
-    with pytest.raises(ValueError, match="library of 6 terms needs at least as many training rows"):
-        assembled(form, [run])
