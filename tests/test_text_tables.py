@@ -153,12 +153,6 @@ def test_an_empty_file_and_a_folder_are_named(tmp_path: Path) -> None:
         open_field(tmp_path)
 
 
-def test_a_binary_file_named_csv_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_bytes(np.linspace(0, 1, 100).tobytes())
-    with pytest.raises(ValueError, match=r"bytes that are no text"):
-        open_field(tmp_path / "a.csv")
-
-
 def test_a_unit_in_the_header_must_agree_with_the_mapping(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t (us),n (cm^-3)\n" + rows(1e6 * T, 1e12 * X))
     with pytest.raises(ValueError, match=r"(?s)2 things .*the file 'cm\^-3'.*the file 'us'"):
