@@ -145,12 +145,10 @@ def test_faults_of_a_table_are_named(tmp_path: Path, fault: str) -> None:
         open_field(tmp_path / "a.csv")
 
 
-def test_an_empty_file_and_a_folder_are_named(tmp_path: Path) -> None:
+def test_an_empty_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b"")
     with pytest.raises(ValueError, match="a.csv is empty: it holds no bytes"):
         open_field(tmp_path / "a.csv")
-    with pytest.raises(ValueError, match=r"a folder that ends in .zarr: .* is a folder"):
-        open_field(tmp_path)
 
 
 def test_a_unit_in_the_header_must_agree_with_the_mapping(tmp_path: Path) -> None:
