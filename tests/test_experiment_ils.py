@@ -13,14 +13,12 @@ from ep2sindy.library.relations import constraint
 from ep2sindy.refinement.problem import Iteration
 from ep2sindy.studies.ils import watcher
 from tests import programs
+from tests.test_experiment_constrained import JUDGED
 
 EXACT = {
     "n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14},
     "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14},
 }
-JUDGED = {
-    "text", "f_kHz", "f_error", "nrmse", "amplitude_ratio", "status", "ci95", "cpu_s",
-}  # fmt: skip
 
 
 def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
