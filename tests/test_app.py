@@ -1,6 +1,5 @@
 """From a command line to a study: configs, their errors, sweeps and their index."""
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -275,9 +274,7 @@ def records(folder: Path) -> None:
     done |= {"folder": "outputs/toy/1", "headline": {"r2": 0.5}}
     failed = {"job": 1, "overrides": ["+exp=toy", "seed=-1"], "status": "failed", "error": "no"}
     for record in (failed, done):
-        path = folder / "jobs" / f"{record['job']}.json"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps(record))
+        write_json(folder / "jobs" / f"{record['job']}.json", record)
 
 
 def test_an_index_has_every_job_in_order(tmp_path: Path) -> None:
