@@ -130,14 +130,9 @@ def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:
                             f"output={folder}"))  # fmt: skip
 
 
+WAVE = np.outer(np.arange(1.0, 6.0), np.arange(1.0, 11.0))
 GRID = xr.Dataset(
-    {
-        "n_i": (
-            ("time", "z"),
-            np.outer(np.arange(1.0, 6.0), np.arange(1.0, 11.0)),
-            {"units": "m^-3"},
-        )
-    },
+    {"n_i": (("time", "z"), WAVE, {"units": "m^-3"})},
     coords={"time": np.arange(5.0), "z": np.linspace(0.0025, 0.0475, 10)},
 )
 
