@@ -137,9 +137,7 @@ def test_rescaled_units_change_the_learned_term_and_nothing_else() -> None:
     states = data().states[::100]
     assert large.loss == pytest.approx(small.loss, rel=1e-6)
     np.testing.assert_allclose(
-        large.learned(states * DENSITY) / (DENSITY * 1e6),
-        small.learned(states),
-        rtol=1e-5,
+        large.learned(states * DENSITY) / (DENSITY * 1e6), small.learned(states), rtol=1e-5
     )
 
 

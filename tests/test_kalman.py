@@ -5,13 +5,7 @@ from scipy.linalg import cho_factor, cho_solve, null_space
 from ep2sindy.signals.kalman import KalmanSmoother, most_likely_ratio
 from ep2sindy.signals.kernels import likelihood, smooth
 from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.systems.systems import (
-    System,
-    damped_oscillator,
-    lorenz,
-    lotka_volterra,
-    van_der_pol,
-)
+from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 SYSTEMS = [damped_oscillator(), lotka_volterra(), van_der_pol(), lorenz()]
 UNEQUAL = np.array([0.0, 0.7, 1.9, 2.4, 3.9, 4.6, 5.1, 7.0, 7.9, 8.3, 9.8, 11.0])

@@ -155,7 +155,5 @@ def test_a_unit_in_the_header_must_agree_with_the_mapping(tmp_path: Path) -> Non
     (tmp_path / "a.csv").write_text("t (us),n (cm^-3)\n" + rows(1e6 * T, 1e12 * X))
     with pytest.raises(ValueError, match=r"(?s)2 things .*the file 'cm\^-3'.*the file 'us'"):
         open_field(
-            tmp_path / "a.csv",
-            variables={"n_i": Variable("n", "m^-3")},
-            time=Variable("t", "s"),
+            tmp_path / "a.csv", variables={"n_i": Variable("n", "m^-3")}, time=Variable("t", "s")
         )
