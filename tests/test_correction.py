@@ -1,5 +1,6 @@
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,6 +45,12 @@ def network(n_in: int, n_out: int, *, hidden: int = 8) -> nn.Module:
     return nn.Sequential(nn.Linear(n_in, hidden), nn.Tanh(), last)
 
 
+def refined(model: SparseModel, run: Trajectory, module: nn.Module, **settings: Any) -> Corrected:
+    """From the same windows at each call."""
+    rng = np.random.default_rng(0)
+    return refine_with_correction(model, [run], module, rng=rng, **settings)
+
+
 class Fixed(nn.Module):
     """The first variable times the last, in units of their scales, into every state."""
 
@@ -84,10 +91,7 @@ def test_missing_interaction_is_learned_and_named() -> None:
         {"x": ("x",), "y": ("y",)},
         [f"x: x == {model.terms('x')['x']!r}", f"y: y == {model.terms('y')['y']!r}"],
     )
-    found = refine_with_correction(
-        model, [data()], network(2, 2), window=25, n_windows=10, constraint=held,
-        rng=np.random.default_rng(0),
-    )  # fmt: skip
+    found = refined(model, data(), network(2, 2), window=25, n_windows=10, constraint=held)
     assert found.status == "converged"
     assert found.loss < 1e-5 * found.loss_before
     assert found.loss == pytest.approx(found.window_loss.mean())
@@ -127,18 +131,13 @@ def test_rescaled_units_change_the_learned_term_and_nothing_else() -> None:
     big = replace(data(), states=data().states * DENSITY, t=data().t * 1e-6)
     rescaled = replace(model, coef=model.coef * 1e6)
     small, large = (
-        refine_with_correction(
-            m, [d], network(2, 2), window=10, n_windows=3, rng=np.random.default_rng(0),
-            method=GradientDescent(max_iter=1),
-        )
+        refined(m, d, network(2, 2), window=10, n_windows=3, method=GradientDescent(max_iter=1))
         for m, d in ((model, data()), (rescaled, big))
-    )  # fmt: skip
+    )
     states = data().states[::100]
     assert large.loss == pytest.approx(small.loss, rel=1e-6)
     np.testing.assert_allclose(
-        large.learned(states * DENSITY) / (DENSITY * 1e6),
-        small.learned(states),
-        rtol=1e-5,
+        large.learned(states * DENSITY) / (DENSITY * 1e6), small.learned(states), rtol=1e-5
     )
 
 
@@ -151,19 +150,13 @@ def test_learned_term_is_in_si_and_knows_the_inputs() -> None:
     run = Trajectory(t, x[:, None], ["x"], u[:, None], ["u"])
     library = named_terms(["x", "u"], ["x"])
     model = SparseModel(library, ["x"], np.array([[-1.0]]))
-    trial = refine_with_correction(
-        model, [run], Fixed(1), window=50, n_windows=3, rng=np.random.default_rng(0),
-        method=GradientDescent(max_iter=1),
-    )  # fmt: skip
+    once = GradientDescent(max_iter=1)
+    trial = refined(model, run, Fixed(1), window=50, n_windows=3, method=once)
     # Fixed returns x u / scale, so this factor of it is 0.2 x u in SI.
     factor = 0.2 * trial.scale.prod() / trial.rate[0]
-    exact = Fixed(1)
     layer = nn.Linear(1, 1, bias=False)
     nn.init.constant_(layer.weight, float(np.float32(factor)))
-    found = refine_with_correction(
-        model, [run], nn.Sequential(exact, layer), window=50, n_windows=3,
-        rng=np.random.default_rng(0),
-    )  # fmt: skip
+    found = refined(model, run, nn.Sequential(Fixed(1), layer), window=50, n_windows=3)
     assert found.loss < 1e-10
     np.testing.assert_allclose(
         found.learned(x[:, None], u[:, None]), (0.2 * x * u)[:, None], rtol=1e-3, atol=1e-3
@@ -177,12 +170,11 @@ def test_callers_module_is_left_alone_and_seeding_decides_the_rest() -> None:
     given = network(2, 2)
     before = [p.detach().clone() for p in given.parameters()]
     first, second = (
-        refine_with_correction(
-            known_part(), [data()], given, window=10, n_windows=3, rng=np.random.default_rng(0),
-            method=GradientDescent(max_iter=2),
+        refined(
+            known_part(), data(), given, window=10, n_windows=3, method=GradientDescent(max_iter=2)
         )
         for _ in range(2)
-    )  # fmt: skip
+    )
     assert first.status == "max_iter"
     assert len(first.history) == 2
     for old, now in zip(before, given.parameters(), strict=True):
@@ -195,9 +187,7 @@ def test_callers_module_is_left_alone_and_seeding_decides_the_rest() -> None:
 @pytest.mark.slow
 def test_blow_up_hands_back_what_came() -> None:
     model = replace(known_part(), coef=known_part().coef * 1e4)
-    found = refine_with_correction(
-        model, [data()], network(2, 2), window=50, n_windows=2, rng=np.random.default_rng(0)
-    )
+    found = refined(model, data(), network(2, 2), window=50, n_windows=2)
     assert found.status == "non_finite"
     assert found.loss == found.loss_before == float("inf")
     np.testing.assert_allclose(found.model.coef, model.coef, rtol=1e-15)
@@ -206,6 +196,4 @@ def test_blow_up_hands_back_what_came() -> None:
 
 def test_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"one column per state \['x', 'y'\]: \(3, 1\) came"):
-        refine_with_correction(
-            known_part(), [data()], network(2, 1), window=10, rng=np.random.default_rng(0)
-        )
+        refined(known_part(), data(), network(2, 1), window=10)

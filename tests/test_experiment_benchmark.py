@@ -1,4 +1,5 @@
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -87,7 +88,6 @@ def test_terminal_and_page_show_both(toy_run: Path) -> None:
     italic = next(row for row in page.split("<tr ") if ">100/92</td>" in row)
     assert italic.startswith('class="italic"><td>ALASSO, thesis</td>')
     assert "EBIC(gamma=1.0, coarsening=60.0)" in page
-    assert 'id="figure-benchmark"' in page
     assert (toy_run / "figures" / "benchmark.png").stat().st_size > 0
     assert list((toy_run / "tensorboard").glob("events*"))
 
@@ -156,12 +156,5 @@ def test_a_rival_without_pysindy_is_refused(
     ],
 )
 def test_settings_that_cannot_work_are_refused(override: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises((ValueError, HydraException)) as caught:
+    with pytest.raises((ValueError, HydraException), match=re.escape(message)):
         run_config(composed(*toy(tmp_path), override))
-    assert message in str(caught.value)
-
-
-def test_a_key_of_this_study_does_nothing_in_another(tmp_path: Path) -> None:
-    config = programs.composed("+exp=breathing", "+n_realizations=3", f"output={tmp_path}")
-    with pytest.raises(ValueError, match="unknown keys \\['n_realizations'\\]"):
-        run_config(config)

@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,12 @@ from ep2sindy.library.relations import constraint
 from ep2sindy.refinement.problem import Iteration
 from ep2sindy.studies.ils import watcher
 from tests import programs
+from tests.test_experiment_constrained import JUDGED
 
 EXACT = {
     "n_i": {"n_i": -1.64e5, "n_i*n_n": 4.66e-14},
     "n_n": {"n_n": 4.39e4, "n_i*n_n": -4.66e-14},
 }
-JUDGED = {
-    "text", "f_kHz", "f_error", "nrmse", "amplitude_ratio", "status", "ci95", "cpu_s",
-}  # fmt: skip
 
 
 def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
@@ -141,8 +140,6 @@ def test_iterations_go_to_tensorboard(toy_run: Path) -> None:
 def test_ils_settings_that_cannot_work_are_refused(
     overrides: list[str], message: str, predator_prey: Path, tmp_path: Path
 ) -> None:
-    config = ils(predator_prey, tmp_path, *overrides)
-    with pytest.raises((ValueError, HydraException)) as caught:
-        run_config(config)
-    assert message in str(caught.value)
+    with pytest.raises((ValueError, HydraException), match=re.escape(message)):
+        run_config(ils(predator_prey, tmp_path, *overrides))
     assert not list(tmp_path.glob("ils/*/models"))

@@ -13,12 +13,11 @@ import pytest
 import xarray as xr
 from omegaconf import DictConfig, OmegaConf
 
-from ep2sindy.app.runner import run_config, start_run
+from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
 from ep2sindy.discovery.pointwise import Block, Kept
 from ep2sindy.studies import pointwise
-from ep2sindy.studies.pointwise import Outcome
 from ep2sindy.systems.regions import TERMS, three_regions
 from tests import programs
 
@@ -27,13 +26,6 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def composed(*overrides: str) -> DictConfig:
     return programs.composed("+exp=pointwise", *overrides)
-
-
-def computed(*overrides: str) -> tuple[Outcome, Path]:
-    """What the study finds, and the run folder, without tables and figures."""
-    config = composed(*overrides)
-    with start_run(config) as run:
-        return study_of(pointwise.Study, config).compute(run), run.folder.path
 
 
 def key_of(*overrides: str) -> str:
@@ -110,8 +102,7 @@ def test_tables_figures_and_page_are_there(toy_run: Path) -> None:
 
 
 def test_finished_blocks_are_gone_once_the_result_is_written(toy_run: Path) -> None:
-    (kept,) = [path for path in toy_run.parents if (path / "kept").exists()][:1]
-    assert list((kept / "kept").iterdir()) == []
+    assert list((toy_run.parents[2] / "kept").iterdir()) == []
 
 
 def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Path) -> None:
@@ -119,13 +110,13 @@ def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Pat
     with xr.open_dataset(grid, decode_times=False) as field:
         write_field(field.isel(r=2, drop=True).load(), line)
     overrides = ["data.r.name=null", "data.variables.u_ir.name=null"]
-    found, folder = computed(*on_file(line, tmp_path), *overrides)
-    assert found.summary()["n_points"] == 6
-    log = " ".join((folder / "run.log").read_text().split())
+    found = programs.computed(composed(*on_file(line, tmp_path), *overrides))
+    assert found.summary["n_points"] == 6
+    log = " ".join(found.log.split())
     assert "lacks their variables: ['n_i*u_ir']" in log
     assert "(all 6 points)" in log
-    assert found.figures()["regimes"].draw().axes
-    with xr.open_dataset(folder / "pointwise.nc") as result:
+    found.check_figures("regimes")
+    with xr.open_dataset(found.folder / "pointwise.nc") as result:
         assert list(result["term"].values) == [name for name in TERMS if "u_ir" not in name]
 
 
@@ -147,7 +138,7 @@ def test_settings_that_cannot_work_are_refused_before_data_are_opened(
     override: str, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
-        computed(*on_file(tmp_path / "not_there.nc", tmp_path), override)
+        study_of(pointwise.Study, composed(*on_file(tmp_path / "not_there.nc", tmp_path), override))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +153,7 @@ def test_settings_that_do_not_fit_the_data_are_refused(
     override: str, message: str, grid: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
-        computed(*on_file(grid, tmp_path), override)
+        programs.computed(composed(*on_file(grid, tmp_path), override))
 
 
 def test_an_outline_that_is_no_thruster_is_refused(tmp_path: Path) -> None:
@@ -215,12 +206,11 @@ def test_a_study_that_selects_nothing_is_a_result(tmp_path: Path) -> None:
     path = tmp_path / "noise.nc"
     write_field(xr.Dataset(noise, coords={"time": time_s, "z": z}), path)
     overrides = [*on_file(path, tmp_path), "data.r.name=null", "data.variables.u_ir.name=null"]
-    found, _ = computed(*overrides, "terms=[n_i*u_iz]", "selection=ebic")
-    assert found.summary()["n_valid"] == 3
-    assert found.summary()["equations"] == [{"n_i": {}, "n_n": {}}]
-    assert set(found.figures()) == {"regimes", "quality"}
-    for figure in found.figures().values():
-        assert figure.draw().axes
+    found = programs.computed(composed(*overrides, "terms=[n_i*u_iz]", "selection=ebic"))
+    assert found.summary["n_valid"] == 3
+    assert found.summary["equations"] == [{"n_i": {}, "n_n": {}}]
+    assert set(found.outcome.figures()) == {"regimes", "quality"}
+    found.check_figures("regimes", "quality")
 
 
 def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:
@@ -239,7 +229,7 @@ def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:
 def test_an_interrupted_run_says_how_to_go_on(
     grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    write, overrides = Kept.write, on_file(grid, tmp_path)
+    write, config = Kept.write, composed(*on_file(grid, tmp_path))
 
     def interrupted(self: Kept, block: Block, done: dict) -> None:
         if len(list(self.folder.glob("z*"))) == 2:
@@ -248,12 +238,12 @@ def test_an_interrupted_run_says_how_to_go_on(
 
     monkeypatch.setattr(Kept, "write", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        computed(*overrides)
+        programs.computed(config)
     assert "the same command goes on" in " ".join(capsys.readouterr().out.split())
     monkeypatch.undo()
-    found, folder = computed(*overrides)
-    assert "going on with 10 of 30 points" in (folder / "run.log").read_text()
-    assert found.points_per_s == pytest.approx(20 / found.wall_s)
+    found = programs.computed(config)
+    assert "going on with 10 of 30 points" in found.log
+    assert found.outcome.points_per_s == pytest.approx(20 / found.outcome.wall_s)
 
 
 KILLED = """

@@ -155,9 +155,8 @@ def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, z=Z, r=R[0] + Z, ni=square, I_d=WAVE[:, 0, 0])
     found = recognise(open_source(tmp_path / "a.npz"))
     assert "n_i" not in found.variables
-    assert any(
-        "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]" in q for q in found.questions
-    )
+    said = "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]"
+    assert any(said in question for question in found.questions)
 
 
 def test_two_names_for_one_quantity_are_asked(tmp_path: Path) -> None:
@@ -248,8 +247,6 @@ def test_temperatures_in_kelvin_become_those_in_eV() -> None:
     factor, zero, unit = conversion("T_e_eV", "K")
     assert (zero, unit) == (0.0, "eV")
     assert factor == pytest.approx(8.617333262e-5, rel=1e-9)  # k_B/e, CODATA 2018
-    with pytest.raises(ValueError, match="'K' came"):
-        conversion("n_i", "K")
 
 
 def test_whole_numbers_are_samples(tmp_path: Path) -> None:

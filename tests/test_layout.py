@@ -37,6 +37,7 @@ ROOMS = [
     "studies",
     "app",
 ]
+TABLES = ("data", "thruster", "systems", "discovery", "operating", "figures", "studies", "app")
 # What takes a second to import, and the modules that may load it, by themselves or through others.
 HEAVY = {
     # In selection the rules that refine, and what they share.
@@ -56,28 +57,8 @@ HEAVY = {
     "matplotlib": ("figures", "report", "studies", "app"),
     "h5py": (),
     "tensorboard": (),
-    "pandas": (
-        "data",
-        "thruster",
-        "systems",
-        "discovery",
-        "operating",
-        "figures",
-        "report",
-        "studies",
-        "app",
-    ),
-    "xarray": (
-        "trust.checksum",
-        "data",
-        "thruster",
-        "systems",
-        "discovery",
-        "operating",
-        "figures",
-        "studies",
-        "app",
-    ),
+    "pandas": (*TABLES, "report"),
+    "xarray": (*TABLES, "trust.checksum"),
 }
 
 # Experiments whose settings, tables and views make one file.

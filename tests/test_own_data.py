@@ -1,7 +1,7 @@
 """A file of one's own on the command line: looked into, written down, run, and said."""
 
 import json
-import sys
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +10,9 @@ import xarray as xr
 import yaml
 
 import ep2sindy as ep
-from ep2sindy.app import main as program
 from ep2sindy.app.inspection import NEEDS
 from ep2sindy.app.runner import run_config
-from tests.programs import EXPERIMENTS, composed, computed
-
-
-def ep2sindy(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["ep2sindy", *arguments])
-    program.main()
+from tests.programs import EXPERIMENTS, composed, computed, ended
 
 
 def lorenz_csv(path: Path, *, seed: int = 0, lost: int = 0) -> None:
@@ -41,18 +35,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_two_commands_lead_from_a_file_to_its_equations(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    folder: Path, capsys: pytest.CaptureFixture
 ) -> None:
     lorenz_csv(folder / "scope.csv", lost=5)
-    ep2sindy(monkeypatch, "inspect", "scope.csv", "--write")
+    assert not ended("inspect", "scope.csv", "--write")
     said = capsys.readouterr().out
     assert "between semicolons, decimal commas, rows from line 5" in said
     command = "ep2sindy +exp=discover data=scope 'trajectory.states=[x,y,z]'"
     assert command in said
-    ep2sindy(
-        monkeypatch, "+exp=discover", "data=scope", "trajectory.states=[x,y,z]",
-        "search=best_subset", "selection=ebic",
-    )  # fmt: skip
+    rest = ["trajectory.states=[x,y,z]", "search=best_subset", "selection=ebic"]
+    assert not ended("+exp=discover", "data=scope", *rest)
     (run,) = (folder / "outputs" / "discover").iterdir()
     summary = json.loads((run / "summary.json").read_text())
     terms = summary["models"]["model"]["equations"]["x"]["terms"]
@@ -64,9 +56,7 @@ def test_two_commands_lead_from_a_file_to_its_equations(
     assert "5 of 1000 samples are missing (NaN)" in summary["warnings"][0]
 
 
-def test_a_written_config_is_that_of_the_file(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_written_config_is_that_of_the_file(folder: Path, capsys: pytest.CaptureFixture) -> None:
     np.savez(
         folder / "a b.npz",
         t=np.arange(9.0) * 1e-6,
@@ -74,7 +64,7 @@ def test_a_written_config_is_that_of_the_file(
         ni=1e12 * np.ones((4, 9)) * np.linspace(1, 2, 9),
         null=np.arange(9.0),
     )
-    ep2sindy(monkeypatch, "inspect", "a b.npz", "--write", "mine")
+    assert not ended("inspect", "a b.npz", "--write", "mine")
     text = (folder / "conf" / "data" / "mine.yaml").read_text()
     config = yaml.safe_load(text)
     assert config["path"] == "a b.npz"
@@ -87,16 +77,13 @@ def test_a_written_config_is_that_of_the_file(
     np.testing.assert_allclose(field["n_i"].values[-1], 2e18)
     assert "data.channel_m=LENGTH" in capsys.readouterr().out
     for name, message in (("mine", "mine.yaml is there already"), ("file", "has data=file itself")):
-        with pytest.raises(SystemExit, match=message):
-            ep2sindy(monkeypatch, "inspect", "a b.npz", "--write", name)
+        assert message in ended("inspect", "a b.npz", "--write", name)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["none.csv"], "error: no such file: .*none.csv"),
-        (["empty.csv"], "error: empty.csv is empty"),
-        (["."], "a folder that ends in .zarr"),
         (["*.h5"], "no file fits the pattern '\\*.h5'"),
         (
             ["a.npz", "b.npz", "--write"],
@@ -105,13 +92,11 @@ def test_a_written_config_is_that_of_the_file(
     ],
 )
 def test_what_cannot_be_looked_into_ends_in_one_message(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+    folder: Path, arguments: list[str], message: str
 ) -> None:
-    (folder / "empty.csv").write_bytes(b"")
     np.savez(folder / "a.npz", t=np.arange(5.0), x=np.arange(5.0) ** 2)
     np.savez(folder / "b.npz", t=np.arange(5.0), y=np.arange(5.0) ** 2)
-    with pytest.raises(SystemExit, match=message):
-        ep2sindy(monkeypatch, "inspect", *arguments)
+    assert re.search(message, ended("inspect", *arguments))
 
 
 def test_several_files_are_several_records(folder: Path) -> None:
@@ -145,14 +130,9 @@ def test_an_experiment_of_one_record_refuses_several(folder: Path) -> None:
                             f"output={folder}"))  # fmt: skip
 
 
+WAVE = np.outer(np.arange(1.0, 6.0), np.arange(1.0, 11.0))
 GRID = xr.Dataset(
-    {
-        "n_i": (
-            ("time", "z"),
-            np.outer(np.arange(1.0, 6.0), np.arange(1.0, 11.0)),
-            {"units": "m^-3"},
-        )
-    },
+    {"n_i": (("time", "z"), WAVE, {"units": "m^-3"})},
     coords={"time": np.arange(5.0), "z": np.linspace(0.0025, 0.0475, 10)},
 )
 

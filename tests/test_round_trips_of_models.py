@@ -1,4 +1,4 @@
-"""Libraries, regressions, rules and models say the same however they are written or asked."""
+"""Libraries and models say the same however they are written, stored or asked."""
 
 import json
 import pickle
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -152,58 +151,3 @@ def test_sympy_and_torch_reckon_as_numpy_does(model: ep.SparseModel, values: np.
             for row in values[:2].tolist()
         ]
         assert (np.abs(np.array(at) - rates[:2, k]) <= 1e-12 * size[:2, k]).all()
-
-
-@FEW
-@given(st.sampled_from([0.1, 0.7, 1.3]), st.integers(5, 40))
-def test_a_model_that_was_stored_runs_to_the_same_bits(x0: float, n: int) -> None:
-    model = ep.lotka_volterra().model
-    t = np.linspace(0.0, 3.0, n)
-    one, two = (
-        m.simulate(t, [x0, 1.0]) for m in (model, ep.SparseModel.from_json(model.to_json()))
-    )
-    np.testing.assert_array_equal(one.states, two.states)
-
-
-BIC = ep.EBIC(gamma=0.0, coarsening=None)
-RULES = [ep.AICc(), BIC, ep.EBIC(), ep.Knee(), ep.Knee(scale="log")]
-RECORD = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
-
-
-def found(run: ep.Trajectory, rule: Any, search: Any) -> ep.Discovery:
-    library = ep.polynomial(list(run.state_names), degree=2)
-    smoother = ep.signals.SavitzkyGolay()
-    recipe = ep.Regression(ep.Differential(smoother=smoother), search, rule, ep.Bootstraps(n=0))
-    return ep.discover(run, library, recipe)
-
-
-@pytest.mark.parametrize(
-    "search", [ep.STLSQ(), ep.BestSubset(max_terms=4)], ids=lambda s: type(s).__name__
-)
-@settings(FEW, max_examples=6)
-@given(st.sampled_from(RULES), st.sampled_from([1e-9, 4.0, 1e18]), st.booleans())
-def test_units_and_order_of_states_leave_the_equations(
-    search: Any, rule: Any, scale: float, turned: bool
-) -> None:
-    """Data in other units, or with their columns exchanged, give the same terms and numbers."""
-    names, values = list(RECORD.state_names), RECORD.states
-    wanted = found(RECORD, rule, search).model
-    order = [1, 0] if turned else [0, 1]
-    sizes = np.array([scale, 1.0])
-    other = ep.Trajectory(
-        t=RECORD.t, states=(values * sizes)[:, order], state_names=[names[k] for k in order]
-    )
-    model = found(other, rule, search).model
-    size = dict(zip(names, sizes.tolist(), strict=True))
-    for state in names:
-        back = {
-            term: c * float(np.prod([size[v] ** p for v, p in _factors(term)])) / size[state]
-            for term, c in model.terms(state).items()
-        }
-        reordered = {wanted.library.names[wanted.library.index(t)]: c for t, c in back.items()}
-        assert reordered == pytest.approx(wanted.terms(state), rel=1e-6)
-
-
-def _factors(term: str) -> list[tuple[str, int]]:
-    parts = [] if term == "1" else [part.partition("^") for part in term.split("*")]
-    return [(name, int(power or 1)) for name, _, power in parts]

@@ -29,9 +29,22 @@ def sine(n_periods=20.0, *, per_period=60, mean=0.0):
     return recorded(1e-3 * turn, mean + np.sin(2 * np.pi * turn))
 
 
+def chosen_for(run):
+    return ep.signals.embed(ep.signals.from_one_signal(run))
+
+
+def discovered(states, *, degree, max_terms):
+    recipe = ep.Regression(
+        ep.Differential(ep.signals.KalmanSmoother()), ep.BestSubset(max_terms=max_terms)
+    )
+    library = ep.polynomial(states.run.state_names, degree=degree)
+    known = {"relations": states.relations, "terms": states.terms}
+    return ep.discover(states.run, library, recipe, **known).model
+
+
 def test_the_growth_rate_is_that_of_the_signal():
     run = toda()
-    chosen = ep.signals.embed(ep.signals.from_one_signal(recorded(run.t, run.states[:, 0])))
+    chosen = chosen_for(recorded(run.t, run.states[:, 0]))
     assert chosen.embedding == ep.signals.LogRate()
     states = chosen.embedded.run
     assert states.state_names == ("x", "g")
@@ -44,28 +57,19 @@ def test_the_growth_rate_is_that_of_the_signal():
 
 def test_the_toda_oscillator_is_found_with_its_known_equation_exact():
     run = toda()
-    found = ep.signals.embed(ep.signals.from_one_signal(recorded(run.t, run.states[:, 0]))).embedded
-    recipe = ep.Regression(ep.Differential(ep.signals.KalmanSmoother()), ep.BestSubset(max_terms=3))
-    library = ep.polynomial(["x", "g"], degree=3)
-    model = ep.discover(
-        found.run, library, recipe, relations=found.relations, terms=found.terms
-    ).model
+    found = chosen_for(recorded(run.t, run.states[:, 0])).embedded
+    model = discovered(found, degree=3, max_terms=3)
     assert model.terms("x") == {"x*g": 1.0}
     kept = {term: model.terms("g")[term] for term in ("1", "x")}
     assert kept == pytest.approx({"1": A, "x": -B}, rel=0.03)
 
 
 def test_a_sine_of_either_sign_is_a_harmonic_oscillator():
-    found = ep.signals.embed(ep.signals.from_one_signal(sine()))
+    found = chosen_for(sine())
     assert found.embedding == ep.signals.Rate()
     assert "either sign" in found.reason
-    states = found.embedded
-    assert states.run.units == {"x": "A", "v": "A s^-1"}
-    library = ep.polynomial(["x", "v"], degree=2)
-    recipe = ep.Regression(ep.Differential(ep.signals.KalmanSmoother()), ep.BestSubset(max_terms=2))
-    model = ep.discover(
-        states.run, library, recipe, relations=states.relations, terms=states.terms
-    ).model
+    assert found.embedded.run.units == {"x": "A", "v": "A s^-1"}
+    model = discovered(found.embedded, degree=2, max_terms=2)
     assert model.terms("x") == {"v": 1.0}
     assert model.terms("v")["x"] == pytest.approx(-((2e3 * np.pi) ** 2), rel=0.01)
 
@@ -83,9 +87,7 @@ def test_delays_are_the_signal_a_part_of_a_period_before():
 def test_noise_that_drowns_the_derivative_asks_for_delays():
     clean = sine(60.0)
     noise = 1.5 * DROWNED * np.random.default_rng(0).standard_normal(clean.n_samples)
-    chosen = ep.signals.embed(
-        ep.signals.from_one_signal(recorded(clean.t, clean.states[:, 0] + noise))
-    )
+    chosen = chosen_for(recorded(clean.t, clean.states[:, 0] + noise))
     assert chosen.embedding == ep.signals.Delays()
     assert "noise" in chosen.reason
 
@@ -155,11 +157,9 @@ def test_a_drift_is_offered_to_be_taken_out(mean):
 
 
 def test_a_signal_named_as_the_rate_keeps_its_name():
-    run = recorded(*(lambda s: (s.t, s.states[:, 0]))(sine(mean=3.0)), name="g")
-    assert ep.signals.embed(ep.signals.from_one_signal(run)).embedded.run.state_names == (
-        "g",
-        "g_rate",
-    )
+    run = sine(mean=3.0)
+    found = chosen_for(recorded(run.t, run.states[:, 0], name="g")).embedded
+    assert found.run.state_names == ("g", "g_rate")
 
 
 @pytest.mark.parametrize(
@@ -181,9 +181,8 @@ def test_what_does_not_oscillate_is_refused(run, message):
 @pytest.mark.parametrize("mean", [0.0, 0.9])
 def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
     signal = ep.signals.from_one_signal(sine(mean=mean))
-    with pytest.raises(
-        ValueError, match=r"needs a positive signal: x falls to .* \(embedding=rate"
-    ):
+    message = r"needs a positive signal: x falls to .* \(embedding=rate"
+    with pytest.raises(ValueError, match=message):
         ep.signals.LogRate().embed(signal)
     assert ep.signals.embed(signal).embedding == ep.signals.Rate()
 

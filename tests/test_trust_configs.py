@@ -10,7 +10,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.types import RunMode
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from test_face import targets
 
@@ -21,10 +21,10 @@ from ep2sindy.app.safety import CheckedLoader, check_places, check_references, r
 from ep2sindy.app.schema import as_node, bind, defaults_of
 from ep2sindy.app.targets import FOR_CONFIGS, check_targets
 from ep2sindy.studies.libraries import register_named
+from tests.attack.payloads import BOMB, RUNS
 from tests.programs import ended
 
 ROOT = Path(__file__).resolve().parents[1]
-RUNS = "__import__('pathlib').Path('ran').touch()"
 # What Hydra would call, what writes or runs what it is given, and what is not for configs.
 REFUSED = [
     "sympy.sympify", "joblib.load", "pandas.read_pickle", "numpy.load", "pathlib.Path.write_text",
@@ -111,17 +111,6 @@ def test_studies_and_functions_are_the_packages_or_lie_in_the_folder(name: str, 
     assert not {"idlelib", "this"} & (set(sys.modules) - before)
 
 
-def program(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "ep2sindy.app.main", *arguments],
-        cwd=cwd,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 CALLBACK = {"_target_": "sympy.sympify", "_args_": [RUNS]}
 ELSEWHERE = [
     ({"hydra": {"callbacks": {"x": CALLBACK}}}, "hydra.callbacks must stay as it is"),
@@ -152,28 +141,25 @@ def test_a_file_cannot_say_what_must_be_typed(
     said: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through Hydra's own door, in this process: what it would do with the config comes later."""
-    (tmp_path / "exp").mkdir()
     text = "# @package _global_\ndefaults: [_self_]\n" + OmegaConf.to_yaml(said)
-    (tmp_path / "exp" / "theirs.yaml").write_text(text)
     monkeypatch.chdir(tmp_path)
     modes = (RunMode.RUN, RunMode.MULTIRUN) if "hydra" in said else (RunMode.RUN,)
     for mode in modes:
         with pytest.raises(ValueError, match=message):
-            looked_at(tmp_path, ["+exp=theirs"], mode)
+            # As Hydra's loader does, and then a job before all else.
+            check_places(resolved(loaded(tmp_path, text, mode)), ["+exp=theirs"])
 
 
 def test_a_file_may_say_what_need_not_be_typed(tmp_path: Path) -> None:
-    (tmp_path / "exp").mkdir()
     text = "# @package _global_\ndefaults: [discover, _self_]\nseed: 3\n"
-    (tmp_path / "exp" / "theirs.yaml").write_text(text)
-    found = loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
-    assert found.seed == 3
+    assert loaded(tmp_path, text).seed == 3
 
 
-def looked_at(folder: Path, overrides: list[str], mode: RunMode) -> None:
-    """As Hydra's loader does, and then a job before all else."""
-    found = loader_of(folder).load_configuration("config", overrides, mode)
-    check_places(resolved(found), overrides)
+def loaded(folder: Path, text: str, mode: RunMode = RunMode.RUN) -> DictConfig:
+    """The config of an experiment that somebody wrote into a folder."""
+    (folder / "exp").mkdir(exist_ok=True)
+    (folder / "exp" / "theirs.yaml").write_text(text)
+    return loader_of(folder).load_configuration("config", ["+exp=theirs"], mode)
 
 
 def test_what_is_typed_is_composed_once_for_all_jobs(
@@ -215,7 +201,6 @@ def test_a_folder_cannot_hide_what_hydra_itself_says(tmp_path: Path) -> None:
             loader_of(tmp_path).load_configuration("config", ["+exp=discover"], mode)
 
 
-BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
 TOO_MUCH = [
     (BOMB, r"may hold up to 100000 values: with its anchors written out it has"),
     ("a: &a {b: *a}", "may hold up to 100000 values"),
@@ -229,10 +214,8 @@ TOO_MUCH = [
 def test_a_file_that_asks_for_too_much_is_refused_by_name(
     text: str, message: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "exp").mkdir()
-    (tmp_path / "exp" / "theirs.yaml").write_text(text)
     with pytest.raises(ValueError, match=rf"theirs\.yaml.* {message}"):
-        loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
+        loaded(tmp_path, text)
 
 
 DOUBLED = {
@@ -250,10 +233,8 @@ DOUBLED = {
 def test_references_that_double_are_refused_before_they_are_written_out(
     text: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "exp").mkdir()
-    (tmp_path / "exp" / "theirs.yaml").write_text(f"# @package _global_\n{text}")
     with pytest.raises(ValueError, match="may stand for up to"):
-        loader_of(tmp_path).load_configuration("config", ["+exp=theirs"], RunMode.RUN)
+        loaded(tmp_path, f"# @package _global_\n{text}")
 
 
 def test_a_long_list_is_no_reference(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +284,10 @@ def test_the_program_looks_before_hydra_does(
         {"hydra": {"callbacks": {"x": CALLBACK}}}
     )
     (tmp_path / "conf" / "exp" / "theirs.yaml").write_text(text)
-    result = program("+exp=theirs", cwd=tmp_path)
+    result = subprocess.run(
+        [sys.executable, "-m", "ep2sindy.app.main", "+exp=theirs"], cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}, capture_output=True, text=True,
+    )  # fmt: skip
     assert result.returncode == 1
     assert "error: hydra.callbacks must stay as it is" in result.stderr
     assert "Traceback" not in result.stderr

@@ -53,13 +53,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / package / "mine.py").write_text(spy)
     (folder / "matplotlibrc").write_text("savefig.dpi: 7\nfont.size: 99\n")
     (folder / ".numba_config.yaml").write_text("disable_jit: 1\n")
-    t = np.arange(400) * 0.05
-    x, y = np.sin(t) + 2.0, np.cos(t)
-    rows = np.column_stack([t, x, y])
-    np.savetxt(folder / "run.csv", rows, delimiter=",", header="time,x,y", comments="")
+    t, x, _ = write_csv(folder / "run.csv").T
     with h5py.File(folder / "run.h5", "w") as file:
         file["time"], file["x"] = t, x
     return folder
+
+
+def write_csv(path: Path) -> np.ndarray:
+    t = 0.05 * np.arange(400)
+    rows = np.column_stack([t, np.sin(t) + 2.0, np.cos(t)])
+    np.savetxt(path, rows, delimiter=",", header="time,x,y", comments="")
+    return rows
 
 
 CASES = [

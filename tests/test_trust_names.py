@@ -17,15 +17,20 @@ from programs import composed
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import value_of
+from ep2sindy.figures.style import hover
 from ep2sindy.report.about import About
-from ep2sindy.report.document import Equation, Link, Section, Table, Text
+from ep2sindy.report.document import Equation, Link, Picture, Section, Table, Text
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import draw
 from ep2sindy.report.screen import Screen
 
 PATHS = ["../../x", "/tmp/x", "a/b", "a\\b", "..", ".", "", "~x", "a\nb", "a\0b", "x" * 300]
-MARKUP = ["<script>alert(1)</script>", "[/red]", "$x_{$", "a&b", '"onload="alert(1)', "'", "{{x}}"]
+MARKUP = [
+    "<script>alert(1)</script>", "<img src=x onerror=alert(1)>", '"onload="alert(1)', "'", "a&b",
+    "[/red]", "$x_{$", "{{x}}",
+]  # fmt: skip
+MATH = {"mi", "mn", "mo", "mrow", "mspace", "msub", "msup"}  # as many as a name has signs
 
 
 @dataclass(frozen=True)
@@ -81,36 +86,45 @@ def test_an_experiment_refuses_such_names_before_it_makes_a_folder(
     assert not list(tmp_path.iterdir())
 
 
-class Tags(HTMLParser):
-    """All elements of a page, with their attributes."""
+class Parsed(HTMLParser):
+    """All elements of a page but the signs of formulas, with their attributes; and its text."""
 
-    def __init__(self) -> None:
+    def __init__(self, page: str) -> None:
         super().__init__()
-        self.found: list[str] = []
+        self.tags: list[str] = []
+        self.said = ""
+        self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found += [tag, *(name for name, _ in attrs)]
+        if tag not in MATH:
+            self.tags += [tag, *(name for name, _ in attrs)]
+
+    def handle_data(self, data: str) -> None:
+        self.said += data
 
 
 @pytest.mark.parametrize("text", MARKUP)
 def test_page_and_screen_show_markup_as_it_is(text: str, tmp_path: Path) -> None:
     def page(text: str) -> str:
-        table = pd.DataFrame({text: [text, Link(text, text), Equation("x", {"x": 1.0}, lead=text)]})
+        equation = Equation(text, {text: 1.0, f"{text}*y": 2.0}, lead=text, mark=text, unit=text)
+        table = pd.DataFrame({text: [text, Link(text, text), equation]})
         blocks = [
-            Text(text), Text(text, warning=True), Table(table, title=text, note=text),
-            Equation("x", {"x": 1.0}, lead=text, mark=text, unit=text),
+            Text(text), Text(text, warning=True), Table(table, title=text, note=text), equation,
+            Picture("a"),
         ]  # fmt: skip
         provenance = {"commit": text, "seed": text, "command": [text], "versions": {text: text}}
         about = About(text, {text: text}, [text], [text], provenance, text)
-        figures = {"a": draw(Figure(), b"", text)}
+        figure = Figure()
+        hover(figure.subplots().plot([0.0, 1.0], "o")[0], f"{text} | second line")
+        figures = {"a": draw(figure, b"", text)}
         sections = [Section(text, blocks)]
         screen = Screen(tmp_path / "run.log")
         screen.show(sections)
         screen.close()
         return page_html(text, sections, figures, about)
 
-    tags, harmless = Tags(), Tags()
-    tags.feed(page(text))
+    found = Parsed(page(text))
     assert text in (tmp_path / "run.log").read_text()
-    harmless.feed(page("word"))
-    assert tags.found == harmless.found
+    assert found.said.count(text) >= 20
+    assert found.tags == Parsed(page("word")).tags
+    assert found.tags.count("svg") == 1

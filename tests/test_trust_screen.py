@@ -25,7 +25,7 @@ from ep2sindy.runtime.files import write_json
 from ep2sindy.runtime.screen import in_line, one_screen, plain, say
 from ep2sindy.studies.source import say_data
 from ep2sindy.thruster import cache
-from tests.test_trust_folder import CSV
+from tests.test_trust_folder import CSV, write_csv
 
 ODD = (
     "\x1b[31mred\x1b[0m",
@@ -106,7 +106,6 @@ def test_markup_and_names_of_emoji_are_text_on_every_screen(
     screen.close()
     assert (tmp_path / "run.log").read_text().count(text) == 8
     capsys.readouterr()
-    (tmp_path / RECORDS).mkdir()
     record = {"job": 0, "overrides": [], "status": "ok", "headline": {text: 1}, "folder": text}
     write_json(tmp_path / RECORDS / "0.json", record)
     shown = index_text(tmp_path)
@@ -173,9 +172,7 @@ def test_a_screen_that_has_gone_away_ends_nothing(
 @pytest.mark.slow
 @pytest.mark.parametrize("screen", ["head", "full"])
 def test_a_run_whose_screen_is_lost_leaves_all_its_files(screen: str, tmp_path: Path) -> None:
-    t = 0.05 * np.arange(400)
-    rows = np.column_stack([t, np.sin(t) + 2.0, np.cos(t)])
-    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="time,x,y", comments="")
+    write_csv(tmp_path / "run.csv")
     command = [sys.executable, "-m", "ep2sindy.app.main", *CSV]
     if screen == "head":
         run = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE)

@@ -1,8 +1,7 @@
 """A simulation that diverges or does not oscillate says so, whatever is done to it."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,21 +20,9 @@ def simulation(status: str, n_samples: int = 2000) -> xr.Dataset:
     return xr.Dataset(data, coords={"time": time_s, "z": z}, attrs=said)
 
 
-@dataclass
-class Data:
-    """What a config names: built when it is asked for."""
-
-    made: xr.Dataset
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {}
-
-    def build(self) -> xr.Dataset:
-        return self.made
-
-    def changed(self, places: Any, more: Any = None) -> "Data":
-        return self
+def prepared(field: xr.Dataset, *steps: Step) -> xr.Dataset:
+    """As a study has it of what its config names."""
+    return open_prepared(SimpleNamespace(settings={}, build=lambda: field), steps)
 
 
 STEPS: list[Step] = [
@@ -53,14 +40,14 @@ STEPS: list[Step] = [
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying", "transit"])
 @pytest.mark.parametrize("k", range(len(STEPS)))
 def test_no_step_makes_a_simulation_silent(status: str, k: int) -> None:
-    field = open_prepared(Data(simulation(status)), [STEPS[k]])
+    field = prepared(simulation(status), STEPS[k])
     assert is_simulation(field.attrs)
     assert amiss(field.attrs)
 
 
 def test_a_run_that_broke_at_once_is_no_data() -> None:
     with pytest.raises(DivergedError, match="it diverged after 3; try shorter steps"):
-        open_prepared(Data(simulation("diverged", 3)), ())
+        prepared(simulation("diverged", 3))
 
 
 @pytest.mark.parametrize("status", ["diverged", "steady", "decaying"])

@@ -9,13 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.test_trust_folder import CSV
+
 ROOT = Path(__file__).resolve().parents[1]
-CSV = [
-    "+exp=discover", "data=file", "data.path=run.csv", "data.z.name=null",
-    "data.variables.n_i.name=null", "data.variables.n_n.name=null",
-    "+data.variables.x.name=x", "+data.variables.x.unit=1",
-    "+data.variables.y.name=y", "+data.variables.y.unit=1", "trajectory.states=[x,y]",
-]  # fmt: skip
 
 pytestmark = pytest.mark.slow
 

@@ -26,7 +26,7 @@ LIMIT_S, MEMORY = 600.0, 3 * 2**30  # of seconds on a machine that does other th
 CASES: Mapping[str, Case] = {**crafted_configs.cases(), **crafted_files.cases()}
 
 # Processes that the package and its libraries start themselves, whatever they are given.
-OURS = ("rev-parse", "status", "ep2sindy.trust.probe", "uname", "fc-list")
+OURS = ("rev-parse", "status", "ep2sindy.trust.probe", "ep2sindy.app.warm", "uname", "fc-list")
 RUNS = {"os.system", "os.exec", "os.posix_spawn", "os.startfile", "pty.spawn"}
 TALKS = {"socket.connect", "socket.bind", "socket.getaddrinfo", "socket.sendto"}
 CHANGES = {
@@ -76,9 +76,10 @@ def judged(case: Case, folder: Path) -> Outcome:
         return "hang", f"over {LIMIT_S:g} s"
     if noted := notes.read_text("utf-8").splitlines():
         return "ran or wrote", noted[0]
-    if changed := [path for path, what in before.items() if _contents(folder).get(path) != what]:
+    after = _contents(folder)
+    if changed := [path for path, what in before.items() if after.get(path) != what]:
         return "ran or wrote", f"{changed[0]} is not what it was"
-    if found := [path for path in _contents(folder) if _is_foul(path) and path not in before]:
+    if found := [path for path in after if _is_foul(path) and path not in before]:
         return "ran or wrote", found[0]
     return _spoken(case, run.returncode, said)
 
@@ -99,11 +100,8 @@ def _spoken(case: Case, status: int, said: str) -> Outcome:
 
 def _contents(folder: Path) -> dict[str, bytes]:
     """Paths of files below a folder, but those that the run may write, with what is in them."""
-    found = {}
-    for path in folder.rglob("*"):
-        if path.is_file() and not path.is_symlink():
-            found[str(path.relative_to(folder))] = path.read_bytes()
-    return found
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def _is_foul(path: str) -> bool:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tests.attack.payloads import CANARY, RUNS, Case
+from tests.attack.payloads import BOMB, CANARY, RUNS, Case
 
 EVIL = f'{{_target_: sympy.sympify, a: "{RUNS}"}}'
 HEAD = "# @package _global_\n"
+JUNK = b"\x89HDF\r\n\x1a\n" + bytes(range(256)) * 20
 # A run that would take a second, of the table a.csv.
 TOY = f"""{HEAD}defaults:
   - override /data: recognised
@@ -33,13 +34,11 @@ thesis: {{}}
 """
 
 
-def config(text: str, names: str, *typed: str, **rest: Any) -> Case:
+def config(text: str, names: str, *, base: str = "toy", **rest: Any) -> Case:
     """A file that changes the toy run; a refusal must name what is wrong."""
-    files = {
-        "conf/exp/toy.yaml": TOY,
-        "conf/exp/theirs.yaml": f"{HEAD}defaults: [toy, _self_]\n{text}",
-    }
-    return Case(["+exp=theirs", *typed], files, names, **rest)
+    theirs = f"{HEAD}defaults: [{base}, _self_]\n{text}"
+    files = {"conf/exp/toy.yaml": TOY, "conf/exp/theirs.yaml": theirs}
+    return Case(["+exp=theirs"], files, names, **rest)
 
 
 def cases() -> dict[str, Case]:
@@ -70,29 +69,19 @@ def _called() -> dict[str, Case]:
         "of NUL": 'prepare: [{_target_: "os\\0.abort"}]',
     }
     found = {f"target {how}": config(text, "") for how, text in steps.items()}
-    studies = (
-        "this",
-        "idlelib.idle",
-        "os.path",
-        "../x",
-        "a\\0b",
-        "ep2sindy.app.main",
-        "front_view",
-    )
-    found |= {f"study {s}": config(f'study: "{s}"', "study must name") for s in studies}
+    outside = (
+        "this", "idlelib.idle", "os.path", "../x", "a\\0b", "ep2sindy.app.main", "front_view",
+    )  # fmt: skip
+    found |= {f"study {s}": config(f'study: "{s}"', "study must name") for s in outside}
     for function in ("idlelib.idle.main", "this.s(x)", "os.abort", "__import__('os')", "eval(x)"):
         text = f'libraries: {{model: {{functions: ["{function}"]}}}}'
         found[f"function {function}"] = config(text, function.split(".")[0].split("(")[0])
-    for what, text in {
-        "a call": RUNS,
-        "an attribute": "x.values",
-        "a lambda": "(lambda: 1)()",
-    }.items():
+    expressions = {"a call": RUNS, "an attribute": "x.values", "a lambda": "(lambda: 1)()"}
+    for what, text in expressions.items():
         step = f'{{_target_: ep2sindy.prepare.derive, name: n, units: m, expression: "{text}"}}'
         found[f"expression with {what}"] = config(f"prepare: [{step}]", "")
-    found["term with a call"] = config(
-        f'libraries: {{model: {{products: ["{RUNS}"]}}}}', "a term is"
-    )
+    term = f'libraries: {{model: {{products: ["{RUNS}"]}}}}'
+    found["term with a call"] = config(term, "a term is")
     found["unit with a call"] = config(f'data: {{time: {{name: t, unit: "{RUNS}"}}}}', "unit")
     found["relation with a call"] = Case(
         ["+exp=constrained", f'+models.velocity.relations=["{RUNS}"]'], {}, ""
@@ -182,17 +171,10 @@ def _written() -> dict[str, Case]:
         ),
     }  # fmt: skip
     found = {f"writes: {name}": config(*said) for name, said in places.items()}
-    found["writes: a scan over caches"] = Case(
-        ["+exp=theirs"],
-        {"conf/exp/theirs.yaml": f"{HEAD}defaults: [simulate, _self_]\nscan: {{cache: [{away}]}}\n"
-         "data: {duration_s: 1.0e-5, warm_up_s: 0.0}\n"}, "cache",
-    )  # fmt: skip
-    point = f"{{V_D_V: 300, mdot_mg_s: 5, data: {{cache: {away}}}}}"
-    found["writes: a point with a cache"] = Case(
-        ["+exp=theirs"],
-        {"conf/exp/theirs.yaml": f"{HEAD}defaults: [predict, _self_]\npoints: [{point}]\n"},
-        "cache",
-    )  # fmt: skip
+    scan = f"scan: {{cache: [{away}]}}\ndata: {{duration_s: 1.0e-5, warm_up_s: 0.0}}\n"
+    found["writes: a scan over caches"] = config(scan, "cache", base="simulate")
+    points = f"points: [{{V_D_V: 300, mdot_mg_s: 5, data: {{cache: {away}}}}}]\n"
+    found["writes: a point with a cache"] = config(points, "cache", base="predict")
     sweeper = (
         "_target_: hydra._internal.core_plugins.basic_sweeper.BasicSweeper\nmax_batch_size: null\n"
     )
@@ -218,31 +200,21 @@ def _written() -> dict[str, Case]:
 
 def _read() -> dict[str, Case]:
     """Paths that are no files, or others' files."""
-
-    def piped(here: Path) -> None:
-        os.mkfifo(here / "pipe.csv")
-
-    def looped(here: Path) -> None:
-        (here / "loop.csv").symlink_to("loop.csv")
-
-    def as_folder(here: Path) -> None:
-        (here / "f.csv").mkdir()
-
-    paths: Mapping[str, Any] = {
-        "pipe.csv": piped, "loop.csv": looped, "f.csv": as_folder, "/dev/zero": None,
-        "/dev/stdin": None, "/proc/self/mem": None, "/proc/self/environ": None, "/": None,
-        "/dev/tty": None, "*.nothing": None, "": None, "${oc.env:NOT_THERE}": None,
-        "http://h.invalid/a.nc": None, "file:///etc/passwd": None, "a.csv::x": None,
-    }  # fmt: skip
-    nothing = lambda here: None  # noqa: E731
-    found = {
-        f"reads: {path or 'nothing'}": config(
-            f"data: {{path: '{path}'}}",
-            "NOT_THERE" if "$" in path else path.rpartition("//")[2],
-            make=make or nothing,
-        )
-        for path, make in paths.items()
+    make: Mapping[str, Callable[[Path], object]] = {
+        "pipe.csv": lambda here: os.mkfifo(here / "pipe.csv"),
+        "loop.csv": lambda here: (here / "loop.csv").symlink_to("loop.csv"),
+        "f.csv": lambda here: (here / "f.csv").mkdir(),
+        "junk": lambda here: (here / "junk").write_bytes(JUNK),
     }
+    found = {}
+    for path in (
+        "pipe.csv", "loop.csv", "f.csv", "/dev/zero", "/dev/stdin", "/proc/self/mem",
+        "/proc/self/environ", "/", "/dev/tty", "*.nothing", "", "${oc.env:NOT_THERE}",
+        "http://h.invalid/a.nc", "file:///etc/passwd", "a.csv::x",
+    ):  # fmt: skip
+        names = "NOT_THERE" if "$" in path else path.rpartition("//")[2]
+        text = f"data: {{path: '{path}'}}"
+        found[f"reads: {path or 'nothing'}"] = config(text, names, make=make.get(path))
     found["reads: NUL"] = config('data: {path: "a\\0.csv"}', "csv")
     found["reads: a number"] = config("data: {path: 5}", "path")
     gas = "mass_u: 131, ionization_eV: 12, excitation_eV: 8, double_ionization_eV: 33"
@@ -258,29 +230,21 @@ def _read() -> dict[str, Case]:
             f"{gas}, second_ionization_eV: 21}}",
         ),
     }
-    kinds = (("pipe.csv", piped), ("/dev/zero", None), ("a.csv", None), ("junk", _junk))
-    for path, make in kinds:
-        rest: Any = {"names": path, "make": make or nothing}
+    for path in ("pipe.csv", "/dev/zero", "a.csv", "junk"):
+        rest: Any = {"names": path, "make": make.get(path)}
         for what, (key, text) in targets.items():
-            typed = ["+exp=simulate", "data.duration_s=1e-5", f"++data.{key}={text % path}"]
+            typed = ["+exp=simulate", "data.duration_s=3e-5", f"++data.{key}={text % path}"]
             found[f"reads: {path} as {what}"] = Case(typed, **rest)
         typed = ["+exp=simulate", "data=hallthruster_input", f"data.path={path}"]
         found[f"reads: {path} as an input of HallThruster.jl"] = Case(typed, **rest)
     return found
 
 
-def _junk(here: Path) -> None:
-    (here / "junk").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(range(256)) * 20)
-
-
 def _large() -> dict[str, Case]:
     """What would take all memory, or for ever."""
-    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
-    bomb += "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12))
-    deep = "-" * 3000
     expressions = {
         "deep brackets": "(" * 5000 + "x" + ")" * 5000,
-        "many signs": f"{deep}x",
+        "many signs": "-" * 3000 + "x",
         "a long sum": "x" + "+x" * 5000,
         "a tower": "x^9^9^9^9^9",
         "a long number": "x*1" + "0" * 400,
@@ -290,17 +254,12 @@ def _large() -> dict[str, Case]:
         "no text": "",
         "surrogates": "x*\\ud800",
     }
-    found = {
-        f"large: {name}": config(
-            'prepare: [{_target_: ep2sindy.prepare.derive, name: n, units: "1", '
-            f'expression: "{text}"}}]',
-            "expression", may_pass=name in ("a tower", "a long sum", "a power of powers"),
-        )
-        for name, text in expressions.items()
-    }  # fmt: skip
+    step = '{_target_: ep2sindy.prepare.derive, name: n, units: "1", expression: "%s"}'
+    steps = {name: f"prepare: [{step % text}]" for name, text in expressions.items()}
     model = "libraries: {model: {variables: [x, y], %s}}"
     texts = {
-        "anchors": (bomb, "theirs.yaml"),
+        **{name: (text, "expression") for name, text in steps.items()},
+        "anchors": (BOMB, "theirs.yaml"),
         "doubling interpolations": (
             "x0: 0123456789\n"
             + "".join(f"x{k}: ${{x{k - 1}}}${{x{k - 1}}}\n" for k in range(1, 40)),
@@ -327,8 +286,8 @@ def _large() -> dict[str, Case]:
         "a key that is a number": ("1: 2", "unknown keys"),
         "a key that is nothing": ("null: 2", "theirs.yaml"),
     }
-    passing = ("a depth", "a rollout without end")
-    found |= {
+    passing = ("a tower", "a long sum", "a power of powers", "a depth", "a rollout without end")
+    found = {
         f"large: {name}": config(text, word, may_pass=name in passing)
         for name, (text, word) in texts.items()
     }

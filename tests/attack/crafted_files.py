@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import pickle
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 
-from tests.attack.payloads import CANARY, RUNS, Case, Sings
+from tests.attack.payloads import BOMB, CANARY, RUNS, Case, Sings
 
 MARKUP = "<img src=x onerror=alert(1)>"
 
@@ -132,8 +135,6 @@ def _renamed(old: str, new: str, *, keep_state: bool = False) -> dict[str, Any]:
 def _runs() -> dict[str, Case]:
     """Folders of runs that are no such."""
     summary = {"experiment": "toy", "seed": 0, "headline": {"r2": 0.5}}
-    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
-    bomb += "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12))
     wrong = {
         "a summary of keys that come twice": {"summary.json": '{"seed": 0, "seed": 1}'},
         "a summary that is a list": {"summary.json": []},
@@ -148,7 +149,7 @@ def _runs() -> dict[str, Case]:
         "versions that are text": {"provenance.json": {"versions": "x"}},
         "a config that is a list": {"config.yaml": "[1, 2]"},
         "a config of tags": {"config.yaml": "a: !!python/object/apply:os.abort []"},
-        "a config that is a bomb": {"config.yaml": bomb},
+        "a config that is a bomb": {"config.yaml": BOMB},
         "a deep config": {"config.yaml": "a: " + "[" * 3000 + "]" * 3000},
         "a config that is broken": {"config.yaml": "a: [1"},
     }
@@ -156,51 +157,38 @@ def _runs() -> dict[str, Case]:
         f"run: {name}": compared(next(iter(c)).split("/")[-1], **c) for name, c in wrong.items()
     }
     marked = {"experiment": MARKUP, "seed": 0, "headline": {MARKUP: 1.0}, "warnings": [MARKUP]}
+    resolvers = "a: ${oc.env:HOME}\nb: ${hydra:runtime.cwd}\n"
     cases["run: a summary of markup"] = compared("", may_pass=True, **{"summary.json": marked})
-    cases["run: resolvers in a config"] = compared(
-        "", may_pass=True, **{"config.yaml": "a: ${oc.env:HOME}\nb: ${hydra:runtime.cwd}\n"}
-    )
+    cases["run: resolvers in a config"] = compared("", may_pass=True, **{"config.yaml": resolvers})
     return cases
 
 
 def _stores() -> dict[str, Case]:
     """Zarr stores."""
 
-    def written(here: Path, version: int = 2) -> Path:
+    def written(here: Path) -> Path:
         import xarray as xr
 
         data = {"I_d": ("time", np.arange(5.0), {"units": "A"})}
         field = xr.Dataset(data, coords={"time": ("time", 1e-6 * np.arange(5), {"units": "s"})})
-        field.to_zarr(here / "a.zarr", consolidated=False, zarr_format=version)
+        field.to_zarr(here / "a.zarr", consolidated=False, zarr_format=2)
         return here / "a.zarr"
 
     def changing(array: str, **changes: Any) -> Callable[[Path], object]:
         def make(here: Path) -> None:
-            import pickle
-
             place = written(here) / array / ".zarray"
             place.write_text(json.dumps(json.loads(place.read_text()) | changes))
             (place.parent / "0").write_bytes(pickle.dumps(Sings()))
 
         return make
 
-    def linked(here: Path) -> None:
-        store = written(here)
-        (store / "I_d" / "0").unlink()
-        (store / "I_d" / "0").symlink_to("/dev/zero")
-
-    def piped(name: str) -> Callable[[Path], object]:
+    def replacing(name: str, lay: Callable[[Path], object]) -> Callable[[Path], object]:
         def make(here: Path) -> None:
-            import os
-
             place = written(here) / "I_d" / name
             place.unlink()
-            os.mkfifo(place)
+            lay(place)
 
         return make
-
-    def deep(here: Path) -> None:
-        (written(here) / "I_d" / ".zattrs").write_text("[" * 100_000)
 
     made: Mapping[str, Callable[[Path], object]] = {
         "a pickle codec": changing("I_d", filters=[{"id": "pickle"}], compressor=None),
@@ -213,11 +201,11 @@ def _stores() -> dict[str, Case]:
         "a shape below zero": changing("I_d", shape=[-5]),
         "chunks without end": changing("I_d", shape=[30_000_000], chunks=[1]),
         "chunks of nothing": changing("I_d", chunks=[0]),
-        "a link to a device": linked,
-        "a pipe of samples": piped("0"),
-        "a pipe of metadata": piped(".zarray"),
-        "a pipe of attributes": piped(".zattrs"),
-        "deep attributes": deep,
+        "a link to a device": replacing("0", lambda place: place.symlink_to("/dev/zero")),
+        "a pipe of samples": replacing("0", os.mkfifo),
+        "a pipe of metadata": replacing(".zarray", os.mkfifo),
+        "a pipe of attributes": replacing(".zattrs", os.mkfifo),
+        "deep attributes": replacing(".zattrs", lambda place: place.write_text("[" * 100_000)),
     }
     return {
         f"store: {name}": Case(["inspect", "a.zarr"], {}, "a.zarr", make=make)
@@ -228,48 +216,38 @@ def _stores() -> dict[str, Case]:
 def _archives() -> dict[str, Case]:
     """Archives and caches that hold pickles."""
 
-    def npz(here: Path) -> None:
+    def pickles(here: Path) -> None:
         np.savez(here / "a.npz", t=np.arange(5.0), x=np.array([Sings()] * 5, dtype=object))
 
-    def named(here: Path) -> None:
-        from zipfile import ZipFile
+    def packed(name: str, content: bytes, n_zeros: int = 0) -> Callable[[Path], object]:
+        def make(here: Path) -> None:
+            with ZipFile(here / "a.npz", "w", ZIP_DEFLATED) as archive:
+                archive.writestr(name, content + bytes(n_zeros))
 
-        with ZipFile(here / "a.npz", "w") as archive:
-            archive.writestr("../../elsewhere/x.npy", b"\x93NUMPY")
+        return make
 
-    def bomb(here: Path) -> None:
-        from zipfile import ZIP_DEFLATED, ZipFile
+    def header(kind: str) -> bytes:
+        text = f"{{'descr': {kind}}}".encode().ljust(117) + b"\n"
+        return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
 
-        kind = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000,), }"
-        head = b"\x93NUMPY\x01\x00v\x00" + kind
-        with ZipFile(here / "a.npz", "w", ZIP_DEFLATED) as archive:
-            archive.writestr("x.npy", head.ljust(127) + b"\n" + bytes(2**28))
-
-    def header(here: Path) -> None:
-        from zipfile import ZipFile
-
-        text = (
-            f"{{'descr': {RUNS}, 'fortran_order': False, 'shape': (1,)}}".encode().ljust(117)
-            + b"\n"
-        )
-        with ZipFile(here / "a.npz", "w") as archive:
-            archive.writestr("x.npy", b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
-
+    huge = header("'<f8', 'fortran_order': False, 'shape': (10000000000,)")
+    code = header(f"{RUNS}, 'fortran_order': False, 'shape': (1,)")
     made = {
-        "pickles": npz, "a name that is a path": named, "a bomb": bomb, "code in a header": header,
-    }  # fmt: skip
+        "pickles": pickles,
+        "a name that is a path": packed("../../elsewhere/x.npy", b"\x93NUMPY"),
+        "a bomb": packed("x.npy", huge, n_zeros=2**28),
+        "code in a header": packed("x.npy", code),
+    }
     return {
         f"archive: {name}": Case(
             ["inspect", "a.npz"], {}, "a.npz", may_pass=name != "a bomb", make=make
         )
         for name, make in made.items()
     }
-    return found
 
 
 def _texts() -> dict[str, Case]:
     """Tables and JSON."""
-    deep = "[" * 100_000
     rows = "".join(f"{k},{k}\n" for k in range(1, 9))
     refused = {
         "twice.json": '{"t": [0, 1], "t": [0, 1, 2], "x": [1, 2, 3]}',
@@ -281,7 +259,7 @@ def _texts() -> dict[str, Case]:
     }
     wide = "t," + ",".join(map(str, range(20_000))) + "\n" + "1," * 20_000 + "1\n"
     files = {
-        "deep.json": deep,
+        "deep.json": "[" * 100_000,
         "names.json": json.dumps({MARKUP: [1.0, 2.0], "t": [0.0, 1.0]}),
         "long.json": '{"x": [1' + "0" * 5000 + ", 2]}",
         "wide.csv": wide,

@@ -26,7 +26,7 @@ def killed(folder: Path, seed: int) -> Callable[[str], Outcome]:
         chance = random.Random(f"{seed} {case}")
         moment_s, sign = chance.uniform(0.0, whole.duration_s), chance.choice(SIGNALS)
         wrong = _ended(name, place, whole, moment_s=moment_s, sign=sign)
-        wrong = wrong or again(name, place, whole)
+        wrong = wrong or ended_well(start(name, place, said=subprocess.PIPE), place, whole)
         words = f"{sign} after {moment_s:.1f} of {whole.duration_s:.1f} s"
         return (wrong[0].partition(":")[0] if wrong else "same bytes"), f"{words} {wrong or ''}"
 
@@ -49,12 +49,8 @@ def _ended(name: str, place: Path, whole: Reference, *, moment_s: float, sign: s
     return alive + lost(after, before) + half_written(place, after, before, whole.files)
 
 
-def again(name: str, place: Path, whole: Reference) -> list[str]:
-    """What is wrong with a run that is to come to its end as the reference did."""
-    return ended_well(start(name, place, said=subprocess.PIPE), place, whole)
-
-
 def ended_well(run: subprocess.Popen[str], place: Path, whole: Reference) -> list[str]:
+    """What is wrong with a run that is to come to its end as the reference did."""
     try:
         printed, errors = run.communicate(timeout=LIMIT_S)
     except subprocess.TimeoutExpired:

@@ -8,6 +8,9 @@ from pathlib import Path
 
 CANARY = "canary_that_sang"
 RUNS = f"__import__('pathlib').Path('{CANARY}').touch()"
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)
+)
 TABLE = "t,x,y\n" + "".join(f"{k},{k % 7 + 1},{k % 5 + 2}\n" for k in range(60))
 
 
@@ -23,14 +26,15 @@ class Case:
     files: Mapping[str, str] = field(default_factory=dict)
     names: str = ""
     may_pass: bool = False
-    make: Callable[[Path], object] = lambda folder: None
+    make: Callable[[Path], object] | None = None
 
     def lay_down(self, here: Path) -> None:
         for name, text in {"a.csv": TABLE, **self.files}.items():
             path = here / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, "utf-8")
-        self.make(here)
+        if self.make:
+            self.make(here)
 
 
 class Sings:
