@@ -42,7 +42,7 @@ def advected_error(n_cells, stretch=1.0):
     thruster, speed = Thruster(ion_temperature=0.0), 1000.0
     point = OperatingPoint(300.0, 5.0, neutral_speed=speed)
     faces = cell_faces(thruster, n_cells, stretch)
-    model = build_model(thruster, point, faces)
+    model = build_model(thruster, point, faces, end_s=1.0)
     dz, z = lengths_and_centres(faces)
     parameters = to_json({"thruster": thruster})
     state = GuessedStart().begin(model, z, parameters).state
@@ -95,7 +95,7 @@ def test_nominal_point_oscillates(short_run):
 
 def test_discharge_voltage_follows_the_series_resistance(short_run):
     drop = 300.0 - short_run["V_d"].values
-    np.testing.assert_allclose(drop, 1.0 * short_run["I_d"].values, rtol=1e-12)
+    np.testing.assert_allclose(drop, 1.0 * short_run["I_d"].values, atol=1e-11)
 
 
 def test_damped_discharge_is_reported():

@@ -2,6 +2,10 @@
 from ep2sindy.thruster.parameters import Thruster as Thruster  # for configs
 from ep2sindy.thruster.parameters import OperatingPoint as OperatingPoint  # for configs
 from ep2sindy.thruster.parameters import OPERATING_POINTS as OPERATING_POINTS
+from ep2sindy.thruster.parameters import Circuit as Circuit  # for configs
+from ep2sindy.thruster.parameters import ModulatedVoltage as ModulatedVoltage  # for configs
+from ep2sindy.thruster.parameters import VoltageTable as VoltageTable  # for configs
+from ep2sindy.thruster.parameters import read_voltage as read_voltage  # for configs
 from ep2sindy.thruster.axial.simulate import simulate as simulate  # for configs
 from ep2sindy.thruster.axial.starts import ColdStart as ColdStart  # for configs
 from ep2sindy.thruster.axial.starts import GuessedStart as GuessedStart  # for configs

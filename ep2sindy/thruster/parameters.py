@@ -1,15 +1,140 @@
-"""Parameters of a simulation: the thruster, its operating point, the six points studied."""
+"""Parameters of a simulation: the thruster and its circuit, the operating point, the six points."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from ep2sindy.thruster.checks import check_not_negative, check_positive
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.thruster.checks import (
+    check_increasing,
+    check_not_negative,
+    check_positive,
+    check_rows,
+)
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
 from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
+from ep2sindy.thruster.tables import number, numbers, read_cells
 from ep2sindy.thruster.transport import AnomalousTransport, Transport
 from ep2sindy.thruster.walls import Anode, FixedAnode, SheathWall, Wall
+
+Volts = Float[np.ndarray, " times"]
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """Inductance in H behind the series resistance; capacitance in F across the discharge.
+
+        supply -- series resistance -- inductance --+-- anode
+                                               capacitance
+                                           cathode --+
+
+    Raises ValueError if both are zero, or either is negative.
+    """
+
+    inductance: float = 0.0
+    capacitance: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "inductance", "capacitance")
+        if self.inductance == self.capacitance == 0.0:
+            raise ValueError(
+                "a Circuit must have an inductance or a capacitance: both are 0; leave the circuit "
+                "out, or give one of them in H or F"
+            )
+
+
+@dataclass(frozen=True)
+class ModulatedVoltage:
+    """The operating point's voltage V_0, modulated: V_0 (1 + share sin(2 pi frequency t)).
+
+    share: amplitude relative to V_0, above 0 and below 1. The modulation begins at t = 0, where the
+    record does. Raises ValueError for a share out of range or a frequency that is not positive.
+    """
+
+    share: float
+    frequency_Hz: float
+
+    def __post_init__(self) -> None:
+        check_positive(self, "share", "frequency_Hz")
+        if self.share >= 1.0:
+            raise ValueError(
+                f"ModulatedVoltage.share must be below 1, or the supply turns round: {self.share:g}"
+                " came; 0.05 is five per cent"
+            )
+
+    def check(self, voltage: float, end_s: float) -> None:
+        """Nothing: it goes on for ever, about any voltage."""
+
+    def at(self, t: Volts, voltage: float) -> Volts:
+        """Voltage in V at times in s, constant before t = 0."""
+        phase = 2.0 * np.pi * self.frequency_Hz * np.maximum(t, 0.0)
+        return voltage * (1.0 + self.share * np.sin(phase))
+
+
+@dataclass(frozen=True)
+class VoltageTable:
+    """Voltage of the supply in V at increasing times in s, linear between them.
+
+    t = 0 is where the record begins; before, during the warm-up, the voltage is that of t = 0,
+    which must be the operating point's. Raises ValueError for gaps, times that do not increase, a
+    first time above 0, or a voltage that is not positive.
+    """
+
+    time: tuple[float, ...]
+    voltage: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check_increasing(self, "time")
+        check_rows(self, "time", "voltage")
+        if min(self.voltage) <= 0.0:
+            raise ValueError(f"VoltageTable.voltage must be positive, got {min(self.voltage):g} V")
+        if self.time[0] > 0.0:
+            raise ValueError(
+                f"VoltageTable.time must begin at 0, where the record does, or before: it begins "
+                f"at {self.time[0]:g} s"
+            )
+
+    def check(self, voltage: float, end_s: float) -> None:
+        """Raise ValueError for another voltage at t = 0, or a table that ends before the run."""
+        first = float(self.at(np.zeros(1), voltage)[0])
+        if abs(first - voltage) > 1e-6 * voltage:
+            raise ValueError(
+                f"the operating point's voltage must be the supply's at t = 0: it is {voltage:g} V,"
+                f" and the table has {first:g} V; the warm-up is run at it"
+            )
+        if self.time[-1] < end_s:
+            raise ValueError(
+                f"the supply's voltage must be known to the end of the run, {end_s:g} s: the table "
+                f"ends at {self.time[-1]:g} s; lengthen it, or shorten duration_s"
+            )
+
+    def at(self, t: Volts, voltage: float) -> Volts:
+        """Voltage in V at times in s, constant before t = 0."""
+        return np.interp(np.maximum(t, 0.0), self.time, self.voltage)
+
+
+Supply = ModulatedVoltage | VoltageTable
+
+
+def read_voltage(path: str | Path) -> VoltageTable:
+    """Read a VoltageTable from a CSV file of two columns, time in s and voltage in V.
+
+    A first row without numbers is a header; lines that begin with # are ignored. Raises ValueError
+    for a gap, or as VoltageTable does.
+    """
+    path = Path(path)
+    rows = read_cells(path, "file of a voltage")
+    if all(number(cell) is None for cell in rows[0]):
+        rows = rows[1:]
+    time, voltage = zip(*numbers(path, rows, 2), strict=True)
+    try:
+        return VoltageTable(time, voltage)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -37,6 +162,7 @@ class Thruster:
     cathode_T_e_eV: float = 3.0
     cathode_potential: float = 20.0  # V
     series_resistance: float = 1.0  # ohm
+    circuit: Circuit | None = None  # besides the series resistance
     pressure_factor: float = 1.0  # p_e = factor n T_e
     conduction_factor: float = 4.66
     conduction_coulomb: float = 0.0
@@ -59,6 +185,11 @@ class Thruster:
             raise ValueError(
                 f"inner_radius must be below outer_radius: {self.inner_radius} m against "
                 f"{self.outer_radius} m"
+            )
+        if self.circuit is not None and self.series_resistance == 0.0:
+            raise ValueError(
+                "a circuit must have a resistance, or nothing damps it: series_resistance is 0 "
+                f"beside {self.circuit}; give it in ohm"
             )
         self.magnetic_field.check_covers(
             -self.channel_length, self.domain_length - self.channel_length
@@ -97,11 +228,15 @@ class Thruster:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """The operator's settings: supply voltage in V, anode flow in mg/s; and the neutrals' speed."""
+    """The operator's settings: supply voltage in V, anode flow in mg/s; and the neutrals' speed.
+
+    supply: how the voltage varies in time; None keeps it constant.
+    """
 
     voltage: float  # V
     mass_flow_mg_s: float
     neutral_speed: float = 280.0  # m/s, tuned
+    supply: Supply | None = None
 
     def __post_init__(self) -> None:
         check_positive(self, "voltage", "mass_flow_mg_s", "neutral_speed")

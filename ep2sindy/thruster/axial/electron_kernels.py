@@ -15,7 +15,10 @@ from ep2sindy.thruster.axial.state_kernels import (
     P_IONS,
     P_WALL,
     POWER,
+    SUPPLY,
+    SUPPLY_CURRENT,
     THRUST,
+    VOLTAGE,
     WALL_CURRENT,
     faces,
     inside,
@@ -81,7 +84,48 @@ def sheath_drop(state, model):
 
 
 @compiled(**FAST)
-def ohm(state, model, drop, w):
+def supply_voltage(state, model):
+    """Voltage of the supply in V at the present time, linear between the model's steps."""
+    supply, place = model.supply, state.clock[0] * model.supply_rate
+    if supply.size == 1 or place <= 0.0:
+        return supply[0]
+    below = min(int(place), supply.size - 2)
+    return supply[below] + (place - below) * (supply[below + 1] - supply[below])
+
+
+@compiled(**FAST)
+def thevenin(state, model, dt):
+    """Source in V and resistance in ohm that the discharge sees over an implicit step of dt.
+
+    With dt = 0 the circuit is at rest: no voltage over the coil, no current into the capacitor.
+    """
+    source, resistance = state.instant[SUPPLY], model.resistance
+    if dt == 0.0:
+        return source, resistance
+    inertia = model.inductance / dt
+    source, resistance = source + inertia * state.instant[SUPPLY_CURRENT], resistance + inertia
+    if model.capacitance == 0.0:
+        return source, resistance
+    held = model.capacitance / dt
+    parallel = 1.0 / (1.0 / resistance + held)
+    return (source / resistance + held * state.instant[VOLTAGE]) * parallel, parallel
+
+
+@compiled(**FAST)
+def follow_circuit(state, model, dt, behind):
+    """Record the voltage behind the circuit, and the current that the supply gives."""
+    instant = state.instant
+    if dt == 0.0 or model.capacitance == 0.0:
+        instant[SUPPLY_CURRENT] = instant[CURRENT]
+    else:
+        inertia = model.inductance / dt
+        driven = instant[SUPPLY] + inertia * instant[SUPPLY_CURRENT] - behind
+        instant[SUPPLY_CURRENT] = driven / (model.resistance + inertia)
+    instant[VOLTAGE] = behind
+
+
+@compiled(**FAST)
+def ohm(state, model, dt, drop, w):
     """Electric field and drift energy; writes the heating -n u_e E to w[2]; returns I_d/(e A).
 
     drop: voltage of the anode's sheath in V, which adds to the voltage over the plasma.
@@ -99,7 +143,9 @@ def ohm(state, model, drop, w):
     for i in inside(n):
         load += dz[i] / (n[i] * mobility[i])
     plasma = E_CHARGE * model.area
-    current = (model.voltage + drop + drive) / (load / plasma + model.resistance)
+    state.instant[SUPPLY] = supply_voltage(state, model)
+    source, resistance = thevenin(state, model, dt)
+    current = (source + drop + drive) / (load / plasma + resistance)
     total = current / plasma
     for i in inside(n):
         E[i] = ((total - g[i]) / mobility[i] - gradient[i]) / n[i]
@@ -109,6 +155,7 @@ def ohm(state, model, drop, w):
         for i in inside(n):
             drift[i] = 0.5 * ((g[i] - total) / n[i]) ** 2 / (mobility[i] * nu[i])
     state.instant[CURRENT] = current
+    follow_circuit(state, model, dt, source - resistance * current)
     return total
 
 
@@ -244,6 +291,7 @@ def record_powers(state, model, total, w):
 def electron_step(state, model, dt, rows, w):
     """Collisions, discharge current, field and new temperature; returns False if the run breaks."""
     T = state.T_e_eV
+    state.clock[0] += dt
     sum_charges(state)
     follow_log(state)
     fill_ghosts(state.n_n)
@@ -255,7 +303,7 @@ def electron_step(state, model, dt, rows, w):
     if not collisions(state, model, rows, w):
         return False
     drop = sheath_drop(state, model)
-    total = ohm(state, model, drop, w)
+    total = ohm(state, model, dt, drop, w)
     if not np.isfinite(total):
         return False
     heat(state, model, dt, total, drop, w)

@@ -5,6 +5,9 @@ Cells have equal lengths, or are longer in the plume, where ions are fast.
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -14,9 +17,11 @@ from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import PropellantTable
 from ep2sindy.thruster.walls import AnodeSheath
+from ep2sindy.trust.memory import check_memory
 
 CFL = 0.8
 MIN_CELLS = 10
+SUPPLY_STEP_S = 1e-7  # a modulation of 50 kHz is then within 1e-4 of its amplitude
 CENTRE_M, WIDTH_M = 12e-3, 4e-3  # beyond the exit; from short to long cells
 
 
@@ -48,11 +53,15 @@ def build_model(
     point: OperatingPoint,
     faces: Float[np.ndarray, " faces"],
     *,
+    end_s: float,
     cfl: float = CFL,
     reconstruct: bool = True,
     coldest_eV: float = 0.0,
 ) -> AxialModel:
-    """Gather all constants of one run; arrays hold one ghost cell at each end."""
+    """Gather all constants of one run; arrays hold one ghost cell at each end.
+
+    end_s: end of the record, to which the supply's voltage must be known.
+    """
     distance = lengths_and_centres(faces)[1] - thruster.channel_length
     omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
     mass, anode, wall = thruster.propellant.mass, thruster.anode, thruster.wall
@@ -67,8 +76,7 @@ def build_model(
         neutral_wave=0.0,
         birth_speed=0.0 if thruster.ions_born_at_rest else point.neutral_speed,
         neutral_inflow=1e-6 * point.mass_flow_mg_s / (mass * thruster.area),
-        voltage=point.voltage - thruster.cathode_potential,
-        resistance=thruster.series_resistance,
+        **_circuit(thruster, point, end_s),
         pressure_factor=thruster.pressure_factor,
         conduction_factor=thruster.conduction_factor,
         conduction_coulomb=thruster.conduction_coulomb,
@@ -91,7 +99,26 @@ def build_model(
     )
 
 
-def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Float[np.ndarray, " cells"]]:
+def _circuit(thruster: Thruster, point: OperatingPoint, end_s: float) -> dict[str, Any]:
+    """Supply and circuit of a model; a voltage that varies is taken at steps of SUPPLY_STEP_S."""
+    volts, rate = np.array([point.voltage]), 0.0
+    if point.supply is not None:
+        point.supply.check(point.voltage, end_s)
+        n_steps = math.ceil(end_s / SUPPLY_STEP_S)
+        check_memory(8.0 * n_steps, f"duration_s = {end_s:g} s", way_out="simulate less of it")
+        volts = point.supply.at(SUPPLY_STEP_S * np.arange(n_steps + 2.0), point.voltage)
+        rate = 1.0 / SUPPLY_STEP_S
+    circuit = thruster.circuit
+    return {
+        "supply": volts - thruster.cathode_potential,
+        "supply_rate": rate,
+        "resistance": thruster.series_resistance,
+        "inductance": 0.0 if circuit is None else circuit.inductance,
+        "capacitance": 0.0 if circuit is None else circuit.capacitance,
+    }
+
+
+def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Any]:
     """The length arrays of a model: of its cells and between their centres."""
     dz, z = lengths_and_centres(faces)
     between = np.diff(z)

@@ -39,7 +39,8 @@ PRODUCTS = {"ionization": "n_i*n_n*R_ion", "flux_i": "n_i*u_iz"}
 
 SERIES = {  # variable -> unit, long name
     "I_d": ("A", "discharge current"),
-    "V_d": ("V", "discharge voltage behind the series resistance"),
+    "V_d": ("V", "discharge voltage behind resistance and circuit"),
+    "V_supply": ("V", "voltage of the supply"),
     "thrust": ("N", "ion momentum flux through the cathode plane"),
     "I_beam": ("A", "ion current through the cathode plane"),
     "I_wall": ("A", "ion current to the channel walls"),
@@ -70,16 +71,22 @@ def field_columns(*, charges: int, averaged: bool) -> dict[str, tuple[int, str, 
 
 
 def series_of(
-    sums: Float[np.ndarray, "samples series"], model: AxialModel, *, voltage: float, sample_s: float
+    sums: Float[np.ndarray, "samples series"],
+    model: AxialModel,
+    *,
+    cathode_V: float,
+    sample_s: float,
 ) -> dict[str, Float[np.ndarray, " samples"]]:
-    """The named time series of a run. voltage: supply voltage in V."""
+    """The named time series of a run. cathode_V: potential of the cathode plane."""
     current = sums[:, recorded.CURRENT]
     particles = model.ion_mass * model.area
     flow_i, flow_n = sums[:, recorded.IONS_OUT], sums[:, recorded.NEUTRALS_OUT]
     powers = sums[:, recorded.POWER : recorded.P_CATHODE + 1].T
+    driven = {"V_supply": cathode_V + sums[:, recorded.SUPPLY]} if model.supply.size > 1 else {}
     return {
         "I_d": current,
-        "V_d": voltage - model.resistance * current,
+        "V_d": cathode_V + sums[:, recorded.VOLTAGE],
+        **driven,
         "thrust": sums[:, recorded.THRUST],
         "I_beam": E_CHARGE * model.area * sums[:, recorded.BEAM],
         "I_wall": sums[:, recorded.WALL_CURRENT],

@@ -35,6 +35,8 @@ from ep2sindy.thruster.axial.state_kernels import (
     CURRENT,
     PER_CHARGE,
     SERIES_SUMS,
+    SUPPLY_CURRENT,
+    VOLTAGE,
     AxialModel,
     AxialState,
 )
@@ -113,8 +115,8 @@ def simulate_as(
     parameters = to_json(_parameters(settings, thruster, point))
     faces = cell_faces(thruster, settings.n_cells, settings.stretch)
     model = build_model(
-        thruster, point, faces, cfl=settings.cfl, reconstruct=settings.reconstruct,
-        coldest_eV=settings.coldest_T_e_eV,
+        thruster, point, faces, end_s=settings.duration_s + settings.sample_s, cfl=settings.cfl,
+        reconstruct=settings.reconstruct, coldest_eV=settings.coldest_T_e_eV,
     )  # fmt: skip
     beginning = start.begin(model, lengths_and_centres(faces)[1], parameters)
     n_samples = sum(sample_counts(beginning, settings))
@@ -166,11 +168,12 @@ def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Ad
     if beginning.resistance is not None:
         quiet = model._replace(resistance=beginning.resistance)
     n_hold, n_warm_up, n_samples = sample_counts(beginning, settings)
+    state.clock[0] = -settings.sample_s * (n_hold + n_warm_up)
     whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
         march = _march(each, state, settings, *_room(n_fields, CHUNK_ROWS, state))
         whole = whole and warm_up(march, n_rows, advance) is None
-    before, state.hottest_eV[0] = stored_energy(state, model), 0.0
+    before, state.hottest_eV[0], state.clock[0] = stored_energy(state, model), 0.0, 0.0
     fields, series = _room(n_fields, n_samples if whole else 0, state)
     filled = record_samples(_march(model, state, settings, fields, series), len(series), advance)
     return Record(
@@ -220,7 +223,8 @@ def _dataset(
     fields = {
         name: (record.fields[place], unit, text) for name, (place, unit, text) in columns.items()
     }
-    series = series_of(record.series, model, voltage=point.voltage, sample_s=settings.sample_s)
+    offset = point.voltage - float(model.supply[0])  # the cathode's potential
+    series = series_of(record.series, model, cathode_V=offset, sample_s=settings.sample_s)
     end = end_of(record.state)
     return labelled(fields, series, end, sample_s=settings.sample_s, faces=faces)
 
@@ -243,7 +247,8 @@ def _attributes(
             attributes["mass_balance"] = mass_balance(field, model, seconds)
     hottest = float(record.state.hottest_eV[0])
     attributes["rates"] = describe_uncovered(thruster.propellant, hottest) or "covered"
-    attributes["end_I_d"] = float(record.state.instant[CURRENT])
+    names = {"end_I_d": CURRENT, "end_V": VOLTAGE, "end_I_supply": SUPPLY_CURRENT}
+    attributes |= {name: float(record.state.instant[k]) for name, k in names.items()}
     return attributes
 
 

@@ -15,7 +15,14 @@ from jaxtyping import Float
 
 from ep2sindy.data.readers.source import damage_named
 from ep2sindy.runtime.files import read_json
-from ep2sindy.thruster.axial.state_kernels import CURRENT, SERIES_SUMS, AxialModel, AxialState
+from ep2sindy.thruster.axial.state_kernels import (
+    CURRENT,
+    SERIES_SUMS,
+    SUPPLY_CURRENT,
+    VOLTAGE,
+    AxialModel,
+    AxialState,
+)
 from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
 from ep2sindy.trust.guard import look_through_first
@@ -169,7 +176,10 @@ class Restart:
         ions, flux = ([cells(_of(name, k)) for k in range(charges)] for name in SPECIES)
         state = _state(parameters, ions, flux, cells("n_n"), cells("T_e_eV"))
         state.drift_eV[1:-1] = cells("drift_eV")[1:-1]
-        state.instant[CURRENT] = float(self._end.attrs["end_I_d"])
+        current = state.instant[CURRENT] = float(self._end.attrs["end_I_d"])
+        state.instant[SUPPLY_CURRENT] = self._end.attrs.get("end_I_supply", current)
+        at_rest = model.supply[0] - model.resistance * current
+        state.instant[VOLTAGE] = self._end.attrs.get("end_V", at_rest)
         if not same:
             return Beginning(state, note=f"interpolated from {points.size} to {z.size - 2} cells")
         state.energy[:], state.E[:] = cells("energy_e"), cells("E_z")
@@ -214,7 +224,7 @@ def _state(
         n_i=n, flux_i=g, n_n=n_n.copy(), T_e_eV=T_e_eV.copy(), energy=1.5 * n_e * T_e_eV,
         drift_eV=zeros[0], n_e=n_e, flux_q=zeros[1], log_n=np.ones((2, size)), E=zeros[2],
         rates=zeros[3:], wall_loss=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
-        hottest_eV=np.zeros(1),
+        clock=np.zeros(1), hottest_eV=np.zeros(1),
     )  # fmt: skip
 
 

@@ -35,8 +35,8 @@ CELL_SUMS = (
 PER_CHARGE = 5  # the last five repeat for every further charge state
 SERIES_SUMS = (
     CURRENT, THRUST, WALL_CURRENT, BEAM, IONS_OUT, NEUTRALS_OUT,
-    POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE,
-) = range(12)  # fmt: skip
+    POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE, VOLTAGE, SUPPLY, SUPPLY_CURRENT,
+) = range(15)  # fmt: skip
 
 
 # Unsigned indices: numba wraps negative ones around, which prevents vectorisation.
@@ -71,8 +71,11 @@ class AxialModel(NamedTuple):
     neutral_wave: float  # m/s: wave speed beyond it in the neutrals' flux, 0 but in comparisons
     birth_speed: float  # of ions born of neutrals, m/s
     neutral_inflow: float  # 1/(m^2 s)
-    voltage: float  # V_0 - V_c, V
+    supply: np.ndarray  # V_s - V_c in V, at equal steps from t = 0; one value if constant
+    supply_rate: float  # 1/s, of these steps
     resistance: float  # ohm
+    inductance: float  # H
+    capacitance: float  # F
     pressure_factor: float  # p_e = pressure_factor * n * T_e
     conduction_factor: float  # kappa = factor / (1 + coulomb * nu_ei / nu) * mu * n * T_e
     conduction_coulomb: float
@@ -110,6 +113,7 @@ class AxialState(NamedTuple):
     rates: np.ndarray  # (3, n + 2), m^3/s: X -> X+, X -> X2+, X+ -> X2+
     wall_loss: np.ndarray  # (n + 2,), 1/s, of singly charged ions
     instant: np.ndarray  # (series,), the series' present values
+    clock: np.ndarray  # (1,), s since the record began
     hottest_eV: np.ndarray  # (1,), highest T_e + 2 K/3 at the ends of samples
 
 

@@ -109,7 +109,7 @@ def simulate_as(
     sample_s, averaged = settings["sample_s"], settings["averaged"]
     duration_s, warm_up_s = settings["duration_s"], settings["warm_up_s"]
     Settings(duration_s, warm_up_s, sample_s)  # raises ValueError for invalid ones
-    check_thruster(thruster)
+    check_thruster(thruster, operating_point)
     grid = MaskedGrid(thruster, settings["n_z"], settings["n_r"])
     model = build_model(thruster, operating_point, grid)
     n_warm_up, n_samples = round(warm_up_s / sample_s), round(duration_s / sample_s) + 1
@@ -220,7 +220,7 @@ CFL = 0.8
 NEUTRAL_DIFFUSION = 1.1  # m^2/s, radial: a mean speed of some 200 m/s over the channel's width
 
 
-def check_thruster(thruster: Thruster) -> None:
+def check_thruster(thruster: Thruster, point: OperatingPoint) -> None:
     """Raise ValueError for closures that the (z, r) model does not support."""
     if not isinstance(thruster.wall, SheathWall):
         raise ValueError(
@@ -229,6 +229,8 @@ def check_thruster(thruster: Thruster) -> None:
         )
     unsolved = {
         "an AnodeSheath": not isinstance(thruster.anode, FixedAnode),
+        "a circuit": thruster.circuit is not None,
+        "a supply whose voltage varies": point.supply is not None,
         "charge_states 2": thruster.charge_states > 1,
         "conduction_coulomb": thruster.conduction_coulomb > 0.0,
         "an anode and a cathode of different T_e_eV": (

@@ -1,0 +1,165 @@
+"""The discharge's circuit and supply: exact networks, records that are driven, what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.thruster.axial.electron_kernels import follow_circuit, thevenin
+from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_centres
+from ep2sindy.thruster.axial.settings import to_json
+from ep2sindy.thruster.axial.simulate import simulate
+from ep2sindy.thruster.axial.starts import GuessedStart
+from ep2sindy.thruster.axial.state_kernels import CURRENT, SUPPLY, VOLTAGE
+
+POINT = ep.thruster.OperatingPoint(300.0, 5.0)
+BRIEF = {
+    "duration_s": 3e-4, "warm_up_s": 1e-4, "n_cells": 40, "stretch": 1.0, "progress": False,
+}  # fmt: skip
+SINE = ep.thruster.ModulatedVoltage(share=0.05, frequency_Hz=2e4)
+
+
+def driven(supply, **settings):
+    return simulate(ep.thruster.Thruster(), replace(POINT, supply=supply), **(BRIEF | settings))
+
+
+def step_response(circuit, load_ohm, dt, n_steps):
+    """Voltage over a resistor behind the circuit, after the supply is switched on at rest."""
+    thruster = ep.thruster.Thruster(circuit=circuit, series_resistance=2.0)
+    faces = cell_faces(thruster, 20, 1.0)
+    model = build_model(thruster, POINT, faces, end_s=1.0)
+    centres = lengths_and_centres(faces)[1]
+    parameters = to_json({"thruster": thruster})
+    state = GuessedStart().begin(model, centres, parameters).state
+    state.instant[:] = 0.0
+    state.instant[SUPPLY] = 100.0
+    found = []
+    for _ in range(n_steps):
+        source, resistance = thevenin.py_func(state, model, dt)
+        state.instant[CURRENT] = source / (resistance + load_ohm)
+        follow_circuit.py_func(state, model, dt, source - resistance * state.instant[CURRENT])
+        found.append(state.instant[VOLTAGE])
+    return np.array(found)
+
+
+def test_a_coil_and_a_capacitor_answer_a_step_as_the_exact_network():
+    """L I' = V - R I - U, C U' = I - U/load: by its matrix exponential."""
+    from scipy.linalg import expm
+
+    R, load, dt, n = 2.0, 50.0, 2e-8, 4000
+    for L, C in ((2e-4, 3e-7), (0.0, 3e-7), (2e-4, 0.0)):
+        found = step_response(ep.thruster.Circuit(inductance=L, capacitance=C), load, dt, n)
+        t = dt * np.arange(1, n + 1)
+        if L and C:
+            A = np.array([[-R / L, -1.0 / L], [1.0 / C, -1.0 / (C * load)]])
+            end = np.linalg.solve(A, [-100.0 / L, 0.0])
+            exact = np.array([(end - expm(A * now) @ end)[1] for now in t[:: n // 8]])
+        else:
+            tau = L / (R + load) if L else C * R * load / (R + load)
+            exact = 100.0 * load / (R + load) * (1.0 - np.exp(-t[:: n // 8] / tau))
+        np.testing.assert_allclose(found[:: n // 8], exact, atol=0.4)  # of 96 V: first order in dt
+
+
+def test_the_supply_is_recorded_as_it_was_asked_for():
+    field = driven(SINE, averaged=False)
+    end = field["time"].values + 1.5e-6  # values at the end of each sample
+    phase = 2.0 * np.pi * SINE.frequency_Hz * end
+    np.testing.assert_allclose(field["V_supply"], 300.0 * (1.0 + 0.05 * np.sin(phase)), atol=1e-3)
+    drop = field["V_supply"] - field["V_d"]
+    np.testing.assert_allclose(drop, 1.0 * field["I_d"], rtol=1e-9, atol=1e-9)
+
+
+def test_a_table_of_a_constant_voltage_changes_nothing():
+    still = ep.thruster.VoltageTable((0.0, 1.0), (300.0, 300.0))
+    plain, tabled = simulate(ep.thruster.Thruster(), POINT, **BRIEF), driven(still)
+    np.testing.assert_array_equal(plain["I_d"], tabled["I_d"])
+    assert "V_supply" not in plain
+
+
+def test_the_voltage_is_held_during_the_warm_up():
+    plain, sine = simulate(ep.thruster.Thruster(), POINT, **BRIEF), driven(SINE)
+    assert float(sine["I_d"][0]) == pytest.approx(float(plain["I_d"][0]), rel=0.02)
+    assert float(np.abs(sine["I_d"] - plain["I_d"]).max()) > 0.1
+
+
+def test_a_large_capacitor_holds_the_voltage_and_a_large_coil_the_current():
+    def run(circuit):
+        thruster = ep.thruster.Thruster(series_resistance=20.0, circuit=circuit)
+        return simulate(thruster, POINT, **BRIEF)
+
+    plain = run(None)
+    held = run(ep.thruster.Circuit(capacitance=1e-3))
+    steady = run(ep.thruster.Circuit(inductance=1.0))
+    assert float(held["V_d"].std()) < 0.05 * float(plain["V_d"].std())
+    assert float(steady["I_d"].std()) < 0.05 * float(plain["I_d"].std())
+    for field in (plain, held, steady):
+        assert field.attrs["energy_balance"] == pytest.approx(1.0, abs=1e-4)
+        assert field.attrs["mass_balance"] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_run_goes_on_with_its_circuit():
+    thruster = ep.thruster.Thruster(circuit=ep.thruster.Circuit(inductance=1e-4, capacitance=1e-7))
+    step = 1.5e-6
+    whole = simulate(thruster, POINT, **(BRIEF | {"duration_s": 200 * step}))
+    first = simulate(thruster, POINT, **(BRIEF | {"duration_s": 99 * step}))
+    rest = {"duration_s": 100 * step, "warm_up_s": 0.0, "initial": first}
+    second = simulate(thruster, POINT, **(BRIEF | rest))
+    np.testing.assert_array_equal(whole["V_d"][100:], second["V_d"])
+
+
+def test_a_voltage_is_read_from_a_file(tmp_path: Path):
+    path = tmp_path / "V.csv"
+    path.write_text("# oscilloscope\nt_s,V\n0,300\n1e-3,330\n2e-3,300\n")
+    table = ep.thruster.read_voltage(path)
+    np.testing.assert_allclose(table.at(np.array([-1.0, 5e-4, 1e-3]), 300.0), [300.0, 315.0, 330.0])
+    path.write_text("0,300\n1e-3,\n")
+    with pytest.raises(ValueError, match=r"must have 2 numbers in every row: row 2"):
+        ep.thruster.read_voltage(path)
+    path.write_text("1e-3,300\n2e-3,300\n")
+    with pytest.raises(ValueError, match=r"V\.csv: VoltageTable\.time must begin at 0"):
+        ep.thruster.read_voltage(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (ep.thruster.Circuit, "an inductance or a capacitance: both are 0"),
+        (lambda: ep.thruster.Circuit(-1.0), "inductance must be finite and zero or more"),
+        (
+            lambda: ep.thruster.Thruster(
+                series_resistance=0.0, circuit=ep.thruster.Circuit(inductance=1e-4)
+            ),
+            "a circuit must have a resistance, .*: series_resistance is 0",
+        ),
+        (lambda: ep.thruster.ModulatedVoltage(1.2, 1e4), "share must be below 1, .*: 1.2 came"),
+        (lambda: ep.thruster.ModulatedVoltage(0.1, 0.0), "frequency_Hz must be finite and pos"),
+        (lambda: ep.thruster.VoltageTable((0.0, 1.0), (300.0, 0.0)), "must be positive, got 0 V"),
+        (
+            lambda: driven(ep.thruster.VoltageTable((0.0, 1e-4), (300.0, 300.0))),
+            "known to the end of the run, 0.0003015 s: the table ends at 0.0001 s",
+        ),
+        (
+            lambda: driven(ep.thruster.VoltageTable((0.0, 1.0), (280.0, 300.0))),
+            "must be the supply's at t = 0: it is 300 V, and the table has 280 V",
+        ),
+        (
+            lambda: ep.thruster.simulate_2d(
+                replace(ep.thruster.THRUSTER_2D, circuit=ep.thruster.Circuit(inductance=1e-4)),
+                progress=False,
+            ),
+            "does not solve a circuit; simulate along the axis alone",
+        ),
+        (
+            lambda: ep.thruster.simulate_2d(
+                operating_point=replace(ep.thruster.OPERATING_POINT_2D, supply=SINE),
+                progress=False,
+            ),
+            "does not solve a supply whose voltage varies; simulate along the axis alone",
+        ),
+    ],
+)  # fmt: skip
+def test_what_no_circuit_can_be_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
