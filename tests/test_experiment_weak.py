@@ -60,7 +60,7 @@ def test_windows_longer_than_the_data_end_a_run_before_any_fit(
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["n_points=[1]"], "windows must number one or more, of two samples or more"),
+        (["n_points=[1]"], "n_points must be a whole number, two or more: 1 came"),
         (["n_points=[10,10]"], "n_points must be a list such as [a,b], each once"),
         (["n_points=[10.5]"], "n_points[0] must be whole numbers, above zero: 10.5 came"),
         (["boxes.test_functions.n_points=70"], "boxes.test_functions.n_points is what n_points"),

@@ -25,7 +25,7 @@ from ep2sindy.refinement.windows import (
     dominant_window,
 )
 from ep2sindy.runtime.progress import Advance, nothing
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import read_only, set_counts
 
 Values = TypeVar("Values", bound=np.ndarray)
 
@@ -60,6 +60,7 @@ class RefinementSettings:
     n_reweights: int = 1
 
     def __post_init__(self) -> None:
+        set_counts(self, {"n_windows": 1, "n_reweights": 0})
         check_windows(self.n_windows, self.window)
         if self.periods is not None:
             if self.window is not None:
@@ -72,8 +73,6 @@ class RefinementSettings:
                     f"periods must be positive: {self.periods} came; leave it out for one and a "
                     "half"
                 )
-        if self.n_reweights < 0:
-            raise ValueError(f"n_reweights must be zero or more: {self.n_reweights} came")
 
     def override(self, given: Mapping[str, Any]) -> RefinementSettings:
         """Copy of the settings, with the given values that are not None replaced."""

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
 from ep2sindy.regression.sampling import even_grid, is_even, one_about_each
+from ep2sindy.runtime.values import set_counts
 
 # Value of a bump, relative to its centre, at the first sample inside its edge.
 EDGE = 1e-10
@@ -63,11 +64,7 @@ class Boxes:
     n_points: int = 100
 
     def __post_init__(self) -> None:
-        if self.n_windows < 1 or self.n_points < 2:
-            raise ValueError(
-                "windows must number one or more, of two samples or more: "
-                f"n_windows={self.n_windows}, n_points={self.n_points} came"
-            )
+        set_counts(self, {"n_windows": 1, "n_points": 2})
 
     def windows(
         self,
