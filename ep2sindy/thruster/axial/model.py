@@ -21,7 +21,7 @@ from ep2sindy.trust.memory import check_memory
 
 CFL = 0.8
 MIN_CELLS = 10
-SUPPLY_STEP_S = 1e-7  # a modulation of 50 kHz is then within 1e-4 of its amplitude
+SUPPLY_STEP_S = 1e-7  # linear between them: a modulation of 40 kHz is within 1e-4 of its amplitude
 CENTRE_M, WIDTH_M = 12e-3, 4e-3  # beyond the exit; from short to long cells
 
 
