@@ -193,10 +193,12 @@ def solve_from_both_ends(lower, diagonal, upper, known, T, c, d):
 
 @compiled(**FAST)
 def heat_through_faces(state, model, total, drop, kappa, down, up, w):
-    """Upwind convection and conduction: the flux through face i is down[i] T[i] + up[i] T[i + 1].
+    """Convection and conduction: the flux through face i is down[i] T[i] + up[i] T[i + 1].
 
-    w holds the collision frequency, the mobility, and in w[17] the electron-ion collision
-    frequency.
+    Patankar's power law, which is within 3 % of the exact flux between two fixed temperatures:
+    central where conduction dominates, upwind where convection does (Patankar, Numerical Heat
+    Transfer and Fluid Flow, 1980, section 5.2-6). w holds the collision frequency, the mobility,
+    and in w[17] the electron-ion collision frequency.
     """
     n, g, T, mobility, between = state.n_e, state.flux_q, state.T_e_eV, w[1], model.between
     for i in range(n.size):
@@ -208,8 +210,9 @@ def heat_through_faces(state, model, total, drop, kappa, down, up, w):
         kappa[i] = 0.5 * (kappa[i] + kappa[i + ONE]) / between[i]
     for i in faces(n):
         flux = 0.5 * (g[i] + g[i + ONE]) - total
-        down[i] = 2.5 * max(flux, 0.0) + kappa[i]
-        up[i] = 2.5 * min(flux, 0.0) - kappa[i]
+        conducted = kappa[i] * max(1.0 - 0.25 * abs(flux) / kappa[i], 0.0) ** 5
+        down[i] = 2.5 * max(flux, 0.0) + conducted
+        up[i] = 2.5 * min(flux, 0.0) - conducted
     if model.sheath:  # no gradient of T; each electron takes 2 T and climbs the sheath
         flux = g[1] - total
         down[0] = 2.5 * max(flux, 0.0)
@@ -218,7 +221,7 @@ def heat_through_faces(state, model, total, drop, kappa, down, up, w):
 
 @compiled(**FAST)
 def heat(state, model, dt, total, drop, w):
-    """New electron temperature: implicit upwind convection, conduction and linearised losses.
+    """New electron temperature: implicit convection, conduction and linearised losses.
 
     Writes the energy fluxes through the two ends, in eV/(m^2 s) towards the cathode, to w[0, 0] and
     w[0, 1], and the losses at the new temperature to w[3] and w[5].
