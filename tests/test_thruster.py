@@ -11,7 +11,7 @@ from ep2sindy.thruster.axial.model import build_model, cell_faces, lengths_and_c
 from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.axial.starts import GuessedStart
-from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, SERIES_SUMS, Sums
+from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, new_sums, new_work
 from ep2sindy.thruster.closures import IONIZATION, TABLE_STEP_EV, closure_table
 from ep2sindy.thruster.magnetic_field import MagneticField
 from ep2sindy.thruster.parameters import OPERATING_POINTS, OperatingPoint, Thruster
@@ -52,8 +52,7 @@ def advected_error(n_cells, stretch=1.0):
 
     state.n_i[:], state.n_n[:], state.flux_i[:] = pulse(0.0), pulse(0.0), speed * pulse(0.0)
     steps = 2 * n_cells // 10 * 5
-    work = np.zeros((26, n_cells + 2))
-    sums = Sums(np.zeros((len(CELL_SUMS), n_cells + 2)), np.zeros(len(SERIES_SUMS)))
+    work, sums = new_work(1, n_cells + 2), new_sums(len(CELL_SUMS), n_cells + 2)
     for _ in range(steps):
         heavy_step(state, model, 0.01 / speed / steps, sums, work)
     inner = (z > 0.015) & (z < 0.045)  # the anode disturbs the first 10 mm

@@ -17,13 +17,27 @@ SETTINGS = ".numba_config.yaml"  # read from the current folder, which may not b
 
 with away_from(SETTINGS):
     import numba
-    from numba.core import config, event
+    from numba.core import config, cpu, event, options
 config._config_fname = ""  # numba looks for the file again at every compilation
 
 THIS = Path(__file__)
 IMPORT = re.compile(r"^from (ep2sindy(?:\.\w+)+) import", re.MULTILINE)
 
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."
+
+
+def _separate_arrays() -> dict[str, Any]:
+    """The option that tells the compiler that a kernel's array arguments are separate ones.
+
+    Numba's compiler has this flag, but its decorators do not offer it; {} where it has gone.
+    """
+    if not hasattr(options.TargetOptions, "Mapping"):
+        return {}
+    cpu.CPUTargetOptions.noalias = options.TargetOptions.Mapping("noalias")
+    return {"noalias": True}
+
+
+SEPARATE_ARRAYS = _separate_arrays()
 
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:

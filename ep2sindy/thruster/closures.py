@@ -22,10 +22,11 @@ TABLE_TOP_EV = 200.0  # the fits end below; a higher T_e counts as divergence
     WALL_COLLISION,
     WALL_POWER,
     ION_LOSS,
+    DRIFT_EVENTS,
     DOUBLE,
     SECOND,
-    DRIFT_EVENTS,
 ) = range(12)
+FURTHER = DOUBLE
 
 
 def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 12"]:

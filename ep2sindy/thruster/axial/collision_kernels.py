@@ -3,133 +3,131 @@
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
-from ep2sindy.thruster.axial.state_kernels import FAST, ONE
+from ep2sindy.thruster.axial.state_kernels import FAST, LOOP, ONE
 from ep2sindy.thruster.closures import (
     COULOMB,
     COULOMB_LOG,
-    DOUBLE,
     DRIFT_EVENTS,
     EVENTS,
+    FURTHER,
     INELASTIC,
     ION_LOSS,
     IONIZATION,
     MOMENTUM,
-    SECOND,
     WALL_COLLISION,
     WALL_POWER,
 )
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 
-@compiled(**FAST)
-def table_rows(T, drift, weight, model, row, share):
-    """Row below T + 2 K/3 in the closure table, share of the row above; False off the table.
-
-    T alone must lie in the table. The drift energy K is large in a spike of the field, while
-    electrons stay cold: where it leads beyond the table, the table's end is taken.
-    """
-    per_eV, top = 1.0 / model.table_step_eV, model.table.shape[0] - 2.0
-    weight = weight * 2.0 / 3.0
-    most = top if weight > 0.0 else np.inf
-    for i in range(T.size):
-        share[i] = min((T[i] + weight * drift[i]) * per_eV, most)
+@compiled(**LOOP)
+def within_table(T, per_eV, top):
+    """Whether every temperature lies in the closure table; not-a-number does not."""
     n_off = 0
     for i in range(T.size):
-        n_off += 0 if 0.0 <= share[i] <= top else 1
-    if n_off:
-        return False
-    for i in range(T.size):
-        row[i] = np.uint64(share[i])
-    for i in range(T.size):
-        share[i] -= row[i]
-    return True
+        n_off += 0 if 0.0 <= T[i] * per_eV <= top else 1
+    return n_off == 0
 
 
-@compiled(**FAST)
-def lookup(table, row, share, column, out):
+@compiled(inline="always")
+def between_rows(table, row, share, column):
     """Linear interpolation between two rows of the closure table."""
-    for i in range(out.size):
-        below = table[row[i], column]
-        out[i] = below + share[i] * (table[row[i] + ONE, column] - below)
+    below = table[row, column]
+    return below + share * (table[row + ONE, column] - below)
 
 
-@compiled(**FAST)
-def loss_with_slope(table, row, share, column, per_eV, loss, slope):
+@compiled(inline="always")
+def with_slope(table, row, share, column, per_eV):
     """A loss rate in eV m^3/s or eV/s and its slope in T_e; the slope is 0 where the loss falls."""
-    for i in range(loss.size):
-        below = table[row[i], column]
-        rise = table[row[i] + ONE, column] - below
-        loss[i] = below + share[i] * rise
-        slope[i] = max(rise, 0.0) * per_eV
+    below = table[row, column]
+    rise = table[row + ONE, column] - below
+    return below + share * rise, max(rise, 0.0) * per_eV
+
+
+@compiled(**LOOP)
+def by_temperature(T, n, nn, log_n, model, nu, coulomb, ion_loss, wall, wall_slope):
+    """Collisions that T_e alone decides; their frequency goes to nu, in 1/s.
+
+    Also electron-ion collisions, in 1/s; the ions' loss to the walls, in 1/s; the electrons' loss
+    of energy there, in eV/(m^3 s), with its slope in T_e.
+    """
+    table, per_eV = model.table, 1.0 / model.table_step_eV
+    for i in range(T.size):
+        place = T[i] * per_eV
+        row = np.uint64(place)
+        share = place - row
+        log_lambda = between_rows(table, row, share, COULOMB_LOG) - 0.5 * log_n[i]
+        coulomb[i] = n[i] * between_rows(table, row, share, COULOMB) * log_lambda
+        with_neutrals = nn[i] * between_rows(table, row, share, MOMENTUM)
+        on_wall = model.wall_collision_weight[i] * between_rows(table, row, share, WALL_COLLISION)
+        nu[i] = with_neutrals + coulomb[i] + model.anomalous[i] + on_wall
+        ion_loss[i] = model.wall_ion_weight[i] * between_rows(table, row, share, ION_LOSS)
+        loss, slope = with_slope(table, row, share, WALL_POWER, per_eV)
+        wall[i] = n[i] * model.wall_power_weight[i] * loss
+        wall_slope[i] = n[i] * model.wall_power_weight[i] * slope
+
+
+@compiled(**LOOP)
+def by_energy(T, drift, n, nn, model, nu, per_nu, mobility, per_mobility, rate, loss, slope):
+    """Inelastic collisions, at T_e + 2 K/3; with them mobility in m^2/(V s), and its inverse.
+
+    K, the energy of the electrons' drift, is large in a spike of the field, while electrons stay
+    cold: where it leads beyond the table, the table's end is taken.
+    """
+    table, per_eV, top = model.table, 1.0 / model.table_step_eV, model.table.shape[0] - 2.0
+    weight, omega, unit = model.drift_weight * 2.0 / 3.0, model.omega_ce, E_CHARGE / M_ELECTRON
+    for i in range(T.size):
+        place = min((T[i] + weight * drift[i]) * per_eV, top)
+        row = np.uint64(place)
+        share = place - row
+        frequency = nu[i] + nn[i] * between_rows(table, row, share, EVENTS)
+        inverse, squares = 1.0 / frequency, frequency**2 + omega[i] ** 2
+        per_nu[i] = inverse
+        mobility[i] = unit * frequency / squares
+        per_mobility[i] = squares * inverse / unit
+        rate[i] = between_rows(table, row, share, IONIZATION)
+        lost, steep = with_slope(table, row, share, INELASTIC, per_eV)
+        loss[i], slope[i] = n[i] * nn[i] * lost, n[i] * nn[i] * steep
+
+
+@compiled(**LOOP)
+def by_column(T, drift, model, column, out):
+    """One more column of the closure table, at T_e + 2 K/3."""
+    table, per_eV, top = model.table, 1.0 / model.table_step_eV, model.table.shape[0] - 2.0
+    weight = model.drift_weight * 2.0 / 3.0
+    for i in range(T.size):
+        place = min((T[i] + weight * drift[i]) * per_eV, top)
+        row = np.uint64(place)
+        out[i] = between_rows(table, row, place - row, column)
 
 
 @compiled(**FAST)
-def collisions(state, model, rows, w):
-    """Collision frequency w[0] and mobility w[1], losses w[3] and w[5] with slopes w[4] and w[6].
-
-    w[3] is the inelastic loss and w[5] the loss to the walls, in eV/(m^3 s). rows: (n + 2,).
-    Returns False if T_e leaves the table.
-    """
-    table, row, share, T, drift = model.table, rows, w[8], state.T_e_eV, state.drift_eV
-    nu, mobility, value, n, nn = w[0], w[1], w[7], state.n_e, state.n_n
-    if not table_rows(T, drift, 0.0, model, row, share):
+def collisions(state, model, w):
+    """Frequencies, mobility, rates and losses at the present T_e; False if it leaves the table."""
+    T, drift, n, nn, nu = state.T_e_eV, state.drift_eV, state.n_e, state.n_n, w.up
+    if not within_table(T, 1.0 / model.table_step_eV, model.table.shape[0] - 2.0):
         return False
-    lookup(table, row, share, COULOMB, value)
-    lookup(table, row, share, COULOMB_LOG, mobility)
-    lookup(table, row, share, MOMENTUM, nu)
-    log_n, anomalous = state.log_n[0], model.anomalous
-    nu_ei = w[17]
-    for i in range(nu.size):
-        nu_ei[i] = n[i] * value[i] * (mobility[i] - 0.5 * log_n[i])
-        nu[i] = nn[i] * nu[i] + nu_ei[i] + anomalous[i]
-    lookup(table, row, share, ION_LOSS, state.wall_loss)
-    for i in range(nu.size):
-        state.wall_loss[i] *= model.wall_ion_weight[i]
-    lookup(table, row, share, WALL_COLLISION, value)
-    on_wall, omega = model.wall_collision_weight, model.omega_ce
-    for i in range(nu.size):
-        nu[i] += on_wall[i] * value[i]
-    weighted_loss(n, model.wall_power_weight, model, row, share, WALL_POWER, w[5], w[6])
-    if model.drift_weight > 0.0 and not table_rows(T, drift, model.drift_weight, model, row, share):
-        return False
-    lookup(table, row, share, EVENTS, value)
-    for i in range(nu.size):
-        nu[i] += nn[i] * value[i]
-    for i in range(nu.size):
-        mobility[i] = E_CHARGE / M_ELECTRON * nu[i] / (nu[i] ** 2 + omega[i] ** 2)
-    lookup(table, row, share, IONIZATION, state.rates[0])
-    weighted_loss(n, nn, model, row, share, INELASTIC, w[3], w[4])
+    by_temperature(
+        T, n, nn, state.log_n[0], model, nu, w.coulomb, state.wall_loss, w.wall, w.wall_slope
+    )
+    by_energy(
+        T, drift, n, nn, model, nu, w.per_nu, w.mobility, w.per_mobility, state.rates[0],
+        w.inelastic, w.inelastic_slope,
+    )  # fmt: skip
     if model.drift_credit:
-        credit_drift(n, nn, drift, table, row, share, value, w[3])
-    if state.n_i.shape[0] > 1:
-        second_charge(state, model, row, share, w[3])
+        by_column(T, drift, model, DRIFT_EVENTS, w.d)
+        pay(w.inelastic, n, nn, w.d, drift, -1.0)
+    for k in range(model.further.shape[0]):
+        by_column(T, drift, model, FURTHER + k, state.rates[k + 1])
+        below = model.further[k, 0]
+        source = nn if below == 0 else state.n_i[below - 1]
+        w.c[:] = model.further_eV[k]
+        pay(w.inelastic, n, source, state.rates[k + 1], w.c, 1.0)
     return True
 
 
-@compiled(**FAST)
-def weighted_loss(n, weight, model, row, share, column, loss, slope):
-    """n weight times a loss per electron and unit weight, and its slope in T_e."""
-    loss_with_slope(model.table, row, share, column, 1.0 / model.table_step_eV, loss, slope)
-    for i in range(n.size):
-        loss[i] *= n[i] * weight[i]
-        slope[i] *= n[i] * weight[i]
-
-
-@compiled(**FAST)
-def credit_drift(n, nn, drift, table, row, share, events, inelastic):
-    """Subtract the inelastic loss that some propellants take from the drift, not the heat."""
-    lookup(table, row, share, DRIFT_EVENTS, events)
-    for i in range(n.size):
-        inelastic[i] -= n[i] * nn[i] * events[i] * drift[i]
-
-
-@compiled(**FAST)
-def second_charge(state, model, row, share, inelastic):
-    """Rate coefficients of the second charge state, and their energy cost for the electrons."""
-    double, second, first = state.rates[1], state.rates[2], state.n_i[0]
-    E_double, E_second = model.second_thresholds_eV
-    lookup(model.table, row, share, DOUBLE, double)
-    lookup(model.table, row, share, SECOND, second)
-    for i in range(double.size):
-        cost = state.n_n[i] * double[i] * E_double + first[i] * second[i] * E_second
-        inelastic[i] += state.n_e[i] * cost
+@compiled(**LOOP)
+def pay(loss, n, source, rate, energy, sign):
+    """Add the energy in eV/(m^3 s) that events of this rate cost, or subtract what drift pays."""
+    for i in range(loss.size):
+        loss[i] += sign * n[i] * source[i] * rate[i] * energy[i]

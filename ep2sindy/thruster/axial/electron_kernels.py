@@ -8,6 +8,7 @@ from ep2sindy.thruster.axial.state_kernels import (
     CURRENT,
     ENTRY,
     FAST,
+    LOOP,
     ONE,
     P_ANODE,
     P_CATHODE,
@@ -34,32 +35,29 @@ def fill_ghosts(values):
     values[-1] = values[-2]
 
 
+@compiled(**LOOP)
+def add_charge(n_e, flux_q, n, g, z):
+    for i in range(n_e.size):
+        n_e[i] += z * n[i]
+        flux_q[i] += z * g[i]
+
+
 @compiled(**FAST)
 def sum_charges(state):
     """Electron density and charge flux of all ions, including the ghost cells."""
-    n, g, n_e, flux_q = state.n_i, state.flux_i, state.n_e, state.flux_q
-    for k in range(n.shape[0]):
-        fill_ghosts(n[k])
-        fill_ghosts(g[k])
-    first, first_flux = n[0], g[0]
-    for i in range(n_e.size):
-        n_e[i] = first[i]
-    for i in range(n_e.size):
-        flux_q[i] = first_flux[i]
-    for k in range(1, n.shape[0]):
-        for i in range(n_e.size):
-            n_e[i] += (k + 1.0) * n[k, i]
-        for i in range(n_e.size):
-            flux_q[i] += (k + 1.0) * g[k, i]
+    state.n_e[:] = 0.0
+    state.flux_q[:] = 0.0
+    for k in range(state.n_i.shape[0]):
+        fill_ghosts(state.n_i[k])
+        fill_ghosts(state.flux_i[k])
+        add_charge(state.n_e, state.flux_q, state.n_i[k], state.flux_i[k], k + 1.0)
 
 
-@compiled(**FAST)
-def follow_log(state):
+@compiled(**LOOP)
+def follow_log(n_e, log_n, before):
     """Update ln n_e by its change in one step: 2 (r - 1)/(r + 1) is ln r to third order."""
-    n_e, log_n, before = state.n_e, state.log_n[0], state.log_n[1]
     for i in range(n_e.size):
         log_n[i] += 2.0 * (n_e[i] - before[i]) / (n_e[i] + before[i])
-    for i in range(n_e.size):
         before[i] = n_e[i]
 
 
@@ -124,36 +122,54 @@ def follow_circuit(state, model, dt, behind):
     instant[VOLTAGE] = behind
 
 
+@compiled(**LOOP)
+def drive_and_load(n, g, T, per_mobility, gradient, model):
+    """Integrals over the plasma of Ohm's law; writes the pressure gradient in eV/m^4.
+
+    The first, in V, drives the current beside the supply; the second is the resistance, times e and
+    the channel's area.
+    """
+    dz, per_span, spread, drive, load = model.dz, model.per_span, model.spread, 0.0, 0.0
+    for i in inside(n):
+        rise = n[i + ONE] * T[i + ONE] - n[i - ONE] * T[i - ONE]
+        rise *= model.pressure_factor * per_span[i]
+        per_n = dz[i] / n[i]
+        gradient[i] = rise
+        drive += per_n * (g[i] * per_mobility[i] + rise)
+        load += per_n * per_mobility[i] / spread[i]
+    return drive, load
+
+
+@compiled(**LOOP)
+def field_of_current(total, n, g, per_nu, per_mobility, gradient, spread, weight, E, heating, K):
+    """Field in V/m, heating -n u_e E in eV/(m^3 s) and the drift's energy K in eV."""
+    for i in inside(n):
+        backwards = total / spread[i] - g[i]  # -n u_e
+        per_n = 1.0 / n[i]
+        field = (backwards * per_mobility[i] - gradient[i]) * per_n
+        E[i] = field
+        heating[i] = backwards * field  # 2 n K nu + u_e dp_e/dz
+        # K = m_e (1 + (omega/nu)^2) u_e^2 / 2 = u_e^2 / (2 mu nu), in eV
+        K[i] = weight * (backwards * per_n) ** 2 * per_mobility[i] * per_nu[i]
+
+
 @compiled(**FAST)
 def ohm(state, model, dt, drop, w):
-    """Electric field and drift energy; writes the heating -n u_e E to w[2]; returns I_d/(e A).
+    """Current, field, drift energy and heating; returns I_d over e and the channel's area.
 
     drop: voltage of the anode's sheath in V, which adds to the voltage over the plasma.
     """
-    n, g, T, E, drift = state.n_e, state.flux_q, state.T_e_eV, state.E, state.drift_eV
-    nu, mobility, heating, gradient = w[0], w[1], w[2], w[7]
-    factor, between, dz = model.pressure_factor, model.between, model.dz
-    for i in inside(n):
-        rise = n[i + ONE] * T[i + ONE] - n[i - ONE] * T[i - ONE]
-        gradient[i] = factor * rise / (between[i - ONE] + between[i])
-    drive = 0.0
-    for i in inside(n):
-        drive += dz[i] * (g[i] / mobility[i] + gradient[i]) / n[i]
-    load = 0.0
-    for i in inside(n):
-        load += dz[i] / (n[i] * mobility[i])
-    plasma = E_CHARGE * model.area
+    n, g, plasma = state.n_e, state.flux_q, E_CHARGE * model.area
+    drive, load = drive_and_load(n, g, state.T_e_eV, w.per_mobility, w.gradient, model)
     state.instant[SUPPLY] = supply_voltage(state, model)
     source, resistance = thevenin(state, model, dt)
     current = (source + drop + drive) / (load / plasma + resistance)
     total = current / plasma
-    for i in inside(n):
-        E[i] = ((total - g[i]) / mobility[i] - gradient[i]) / n[i]
-    for i in inside(n):
-        heating[i] = (total - g[i]) * E[i]  # 2 n K nu + u_e dp_e/dz
-    if model.drift_weight > 0.0:  # K = m_e (1 + (omega/nu)^2) u_e^2 / 2 = u_e^2 / (2 mu nu), in eV
-        for i in inside(n):
-            drift[i] = 0.5 * ((g[i] - total) / n[i]) ** 2 / (mobility[i] * nu[i])
+    counted = 0.5 if model.drift_weight > 0.0 else 0.0
+    field_of_current(
+        total, n, g, w.per_nu, w.per_mobility, w.gradient, model.spread, counted,
+        state.E, w.heating, state.drift_eV,
+    )  # fmt: skip
     state.instant[CURRENT] = current
     follow_circuit(state, model, dt, source - resistance * current)
     return total
@@ -191,119 +207,148 @@ def solve_from_both_ends(lower, diagonal, upper, known, T, c, d):
         T[j] = d[j] - c[j] * T[j - 1]
 
 
-@compiled(**FAST)
-def heat_through_faces(state, model, total, drop, kappa, down, up, w):
+@compiled(**LOOP)
+def conductivities(n, T, mobility, coulomb, per_nu, model, kappa):
+    """Heat conductivity of the electrons in every cell, in 1/(m s)."""
+    factor, shared = model.conduction_factor, model.conduction_coulomb
+    for i in range(n.size):
+        kappa[i] = factor * mobility[i] * n[i] * T[i] / (1.0 + shared * coulomb[i] * per_nu[i])
+
+
+@compiled(**LOOP)
+def heat_through_faces(g, total, kappa, model, down, up):
     """Convection and conduction: the flux through face i is down[i] T[i] + up[i] T[i + 1].
 
     Patankar's power law, which is within 3 % of the exact flux between two fixed temperatures:
     central where conduction dominates, upwind where convection does (Patankar, Numerical Heat
-    Transfer and Fluid Flow, 1980, section 5.2-6). w holds the collision frequency, the mobility,
-    and in w[17] the electron-ion collision frequency.
+    Transfer and Fluid Flow, 1980, section 5.2-6).
     """
-    n, g, T, mobility, between = state.n_e, state.flux_q, state.T_e_eV, w[1], model.between
-    for i in range(n.size):
-        kappa[i] = model.conduction_factor * mobility[i] * n[i] * T[i]
-    if model.conduction_coulomb > 0.0:
-        for i in range(n.size):
-            kappa[i] /= 1.0 + model.conduction_coulomb * w[17, i] / w[0, i]
-    for i in faces(n):
-        kappa[i] = 0.5 * (kappa[i] + kappa[i + ONE]) / between[i]
-    for i in faces(n):
-        flux = 0.5 * (g[i] + g[i + ONE]) - total
-        conducted = kappa[i] * max(1.0 - 0.25 * abs(flux) / kappa[i], 0.0) ** 5
-        down[i] = 2.5 * max(flux, 0.0) + conducted
-        up[i] = 2.5 * min(flux, 0.0) - conducted
-    if model.sheath:  # no gradient of T; each electron takes 2 T and climbs the sheath
-        flux = g[1] - total
-        down[0] = 2.5 * max(flux, 0.0)
-        up[0] = min(flux, 0.0) * (2.0 + model.sheath_weight * drop / T[1])
+    per_between, spread = model.per_between, model.spread_at
+    for i in faces(g):
+        flux = 2.5 * (0.5 * (g[i] + g[i + ONE]) - total / spread[i])
+        conducting = 0.5 * (kappa[i] + kappa[i + ONE]) * per_between[i]
+        conducting *= max(1.0 - 0.1 * abs(flux) / conducting, 0.0) ** 5
+        down[i] = max(flux, 0.0) + conducting
+        up[i] = min(flux, 0.0) - conducting
+
+
+@compiled(**LOOP)
+def transport_of_heat(dt, n, down, up, per_before, per_behind, lower, diagonal, upper):
+    """Equations of the next T_e: what is stored, and what passes through the faces."""
+    for i in inside(n):
+        before, behind = dt * per_before[i], dt * per_behind[i]
+        lower[i] = -before * down[i - ONE]
+        upper[i] = behind * up[i]
+        diagonal[i] = 1.5 * n[i] + (behind * down[i] - before * up[i - ONE])
+
+
+@compiled(**LOOP)
+def sources_of_heat(
+    dt, energy, T, heating, inelastic, inelastic_slope, wall, wall_slope, diagonal, known, before
+):
+    """Add heating and losses, implicit by the losses' slopes, and keep the present T_e."""
+    for i in inside(T):
+        slope = dt * (inelastic_slope[i] + wall_slope[i])
+        before[i] = T[i]
+        known[i] = energy[i] + slope * T[i] + dt * (heating[i] - inelastic[i] - wall[i])
+        diagonal[i] += slope
+
+
+@compiled(**LOOP)
+def settle(n, T, before, coldest, inelastic_slope, wall_slope, energy, inelastic, wall):
+    """Energy at the new temperature, and the losses that it paid."""
+    for i in inside(n):
+        T[i] = max(T[i], coldest)
+        rise = T[i] - before[i]
+        energy[i] = 1.5 * n[i] * T[i]
+        inelastic[i] += inelastic_slope[i] * rise
+        wall[i] += wall_slope[i] * rise
 
 
 @compiled(**FAST)
 def heat(state, model, dt, total, drop, w):
     """New electron temperature: implicit convection, conduction and linearised losses.
 
-    Writes the energy fluxes through the two ends, in eV/(m^2 s) towards the cathode, to w[0, 0] and
-    w[0, 1], and the losses at the new temperature to w[3] and w[5].
+    The losses in w become those at the new temperature.
     """
-    n, T, energy, inverse_dz = state.n_e, state.T_e_eV, state.energy, model.inverse_dz
-    heating, inelastic, slope_in, wall, slope_wall = w[2], w[3], w[4], w[5], w[6]
-    diagonal, known, kappa, down, up, c, d = w[7], w[8], w[9], w[10], w[11], w[12], w[13]
-    lower, upper, before = w[14], w[15], w[16]
-    heat_through_faces(state, model, total, drop, kappa, down, up, w)
-    for i in range(n.size):
-        before[i] = T[i]
-    for i in range(n.size):
-        diagonal[i] = dt * (slope_in[i] + slope_wall[i])
-    for i in range(n.size):
-        known[i] = energy[i] + diagonal[i] * T[i]
-    for i in range(n.size):
-        known[i] += dt * (heating[i] - inelastic[i] - wall[i])
+    n, T, down, up = state.n_e, state.T_e_eV, w.down, w.up
+    conductivities(n, T, w.mobility, w.coulomb, w.per_nu, model, w.kappa)
+    heat_through_faces(state.flux_q, total, w.kappa, model, down, up)
+    if model.sheath:  # no gradient of T; each electron takes 2 T and climbs the sheath
+        flux = state.flux_q[1] - total
+        down[0] = 2.5 * max(flux, 0.0)
+        up[0] = min(flux, 0.0) * (2.0 + model.sheath_weight * drop / T[1])
+    transport_of_heat(
+        dt, n, down, up, model.per_before, model.per_behind, w.lower, w.diagonal, w.upper
+    )
+    sources_of_heat(
+        dt, state.energy, T, w.heating, w.inelastic, w.inelastic_slope, w.wall, w.wall_slope,
+        w.diagonal, w.known, w.before,
+    )  # fmt: skip
+    solve_from_both_ends(w.lower, w.diagonal, w.upper, w.known, T, w.c, w.d)
+    settle(
+        n, T, w.before, model.coldest_eV, w.inelastic_slope, w.wall_slope, state.energy,
+        w.inelastic, w.wall,
+    )  # fmt: skip
+
+
+@compiled(**LOOP)
+def integrals(g, E, inelastic, wall, dz, spread):
+    """Of the ions' work, the field and the two losses over the plasma, per channel area."""
+    work = drop = lost = to_wall = 0.0
+    for i in inside(g):
+        volume = dz[i] * spread[i]
+        work += volume * g[i] * E[i]
+        drop += dz[i] * E[i]
+        lost += volume * inelastic[i]
+        to_wall += volume * wall[i]
+    return work, drop, lost, to_wall
+
+
+@compiled(**LOOP)
+def drained(n, loss, dz, spread):
+    """Ions lost to the walls per channel area and time."""
+    total = 0.0
     for i in inside(n):
-        lower[i] = -dt * inverse_dz[i] * down[i - ONE]
-    for i in inside(n):
-        upper[i] = dt * inverse_dz[i] * up[i]
-    for i in inside(n):
-        diagonal[i] += 1.5 * n[i] + dt * inverse_dz[i] * (down[i] - up[i - ONE])
-    solve_from_both_ends(lower, diagonal, upper, known, T, c, d)
-    if model.coldest_eV > 0.0:
-        for i in inside(n):
-            T[i] = max(T[i], model.coldest_eV)
-    for i in inside(n):
-        energy[i] = 1.5 * n[i] * T[i]
-    for i in inside(n):
-        inelastic[i] += slope_in[i] * (T[i] - before[i])
-    for i in inside(n):
-        wall[i] += slope_wall[i] * (T[i] - before[i])
-    w[0, 0] = down[0] * T[0] + up[0] * T[1]
-    w[0, 1] = down[-2] * T[-2] + up[-2] * T[-1]
+        total += dz[i] * spread[i] * n[i] * loss[i]
+    return total
 
 
 @compiled(**FAST)
 def record_powers(state, model, total, w):
     """Record currents, thrust and power terms, as named in `SERIES_SUMS`."""
-    g, E, dz = state.flux_q, state.E, model.dz
-    inelastic, wall, instant = w[3], w[5], state.instant
-    n, last = state.n_e, g.size - 2
-    ions = drop = collisions_lost = to_walls = drained = thrust = 0.0
-    for i in inside(n):
-        ions += dz[i] * g[i] * E[i]
-    for i in inside(n):
-        drop += dz[i] * E[i]
-    for i in inside(n):
-        collisions_lost += dz[i] * inelastic[i]
-    for i in inside(n):
-        to_walls += dz[i] * wall[i]
+    instant, dz, spread, T = state.instant, model.dz, model.spread, state.T_e_eV
+    work, drop, lost, to_wall = integrals(state.flux_q, state.E, w.inelastic, w.wall, dz, spread)
+    on_wall = thrust = 0.0
     for k in range(state.n_i.shape[0]):
-        z, n_k, flux, lost = k + 1.0, state.n_i[k], state.flux_i[k], state.wall_loss
-        for i in inside(n):
-            drained += z**1.5 * dz[i] * n_k[i] * lost[i]
-        thrust += flux[last] * flux[last] / n_k[last]
-    watts = E_CHARGE * model.area
-    instant[THRUST] = model.ion_mass * model.area * thrust
-    instant[WALL_CURRENT] = watts * drained
+        z, n, flux = k + 1.0, state.n_i[k], state.flux_i[k]
+        on_wall += z**1.5 * drained(n, state.wall_loss, dz, spread)
+        thrust += flux[-2] * flux[-2] / n[-2]
+    watts, end = E_CHARGE * model.area, model.spread_at[-1]
+    instant[THRUST] = model.ion_mass * model.area * end * thrust
+    instant[WALL_CURRENT] = watts * on_wall
     instant[POWER] = instant[CURRENT] * drop
-    instant[P_IONS] = watts * ions
-    instant[P_INELASTIC] = watts * collisions_lost
-    instant[P_WALL] = watts * to_walls
-    instant[P_ANODE] = -watts * w[0, 0]
-    instant[P_CATHODE] = watts * w[0, 1]
+    instant[P_IONS] = watts * work
+    instant[P_INELASTIC] = watts * lost
+    instant[P_WALL] = watts * to_wall
+    instant[P_ANODE] = -watts * (w.down[0] * T[0] + w.up[0] * T[1])
+    instant[P_CATHODE] = watts * end * (w.down[-2] * T[-2] + w.up[-2] * T[-1])
 
 
 @compiled(**ENTRY)
-def electron_step(state, model, dt, rows, w):
+def electron_step(state, model, dt, w):
     """Collisions, discharge current, field and new temperature; returns False if the run breaks."""
     T = state.T_e_eV
     state.clock[0] += dt
     sum_charges(state)
-    follow_log(state)
+    follow_log(state.n_e, state.log_n[0], state.log_n[1])
     fill_ghosts(state.n_n)
     # The ends of the domain, half a cell outside the last centres, are held at their temperature.
     T[0] = max(2.0 * model.anode_T_e_eV - T[1], COLDEST_EV)
     if model.sheath:  # electrons from the anode have its temperature; otherwise T[1] is taken
         T[0] = T[1] if state.instant[CURRENT] > 0.0 else model.anode_T_e_eV
     T[-1] = max(2.0 * model.cathode_T_e_eV - T[-2], COLDEST_EV)
-    if not collisions(state, model, rows, w):
+    if not collisions(state, model, w):
         return False
     drop = sheath_drop(state, model)
     total = ohm(state, model, dt, drop, w)

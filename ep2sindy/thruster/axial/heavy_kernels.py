@@ -14,11 +14,11 @@ from ep2sindy.thruster.axial.state_kernels import (
     FAST,
     IONIZATION,
     IONS_OUT,
+    LOOP,
     NEUTRALS_OUT,
     ONE,
     PER_CHARGE,
     WALL_LOSS,
-    faces,
     inside,
 )
 from ep2sindy.thruster.constants import E_CHARGE
@@ -26,89 +26,98 @@ from ep2sindy.thruster.constants import E_CHARGE
 TINY = 1e-60  # avoids 0/0
 
 
-@compiled(**FAST)
-def half_slopes(values, model, s):
+@compiled(**LOOP)
+def half_slopes(values, to_left, to_right, weight, s):
     """Half of van Leer's slope in every cell: a*b/(a + b) of the differences to both sides.
 
     The slope is 0 at an extremum, and in the two outermost cells.
     """
-    to_left, to_right = model.to_left, model.to_right
     for i in inside(values):
         a = (values[i] - values[i - ONE]) * to_left[i]
         b = (values[i + ONE] - values[i]) * to_right[i]
-        s[i] = max(a * b, 0.0) * (a + b) / ((a + b) ** 2 + TINY)  # a branch would not vectorise
+        limited = max(a * b, 0.0) * (a + b) / ((a + b) ** 2 + TINY)  # a branch is not vectorised
+        s[i] = weight * limited
     s[1] = s[-2] = 0.0
-    if not model.reconstruct:
-        s[:] = 0.0
 
 
-@compiled(**FAST)
-def ion_fluxes(n, g, c2, bohm, model, w, f_n, f_g):
-    """Rusanov fluxes of ion density and ion flux through faces 0 .. cells; w: 3 rows of work.
-
-    Anode: the ghost state leaves at the Bohm speed or faster. Cathode plane: ions leave freely.
-    """
-    cells, c = n.size - 2, np.sqrt(c2)
-    u, s_n, s_u = w[0], w[1], w[2]
+@compiled(**LOOP)
+def ratios(g, n, u):
     for i in inside(n):
         u[i] = g[i] / n[i]
-    half_slopes(n, model, s_n)
-    half_slopes(u, model, s_u)
-    n_l, u_l = n[1], min(u[1], -bohm)
-    for i in faces(n):
+
+
+@compiled(inline="always")
+def rusanov(n_l, u_l, n_r, u_r, c2, c):
+    """Rusanov fluxes of ion density and ion flux between two states."""
+    g_l, g_r = n_l * u_l, n_r * u_r
+    s = max(abs(u_l), abs(u_r)) + c
+    through = 0.5 * (g_l + g_r - s * (n_r - n_l))
+    return through, 0.5 * (g_l * u_l + g_r * u_r + c2 * (n_l + n_r) - s * (g_r - g_l))
+
+
+@compiled(**LOOP)
+def fluxes_between(n, u, s_n, s_u, c2, flux, momentum_flux):
+    """Fluxes of ions through all faces between two cells."""
+    c = np.sqrt(c2)
+    for i in range(ONE, np.uint64(n.size) - ONE - ONE):
         j = i + ONE
-        n_r, u_r = n[j] - s_n[j], u[j] - s_u[j]
-        g_l, g_r = n_l * u_l, n_r * u_r
-        s = max(abs(u_l), abs(u_r)) + c
-        f_n[i] = 0.5 * (g_l + g_r - s * (n_r - n_l))
-        f_g[i] = 0.5 * (g_l * u_l + g_r * u_r + c2 * (n_l + n_r) - s * (g_r - g_l))
-        n_l, u_l = n[j] + s_n[j], u[j] + s_u[j]
-    f_n[cells] = g[cells]
-    f_g[cells] = g[cells] * u[cells] + c2 * n[cells]
+        flux[i], momentum_flux[i] = rusanov(
+            n[i] + s_n[i], u[i] + s_u[i], n[j] - s_n[j], u[j] - s_u[j], c2, c
+        )
 
 
 @compiled(**FAST)
-def births(n, g, nn, state, model, gain, momentum, consumed):
-    """Gains of ions of every charge in density and momentum over mass, and the neutrals consumed.
+def fluxes_at_ends(n, g, u, c2, bohm, flux, momentum_flux):
+    """Fluxes of ions at the anode, at the Bohm speed or faster, and freely at the cathode plane."""
+    flux[0], momentum_flux[0] = rusanov(n[1], min(u[1], -bohm), n[1], u[1], c2, np.sqrt(c2))
+    flux[-2] = g[-2]
+    momentum_flux[-2] = g[-2] * u[-2] + c2 * n[-2]
 
-    Ions from neutrals start with the neutrals' speed or at rest; ions from ions keep their speed.
-    """
-    charges, size = n.shape
-    single, double, second = state.rates[0], state.rates[1], state.rates[2]
-    first, speed, gain_1, momentum_1 = n[0], model.birth_speed, gain[0], momentum[0]
-    if charges == 1:
-        for i in range(size):
-            born = single[i] * first[i] * nn[i]
-            consumed[i] = born
-            gain_1[i] = born
-            momentum_1[i] = born * speed
-        return
-    for i in range(size):
-        n_e = first[i] + 2.0 * n[1, i]
-        once, twice = single[i] * n_e * nn[i], double[i] * n_e * nn[i]
-        again = second[i] * n_e * first[i]
-        u = g[0, i] / first[i]
-        gain_1[i] = once - again
-        gain[1, i] = twice + again
-        momentum_1[i] = once * speed - again * u
-        momentum[1, i] = twice * speed + again * u
-        consumed[i] = once + twice
+
+@compiled(**LOOP)
+def birth(rate, n_e, source, speed, consumed, gain, push, first):
+    """Ions from neutrals, with the neutrals' speed or at rest; if first, forget what was there."""
+    keep = 0.0 if first else 1.0
+    for i in inside(source):
+        born = rate[i] * n_e[i] * source[i]
+        consumed[i] = keep * consumed[i] + born
+        gain[i] += born
+        push[i] += born * speed[i]
+
+
+@compiled(**LOOP)
+def further_birth(rate, n_e, source, g, loss, drag, gain, push):
+    """Ions from ions of a lower charge, which lose them; they keep their speed."""
+    for i in inside(source):
+        born, taken = rate[i] * n_e[i] * source[i], rate[i] * n_e[i] * g[i]
+        loss[i] -= born
+        drag[i] -= taken
+        gain[i] += born
+        push[i] += taken
 
 
 @compiled(**FAST)
-def neutral_fluxes(nn, model, at_anode, slopes, f_nn):
-    """Upwind fluxes of neutrals; ions that reached the anode return as neutrals.
-
-    With `neutral_wave` they are Rusanov fluxes at that much more than the neutrals' speed.
-    """
-    half_slopes(nn, model, slopes)
-    f_nn[0] = model.neutral_inflow - at_anode
+def births(n, g, nn, state, model, w):
+    """Gains of ions of every charge, of their flux, and the neutrals consumed."""
+    n_e, charges = w.n_e, n.shape[0]
     for i in inside(nn):
-        f_nn[i] = model.neutral_speed * (nn[i] + slopes[i])
-    if model.neutral_wave > 0.0:
-        for i in range(1, nn.size - 2):
-            jump = nn[i + 1] - slopes[i + 1] - nn[i] - slopes[i]
-            f_nn[i] -= 0.5 * model.neutral_wave * jump
+        n_e[i] = n[0, i]
+    for k in range(1, charges):
+        for i in inside(nn):
+            n_e[i] += (k + 1.0) * n[k, i]
+    w.gain[:] = 0.0
+    w.push[:] = 0.0
+    rates, speed = state.rates, model.birth_speed
+    birth(rates[0], n_e, nn, speed, w.consumed, w.gain[0], w.push[0], True)
+    for t in range(model.further.shape[0]):
+        below, above = model.further[t, 0] - 1, model.further[t, 1] - 1
+        gain, push = w.gain[above], w.push[above]
+        if below < 0:
+            birth(rates[t + 1], n_e, nn, speed, w.consumed, gain, push, False)
+        else:
+            further_birth(
+                rates[t + 1], n_e, n[below], g[below], w.gain[below], w.push[below], gain, push
+            )
 
 
 @compiled(**FAST)
@@ -125,83 +134,102 @@ def leaving_speed(charge, state, model):
     return bohm / np.sqrt(1.0 + chi)
 
 
-@compiled(**FAST)
-def ion_rates(k, n, g, state, model, sums, weight, w, d_n, d_g):
-    """Time derivatives of density and flux of ions of charge k + 1; returns their anode flux.
-
-    The rate of ions neutralised at the walls is added to w[4].
-    """
-    f_n, f_g, neutralised, gain, momentum = w[0], w[1], w[4], w[6 + k], w[8 + k]
-    z, through, walled = k + 1.0, sums.cells[FACE_I + PER_CHARGE * k], sums.cells[WALL_LOSS]
-    charge, to_wall = z * E_CHARGE / model.ion_mass, np.sqrt(z)
-    bohm = leaving_speed(charge, state, model)
-    ion_fluxes(n, g, model.sound_speed_squared, bohm, model, w[10:13], f_n, f_g)
+@compiled(**LOOP)
+def follow_ions(
+    new, new_g, n, g, flux, momentum_flux, gain, push, E, loss, per_before, per_behind,
+    neutralised, walled, through, keep, dt, weight, charge, to_wall, c2,
+):  # fmt: skip
+    """new = keep new + (1 - keep) (n + dt dn/dt), and the same of the ion flux; sums beside it."""
+    take = 1.0 - keep
     for i in inside(n):
-        lost, per_dz = to_wall * state.wall_loss[i], model.inverse_dz[i]
-        push = momentum[i] + charge * n[i] * state.E[i]
-        d_n[i] = (f_n[i - ONE] - f_n[i]) * per_dz + gain[i] - lost * n[i]
-        d_g[i] = (f_g[i - ONE] - f_g[i]) * per_dz + push - lost * g[i]
-        neutralised[i] += lost * n[i]
-        walled[i] += weight * lost * n[i]
-        through[i] += weight * f_n[i - ONE]
-    sums.series[BEAM] += weight * z * f_n[n.size - 2]
-    sums.series[IONS_OUT] += weight * f_n[n.size - 2]
-    return f_n[0]
+        lost, before, behind = to_wall * loss[i], per_before[i], per_behind[i]
+        gone, inflow = lost * n[i], flux[i - ONE]
+        d_n = inflow * before - flux[i] * behind + gain[i] - gone
+        widening = c2 * n[i] * (behind - before)  # pressure on the sides of a cell that widens
+        d_g = momentum_flux[i - ONE] * before - momentum_flux[i] * behind + widening
+        d_g += push[i] + charge * n[i] * E[i] - lost * g[i]
+        neutralised[i] += gone
+        walled[i] += weight * gone
+        through[i] += weight * inflow
+        new[i] = keep * new[i] + take * (n[i] + dt * d_n)
+        new_g[i] = keep * new_g[i] + take * (g[i] + dt * d_g)
+
+
+@compiled(**LOOP)
+def neutral_fluxes(nn, slopes, speed, wave, flux):
+    """Upwind fluxes of neutrals behind every cell; with `wave`, Rusanov's at that much more."""
+    for i in inside(nn):
+        flux[i] = speed[i] * (nn[i] + slopes[i])
+    if wave > 0.0:
+        for i in range(1, nn.size - 2):
+            flux[i] -= 0.5 * wave * (nn[i + 1] - slopes[i + 1] - nn[i] - slopes[i])
+
+
+@compiled(**LOOP)
+def follow_neutrals(
+    new, nn, flux, consumed, neutralised, per_before, per_behind, ionized, through, keep, dt, weight
+):
+    """As `follow_ions`, of the neutrals."""
+    take = 1.0 - keep
+    for i in inside(nn):
+        inflow = flux[i - ONE]
+        d_nn = inflow * per_before[i] - flux[i] * per_behind[i] + neutralised[i] - consumed[i]
+        ionized[i] += weight * consumed[i]
+        through[i] += weight * inflow
+        new[i] = keep * new[i] + take * (nn[i] + dt * d_nn)
 
 
 @compiled(**FAST)
-def heavy_rates(n, g, nn, state, model, sums, weight, w, d_n, d_g, d_nn):
-    """Time derivatives of all heavy species; adds weight times fluxes and sources to the sums."""
-    f_nn, consumed, neutralised = w[2], w[3], w[4]
-    ionized, through = sums.cells[IONIZATION], sums.cells[FACE_N]
-    births(n, g, nn, state, model, w[6:8], w[8:10], consumed)
-    for i in inside(nn):
-        neutralised[i] = 0.0
+def stage_of_ions(k, new, new_g, n, g, keep, dt, state, model, sums, w):
+    """One stage of Heun's step for ions of charge k + 1; returns their flux into the anode."""
+    flux, c2, z = w.flux, model.sound_speed_squared, k + 1.0
+    charge, weight = z * E_CHARGE / model.ion_mass, 0.5 * dt
+    to_left, to_right, limit = model.to_left, model.to_right, model.slope_weight
+    ratios(g, n, w.u)
+    half_slopes(n, to_left, to_right, limit, w.slope_n)
+    half_slopes(w.u, to_left, to_right, limit, w.slope_u)
+    fluxes_between(n, w.u, w.slope_n, w.slope_u, c2, flux, w.momentum_flux)
+    fluxes_at_ends(n, g, w.u, c2, leaving_speed(charge, state, model), flux, w.momentum_flux)
+    cells = sums.cells
+    follow_ions(
+        new, new_g, n, g, flux, w.momentum_flux, w.gain[k], w.push[k], state.E, state.wall_loss,
+        model.per_before, model.per_behind, w.neutralised, cells[WALL_LOSS],
+        cells[FACE_I + PER_CHARGE * k], keep, dt, weight, charge, np.sqrt(z), c2,
+    )  # fmt: skip
+    leaving = flux[-2] * model.spread_at[-1]
+    sums.series[BEAM] += weight * z * leaving
+    sums.series[IONS_OUT] += weight * leaving
+    return flux[0]
+
+
+@compiled(**FAST)
+def stage(new, new_g, new_nn, n, g, nn, keep, dt, state, model, sums, w):
+    """One stage of Heun's step; adds half of dt times fluxes and sources to the sums."""
+    flux, weight = w.flux, 0.5 * dt
+    births(n, g, nn, state, model, w)
+    w.neutralised[:] = 0.0
     at_anode = 0.0
     for k in range(n.shape[0]):
-        at_anode += ion_rates(k, n[k], g[k], state, model, sums, weight, w, d_n[k], d_g[k])
-    neutral_fluxes(nn, model, at_anode, w[5], f_nn)
-    for i in inside(nn):
-        exchange = neutralised[i] - consumed[i]
-        d_nn[i] = (f_nn[i - ONE] - f_nn[i]) * model.inverse_dz[i] + exchange
-        ionized[i] += weight * consumed[i]
-        through[i] += weight * f_nn[i - ONE]
-    sums.series[NEUTRALS_OUT] += weight * f_nn[nn.size - 2]
+        at_anode += stage_of_ions(k, new[k], new_g[k], n[k], g[k], keep, dt, state, model, sums, w)
+    half_slopes(nn, model.to_left, model.to_right, model.slope_weight, w.slope_nn)
+    neutral_fluxes(nn, w.slope_nn, model.neutral_speed, model.neutral_wave, flux)
+    flux[0] = model.neutral_inflow - at_anode
+    follow_neutrals(
+        new_nn, nn, flux, w.consumed, w.neutralised, model.per_before, model.per_behind,
+        sums.cells[IONIZATION], sums.cells[FACE_N], keep, dt, weight,
+    )  # fmt: skip
+    sums.series[NEUTRALS_OUT] += weight * flux[-2] * model.spread_at[-1]
 
 
 @compiled(**ENTRY)
 def heavy_step(state, model, dt, sums, w):
     """One SSP-RK2 (Heun) step of ions and neutrals in a frozen field.
 
-    w: (26, n + 2). The entries of `sums` match the changes of this step to rounding.
+    The entries of `sums` match the changes of this step to rounding.
     """
     n, g, nn = state.n_i, state.flux_i, state.n_n
-    n_1, g_1, nn_1 = w[16:18], w[18:20], w[20]
-    d_n, d_g, d_nn = w[21:23], w[23:25], w[25]
-    heavy_rates(n, g, nn, state, model, sums, 0.5 * dt, w, d_n, d_g, d_nn)
-    for k in range(n.shape[0]):
-        euler_step(n[k], d_n[k], dt, n_1[k])
-        euler_step(g[k], d_g[k], dt, g_1[k])
-    euler_step(nn, d_nn, dt, nn_1)
-    heavy_rates(
-        n_1[: n.shape[0]], g_1[: n.shape[0]], nn_1, state, model, sums, 0.5 * dt, w, d_n, d_g, d_nn
-    )
-    for k in range(n.shape[0]):
-        heun_step(n[k], n_1[k], d_n[k], dt)
-        heun_step(g[k], g_1[k], d_g[k], dt)
-    heun_step(nn, nn_1, d_nn, dt)
-
-
-@compiled(**FAST)
-def euler_step(values, d, dt, following):
-    for i in inside(values):
-        following[i] = values[i] + dt * d[i]
-
-
-@compiled(**FAST)
-def heun_step(values, following, d, dt):
-    for i in inside(values):
-        values[i] = 0.5 * (values[i] + following[i] + dt * d[i])
+    stage(w.stage_n, w.stage_flux, w.stage_nn, n, g, nn, 0.0, dt, state, model, sums, w)
+    stage(n, g, nn, w.stage_n, w.stage_flux, w.stage_nn, 0.5, dt, state, model, sums, w)
 
 
 @compiled(**FAST)

@@ -13,6 +13,7 @@ from ep2sindy.thruster.axial.state_kernels import (
     ENTRY,
     FAST,
     FLUX_I,
+    LOOP,
     N_I,
     N_N,
     PER_CHARGE,
@@ -20,7 +21,6 @@ from ep2sindy.thruster.axial.state_kernels import (
     SHORTEST_STEP,
     T_E,
     U_IZ,
-    Sums,
     inside,
 )
 
@@ -46,22 +46,33 @@ def time_step(state, model, left):
     return left / np.ceil(left * top / model.cfl)
 
 
+@compiled(**LOOP)
+def add_fields(sum_n, sum_T, sum_rate, sum_E, sum_energy, n, T, rate, E, energy, weight):
+    for i in range(n.size):
+        sum_n[i] += weight * n[i]
+        sum_T[i] += weight * T[i]
+        sum_rate[i] += weight * rate[i]
+        sum_E[i] += weight * E[i]
+        sum_energy[i] += weight * energy[i]
+
+
+@compiled(**LOOP)
+def add_ions(sum_n, sum_u, sum_g, n, g, weight):
+    for i in range(n.size):
+        sum_n[i] += weight * n[i]
+        sum_u[i] += weight * (g[i] / n[i])
+        sum_g[i] += weight * g[i]
+
+
 @compiled(**FAST)
-def add_instant(sums, state, weight, work):
+def add_instant(sums, state, weight, w):
     """Add weight times the present fields to the sums, except those that the heavy step adds."""
-    cells = sums.cells
-    add_scaled(cells[N_N], state.n_n, weight)
-    add_scaled(cells[T_E], state.T_e_eV, weight)
-    add_scaled(cells[R_ION], state.rates[0], weight)
-    add_scaled(cells[E_Z], state.E, weight)
-    add_scaled(cells[ENERGY], state.energy, weight)
+    cells, E, energy = sums.cells, state.E, state.energy
+    add_fields(cells[N_N], cells[T_E], cells[R_ION], cells[E_Z], cells[ENERGY], state.n_n,
+               state.T_e_eV, state.rates[0], E, energy, weight)  # fmt: skip
     for k in range(state.n_i.shape[0]):
-        n, g, u = state.n_i[k], state.flux_i[k], work[0]
-        for i in range(u.size):
-            u[i] = g[i] / n[i]
-        add_scaled(cells[N_I + PER_CHARGE * k], n, weight)
-        add_scaled(cells[U_IZ + PER_CHARGE * k], u, weight)
-        add_scaled(cells[FLUX_I + PER_CHARGE * k], g, weight)
+        n, u, g = N_I + PER_CHARGE * k, U_IZ + PER_CHARGE * k, FLUX_I + PER_CHARGE * k
+        add_ions(cells[n], cells[u], cells[g], state.n_i[k], state.flux_i[k], weight)
     add_scaled(sums.series, state.instant, weight)
 
 
@@ -74,15 +85,13 @@ def add_changes(sums, state, sign):
 
 
 @compiled(**ENTRY)
-def advance(state, model, sample_s, averaged, fields, series):
+def advance(state, model, sums, w, sample_s, averaged, fields, series):
     """Fill the rows of fields (cell sums, rows, cells) and series (rows, series); return how many.
 
     Rows hold averages over each sample, or the values at its end. If the run breaks, earlier rows
     remain.
     """
     size = state.n_n.size
-    work, rows = np.zeros((26, size)), np.zeros(size, np.uint64)
-    sums = Sums(np.zeros((fields.shape[0], size)), np.zeros(series.shape[1]))
     for row in range(series.shape[0]):
         start_density(state)
         sums.cells[:] = 0.0
@@ -97,10 +106,10 @@ def advance(state, model, sample_s, averaged, fields, series):
                 weight = dt
             if not dt > SHORTEST_STEP * sample_s:
                 return row
-            heavy_step(state, model, dt, sums, work)
-            if not electron_step(state, model, dt, rows, work):
+            heavy_step(state, model, dt, sums, w)
+            if not electron_step(state, model, dt, w):
                 return row
-            add_instant(sums, state, dt, work)
+            add_instant(sums, state, dt, w)
             left -= dt
         add_changes(sums, state, 1.0)
         for i in range(size):

@@ -68,13 +68,15 @@ def build_model(
     table = closure_table(thruster)
     return AxialModel(
         **_lengths(faces),
-        reconstruct=reconstruct,
+        slope_weight=1.0 if reconstruct else 0.0,
         area=thruster.area,
         ion_mass=mass,
         sound_speed_squared=K_BOLTZMANN * thruster.ion_temperature / mass,
-        neutral_speed=point.neutral_speed,
+        neutral_speed=np.full(faces.size, point.neutral_speed),
         neutral_wave=0.0,
-        birth_speed=0.0 if thruster.ions_born_at_rest else point.neutral_speed,
+        birth_speed=np.full(
+            distance.size, 0.0 if thruster.ions_born_at_rest else point.neutral_speed
+        ),
         neutral_inflow=1e-6 * point.mass_flow_mg_s / (mass * thruster.area),
         **_circuit(thruster, point, end_s),
         pressure_factor=thruster.pressure_factor,
@@ -95,7 +97,7 @@ def build_model(
         wall_power_weight=wall.power_weight(distance),
         table=table,
         table_step_eV=TABLE_STEP_EV,
-        second_thresholds_eV=_second_thresholds(thruster),
+        **_further(thruster),
     )
 
 
@@ -125,7 +127,12 @@ def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Any]:
     return {
         "dz": dz,
         "inverse_dz": 1.0 / dz,
-        "between": between,
+        "spread": np.ones(dz.size),
+        "spread_at": np.ones(dz.size - 1),
+        "per_before": 1.0 / dz,
+        "per_behind": 1.0 / dz,
+        "per_between": 1.0 / between,
+        "per_span": np.pad(1.0 / (between[1:] + between[:-1]), 1, mode="edge"),
         "to_left": np.append(1.0, dz[1:] / between),
         "to_right": np.append(dz[:-1] / between, 1.0),
     }
@@ -141,10 +148,10 @@ def lengths_and_centres(
     return dz, 0.5 * (np.array(ends[1:]) + np.array(ends[:-1]))
 
 
-def _second_thresholds(thruster: Thruster) -> tuple[float, float]:
+def _further(thruster: Thruster) -> dict[str, Any]:
     if thruster.charge_states == 1:
-        return 0.0, 0.0
+        return {"further": np.zeros((0, 2), np.int64), "further_eV": np.zeros(0)}
     propellant = thruster.propellant
     assert isinstance(propellant, PropellantTable)  # the thruster checks this
     energies = propellant.double_ionization_eV, propellant.second_ionization_eV
-    return energies[0] or 0.0, energies[1] or 0.0
+    return {"further": np.array([(0, 2), (1, 2)]), "further_eV": np.array(energies)}

@@ -39,6 +39,8 @@ from ep2sindy.thruster.axial.state_kernels import (
     VOLTAGE,
     AxialModel,
     AxialState,
+    new_sums,
+    new_work,
 )
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
@@ -188,8 +190,7 @@ def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Ad
 def first_fields(state: AxialState, model: AxialModel) -> bool:
     """Field, rates and current from the profiles, for the first step; False if that breaks."""
     start_density(state)
-    rows, work = np.zeros(state.n_n.size, np.uint64), np.zeros((26, state.n_n.size))
-    return electron_step(state, model, 0.0, rows, work)
+    return electron_step(state, model, 0.0, new_work(*state.n_i.shape))
 
 
 def _march(
@@ -197,9 +198,11 @@ def _march(
 ) -> March:
     """A function that records samples of a run into a slice of rows of these arrays."""
 
+    sums, work = new_sums(len(fields), state.n_n.size), new_work(*state.n_i.shape)
+
     def march(rows: slice) -> int:
-        sample_s, averaged = settings.sample_s, settings.averaged
-        return kernels.advance(state, model, sample_s, averaged, fields[:, rows], series[rows])
+        recorded = settings.sample_s, settings.averaged, fields[:, rows], series[rows]
+        return kernels.advance(state, model, sums, work, *recorded)
 
     return march
 

@@ -86,7 +86,7 @@ class GuessedStart:
         place = z / channel_length  # 1 at the exit
         n_i = np.full(z.size, 5e17)
         u_i = -1000.0 + 8000.0 * place
-        n_n = model.neutral_inflow / model.neutral_speed * np.clip(1.0 - place, 0.05, 1.0)
+        n_n = _gas(model) * np.clip(1.0 - place, 0.05, 1.0)
         T_e = model.anode_T_e_eV + 10.0 * np.exp(-0.5 * ((place - 1.0) / 0.4) ** 2)
         return Beginning(_state(parameters, [n_i], [n_i * u_i], n_n, T_e))
 
@@ -111,7 +111,7 @@ class ColdStart:
 
     def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning:
         n_i, T_e = np.full(z.size, self.n_i), np.full(z.size, self.T_e_eV)
-        n_n = np.full(z.size, model.neutral_inflow / model.neutral_speed)
+        n_n = _gas(model)
         return Beginning(_state(parameters, [n_i], [self.u_i * n_i], n_n, T_e))
 
 
@@ -189,6 +189,12 @@ class Restart:
         return Beginning(state, whole=True)
 
 
+def _gas(model: AxialModel) -> Profile:
+    """Density of the neutrals without ionisation, in m^-3."""
+    at_faces = model.neutral_inflow / (model.neutral_speed * model.spread_at)
+    return np.pad(0.5 * (at_faces[1:] + at_faces[:-1]), 1, mode="edge")
+
+
 def _of(name: str, k: int) -> str:
     """Variable name by charge: `n_i` of the first charge, `n_i2` of the second."""
     return name if k == 0 else f"{name}{k + 1}"
@@ -219,11 +225,11 @@ def _state(
         n = np.concatenate([0.99 * n, 0.005 * n])
         g = np.concatenate([0.99 * g, 0.005 * np.sqrt(2.0) * g])
     n_e = n.T @ np.arange(1.0, charges + 1.0)
-    zeros = np.zeros((6, size))
+    zeros = np.zeros((3, size))
     return AxialState(
         n_i=n, flux_i=g, n_n=n_n.copy(), T_e_eV=T_e_eV.copy(), energy=1.5 * n_e * T_e_eV,
         drift_eV=zeros[0], n_e=n_e, flux_q=zeros[1], log_n=np.ones((2, size)), E=zeros[2],
-        rates=zeros[3:], wall_loss=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
+        rates=np.zeros((1 if charges == 1 else 3, size)), wall_loss=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
         clock=np.zeros(1), hottest_eV=np.zeros(1),
     )  # fmt: skip
 

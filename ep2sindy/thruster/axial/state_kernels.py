@@ -4,18 +4,23 @@ Cell arrays hold one ghost cell at each end: index 0 lies behind the anode, inde
 cathode plane; cells 1 .. n are the domain. Face i lies between cells i and i + 1. Species arrays
 have one row per charge state.
 
-The loops of these kernels are short and touch few arrays each, so that the compiler can vectorise
-them.
+A step at 100 cells costs a few microseconds, of which the start of every loop is a part: loops over
+cells therefore do as much as the compiler can vectorise. Functions that hold one are `LOOP`.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ep2sindy.runtime.compilation import compiled
+from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
 
-# Sums may be reordered, but infinities and NaNs must be preserved: they end a run.
-ENTRY: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp", "nsz"}}
+# Sums may be reordered, but infinities and NaNs must be preserved: they end a run. Nothing is
+# allocated in a kernel, so that references need not be counted, which costs as much as the loops.
+ENTRY: dict[str, Any] = {
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
+    "_nrt": False,
+}
 # For functions that only kernels call. Wrappers for Python would double the time to compile.
 # They are inlined, since a call costs as much as a loop over the cells.
 FAST: dict[str, Any] = {
@@ -24,6 +29,9 @@ FAST: dict[str, Any] = {
     "no_cfunc_wrapper": True,
     "forceinline": True,
 }
+# For functions whose array arguments are separate ones: the compiler need not look whether a value
+# written is read by the next. Never pass one array twice, nor a row beside the matrix that has it.
+LOOP: dict[str, Any] = {**FAST, **SEPARATE_ARRAYS}
 
 SHORTEST_STEP = 1e-5  # of a sample: a run that needs shorter steps has diverged
 
@@ -60,16 +68,21 @@ class AxialModel(NamedTuple):
 
     dz: np.ndarray  # (n + 2,), m: lengths of the cells
     inverse_dz: np.ndarray  # (n + 2,), 1/m
-    between: np.ndarray  # (n + 1,), m: distance of the centres beside each face
+    per_between: np.ndarray  # (n + 1,), 1/m: of the distance of the centres beside each face
+    per_span: np.ndarray  # (n + 2,), 1/m: of the distance of the centres beside each cell
     to_left: np.ndarray  # (n + 2,): length of a cell over the distance to its left neighbour
     to_right: np.ndarray  # (n + 2,)
-    reconstruct: bool  # van Leer's slopes, or none
-    area: float  # m^2
+    slope_weight: float  # 1: van Leer's slopes; 0: none
+    area: float  # m^2, of the channel
+    spread: np.ndarray  # (n + 2,), area of the plasma over that of the channel
+    spread_at: np.ndarray  # (n + 1,), the same at the faces
+    per_before: np.ndarray  # (n + 2,), 1/m: spread of the face before a cell over spread times dz
+    per_behind: np.ndarray  # (n + 2,), 1/m: of the face behind it
     ion_mass: float  # kg
     sound_speed_squared: float  # k_B T_i / m, m^2/s^2
-    neutral_speed: float  # m/s
+    neutral_speed: np.ndarray  # (n + 1,), m/s, at the faces
     neutral_wave: float  # m/s: wave speed beyond it in the neutrals' flux, 0 but in comparisons
-    birth_speed: float  # of ions born of neutrals, m/s
+    birth_speed: np.ndarray  # (n + 2,), of ions born of neutrals, m/s
     neutral_inflow: float  # 1/(m^2 s)
     supply: np.ndarray  # V_s - V_c in V, at equal steps from t = 0; one value if constant
     supply_rate: float  # 1/s, of these steps
@@ -94,7 +107,8 @@ class AxialModel(NamedTuple):
     wall_power_weight: np.ndarray
     table: np.ndarray  # (temperatures, columns), as `closure_table` fills it
     table_step_eV: float
-    second_thresholds_eV: tuple[float, float]  # of X -> X2+ and X+ -> X2+
+    further: np.ndarray  # (k, 2): charges before and after the ionisations beside X -> X+
+    further_eV: np.ndarray  # (k,), their energies
 
 
 class AxialState(NamedTuple):
@@ -110,7 +124,7 @@ class AxialState(NamedTuple):
     flux_q: np.ndarray  # (n + 2,), charge flux of all ions over e
     log_n: np.ndarray  # (2, n + 2): ln n_e and the n_e it was taken at
     E: np.ndarray  # (n + 2,), V/m
-    rates: np.ndarray  # (3, n + 2), m^3/s: X -> X+, X -> X2+, X+ -> X2+
+    rates: np.ndarray  # (1 + k, n + 2), m^3/s: X -> X+ and the model's further ionisations
     wall_loss: np.ndarray  # (n + 2,), 1/s, of singly charged ions
     instant: np.ndarray  # (series,), the series' present values
     clock: np.ndarray  # (1,), s since the record began
@@ -122,3 +136,55 @@ class Sums(NamedTuple):
 
     cells: np.ndarray  # (cell sums, n + 2)
     series: np.ndarray  # (series,)
+
+
+def new_sums(n_cell_sums: int, size: int) -> Sums:
+    """Zeros for cells, with ghosts, of this number."""
+    return Sums(np.zeros((n_cell_sums, size)), np.zeros(len(SERIES_SUMS)))
+
+
+class Work(NamedTuple):
+    """Arrays of the loop that no step needs from the one before."""
+
+    u: np.ndarray  # (n + 2,), as all that follow but where said
+    slope_n: np.ndarray  # half slopes: of ions, of their speed, of neutrals
+    slope_u: np.ndarray
+    slope_nn: np.ndarray
+    flux: np.ndarray  # through the face behind each cell
+    momentum_flux: np.ndarray
+    gain: np.ndarray  # (charges, n + 2): of ions by ionisation, and of their flux
+    push: np.ndarray  # (charges, n + 2)
+    consumed: np.ndarray  # neutrals
+    neutralised: np.ndarray  # ions at the walls
+    n_e: np.ndarray
+    stage_n: np.ndarray  # (charges, n + 2): of Heun's first stage
+    stage_flux: np.ndarray  # (charges, n + 2)
+    stage_nn: np.ndarray
+    mobility: np.ndarray  # m^2/(V s)
+    per_mobility: np.ndarray
+    per_nu: np.ndarray  # s
+    coulomb: np.ndarray  # 1/s, electron-ion collisions
+    heating: np.ndarray  # eV/(m^3 s), and the losses, with their slopes in T_e
+    inelastic: np.ndarray
+    inelastic_slope: np.ndarray
+    wall: np.ndarray
+    wall_slope: np.ndarray
+    gradient: np.ndarray  # of the pressure
+    kappa: np.ndarray  # of conduction, in the cells
+    down: np.ndarray  # heat through the face behind each cell: down T + up T of the next
+    up: np.ndarray
+    lower: np.ndarray  # equations of the heat
+    diagonal: np.ndarray
+    upper: np.ndarray
+    known: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    before: np.ndarray  # T_e before the step
+
+
+def new_work(charges: int, size: int) -> Work:
+    """Zeros for cells, with ghosts, of this number."""
+    per_charge = ("gain", "push", "stage_n", "stage_flux")
+    return Work(
+        **{k: np.zeros((charges, size) if k in per_charge else size) for k in Work._fields}
+    )
