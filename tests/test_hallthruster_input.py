@@ -158,10 +158,17 @@ def test_walls_conduction_and_anode_follow_the_file(folder: Path) -> None:
     assert np.all(made.propellant.coulomb(np.ones(3)) == 0.0)
 
 
+@pytest.mark.parametrize("corrected", [True, False])
+def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> None:
+    content = changed(solve_plume=True, apply_thrust_divergence_correction=corrected)
+    expected = ep.thruster.ThermalPlume(axial_thrust=corrected)
+    assert read(folder, content).thruster.plume == expected
+    assert read(folder, changed(apply_thrust_divergence_correction=True)).thruster.plume is None
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"solve_plume": True}, r"config\.solve_plume is not supported here but at False: True"),
         ({"background_pressure_Torr": 1e-5}, r"config\.background_pressure_Torr is not supported"),
         ({"LANDMARK": True}, r"config\.LANDMARK is not supported here but at False"),
         ({"domian": [0, 1]}, r"config has keys that are not supported: \['domian'\]"),

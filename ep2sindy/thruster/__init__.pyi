@@ -26,6 +26,8 @@ from ep2sindy.thruster.magnetic_field import MagneticFieldTable as MagneticField
 from ep2sindy.thruster.magnetic_field import (
     read_magnetic_field as read_magnetic_field,
 )  # for configs
+from ep2sindy.thruster.plume import ConicalPlume as ConicalPlume  # for configs
+from ep2sindy.thruster.plume import ThermalPlume as ThermalPlume  # for configs
 from ep2sindy.thruster.transport import AnomalousTransport as AnomalousTransport  # for configs
 from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport  # for configs
 from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport  # for configs

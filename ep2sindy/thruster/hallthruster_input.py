@@ -21,6 +21,7 @@ from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.magnetic_field import MagneticFieldTable, read_magnetic_field
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.plume import ThermalPlume
 from ep2sindy.thruster.propellant_files import propellant
 from ep2sindy.thruster.propellants import PropellantTable
 from ep2sindy.thruster.transport import (
@@ -206,7 +207,6 @@ RATES_OF = {"xenon": "xenon_5eV", "krypton": "krypton", "argon": "argon"}
 # Keys that are supported at this value only; any other would change the simulation.
 CONFIG_AT_REST: dict[str, Any] = {
     "background_pressure_Torr": 0.0,
-    "solve_plume": False,
     "anom_smoothing_iters": 0,
     "LANDMARK": False,
     "ionization_model": "Lookup",
@@ -219,7 +219,6 @@ CONFIG_AT_REST: dict[str, Any] = {
 # Keys without effect here: they concern missing features, or the other code's output.
 CONFIG_IDLE = (
     "background_temperature_K", "neutral_ingestion_multiplier", "initial_condition",
-    "apply_thrust_divergence_correction",
 )  # fmt: skip
 SIMULATION_IDLE = (
     "dt", "adaptive", "CFL", "min_dt", "max_dt", "max_small_steps", "verbose", "print_errors",
@@ -263,7 +262,7 @@ def read_hallthruster_input(path: str | Path) -> HallThrusterInput:
     beside the JSON file, then in the current folder. The single loss_scale of a wall in
     HallThruster.jl sets both of ours. Its conductivity multiplies the gradient of 1.5 T_e, so that
     our factor is 1.5 times its own. Raises ValueError for an unknown key, and for one that asks for
-    physics that is missing here (background gas, plume expansion, three charges, mixtures, a
+    physics that is missing here (background gas, three charges, mixtures, a
     shielded wall, LANDMARK), naming it.
     """
     path = Path(path)
@@ -347,7 +346,13 @@ def _thruster(config: Node, gas: dict[str, Any], folder: Path) -> Thruster:
         series_resistance=0.0,
         conduction_factor=factor,
         conduction_coulomb=coulomb,
+        plume=_plume(config),
     )
+
+
+def _plume(config: Node) -> ThermalPlume | None:
+    corrected = bool(config.take("apply_thrust_divergence_correction", False))
+    return ThermalPlume(axial_thrust=corrected) if config.take("solve_plume", False) else None
 
 
 def _anode(config: Node, cathode_T_e_eV: float) -> FixedAnode | AnodeSheath:

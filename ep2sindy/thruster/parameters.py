@@ -16,6 +16,7 @@ from ep2sindy.thruster.checks import (
     check_rows,
 )
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
+from ep2sindy.thruster.plume import Plume, relative_area
 from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
 from ep2sindy.thruster.tables import number, numbers, read_cells
 from ep2sindy.thruster.transport import AnomalousTransport, Transport
@@ -145,7 +146,8 @@ class Thruster:
     Braginskii's values for singly charged ions. charge_states: highest charge of the ions, 1 or 2.
     cathode_potential: potential of the cathode plane relative to the cathode (coupling voltage).
     ions_born_at_rest: if True, ionisation adds no momentum to the ions, as in LANDMARK; otherwise
-    it adds the neutrals' momentum.
+    it adds the neutrals' momentum. plume: how the plasma spreads beyond the exit; None keeps
+    the channel's cross-section.
     """
 
     channel_length: float = 0.025  # m
@@ -167,6 +169,7 @@ class Thruster:
     conduction_factor: float = 4.66
     conduction_coulomb: float = 0.0
     ions_born_at_rest: bool = False
+    plume: Plume | None = None
 
     def __post_init__(self) -> None:
         check_positive(
@@ -224,6 +227,14 @@ class Thruster:
     def area(self) -> float:
         """Channel cross-section in m^2."""
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
+
+    def relative_area(
+        self, distance: Float[np.ndarray, " z"], tangents: Float[np.ndarray, " z"]
+    ) -> Float[np.ndarray, " z"]:
+        """Cross-section over the channel's at distances from the exit; see `relative_area`."""
+        return relative_area(
+            distance, tangents, inner_radius=self.inner_radius, outer_radius=self.outer_radius
+        )
 
 
 @dataclass(frozen=True)

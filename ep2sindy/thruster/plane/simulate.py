@@ -230,6 +230,7 @@ def check_thruster(thruster: Thruster, point: OperatingPoint) -> None:
     unsolved = {
         "an AnodeSheath": not isinstance(thruster.anode, FixedAnode),
         "a circuit": thruster.circuit is not None,
+        "a plume that spreads": thruster.plume is not None,
         "a supply whose voltage varies": point.supply is not None,
         "charge_states 2": thruster.charge_states > 1,
         "conduction_coulomb": thruster.conduction_coulomb > 0.0,
