@@ -143,7 +143,8 @@ class Thruster:
     """Geometry, field, closures and boundary values of one thruster; the default is SPT-100-like.
 
     kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e; 4.66 and 0 are
-    Braginskii's values for singly charged ions. charge_states: highest charge of the ions, 1 or 2.
+    Braginskii's values for singly charged ions. charge_states: highest charge of the ions,
+    1 to 3; None takes 2 where the gas has the rates, else 1.
     cathode_potential: potential of the cathode plane relative to the cathode (coupling voltage).
     ions_born_at_rest: if True, ionisation adds no momentum to the ions, as in LANDMARK; otherwise
     it adds the neutrals' momentum. plume: how the plasma spreads beyond the exit; None keeps
@@ -157,7 +158,7 @@ class Thruster:
     magnetic_field: Field = field(default_factory=MagneticField)
     transport: Transport = field(default_factory=AnomalousTransport)
     propellant: Propellant = field(default_factory=XenonFits)
-    charge_states: int = 1
+    charge_states: int | None = None
     wall: Wall = field(default_factory=SheathWall)
     ion_temperature: float = 1000.0  # K
     anode: Anode = field(default_factory=FixedAnode)
@@ -200,12 +201,15 @@ class Thruster:
         self._check_propellant()
 
     def _check_propellant(self) -> None:
-        if self.charge_states not in (1, 2):
-            raise ValueError(f"charge_states must be 1 or 2, got {self.charge_states!r}")
-        if self.charge_states > self.propellant.charge_states:
+        known = self.propellant.charge_states
+        if self.charge_states is None:
+            object.__setattr__(self, "charge_states", min(2, known))
+        if self.highest_charge not in (1, 2, 3):
+            raise ValueError(f"charge_states must be 1, 2 or 3, got {self.charge_states!r}")
+        if self.highest_charge > known:
             raise ValueError(
-                "charge_states 2 needs rates of the second charge, which the propellant "
-                f"{gas_name(self.propellant)} has not; take "
+                f"charge_states {self.charge_states} needs rates of every charge up to it, and the "
+                f"propellant {gas_name(self.propellant)} has them up to {known}; take "
                 "ep2sindy.thruster.propellant(name='xenon')"
             )
         if self.propellant.range_eV is None:
@@ -217,6 +221,12 @@ class Thruster:
                     f"the rates of {gas_name(self.propellant)} cover T_e from {low:g} to {high:g} "
                     f"eV, and it is {T_e_eV:g} eV at the {place}; extend the table"
                 )
+
+    @property
+    def highest_charge(self) -> int:
+        """Highest charge of the ions; `charge_states` with its default filled in."""
+        assert self.charge_states is not None
+        return self.charge_states
 
     @property
     def gap(self) -> float:

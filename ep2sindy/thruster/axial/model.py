@@ -142,9 +142,8 @@ def lengths_and_centres(
 
 
 def _second_thresholds(thruster: Thruster) -> tuple[float, float]:
-    if thruster.charge_states == 1:
+    if thruster.highest_charge == 1:
         return 0.0, 0.0
     propellant = thruster.propellant
     assert isinstance(propellant, PropellantTable)  # the thruster checks this
-    energies = propellant.double_ionization_eV, propellant.second_ionization_eV
-    return energies[0] or 0.0, energies[1] or 0.0
+    return propellant.further_energy(0, 2), propellant.further_energy(1, 2)

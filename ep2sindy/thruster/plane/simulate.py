@@ -232,7 +232,7 @@ def check_thruster(thruster: Thruster, point: OperatingPoint) -> None:
         "a circuit": thruster.circuit is not None,
         "a plume that spreads": thruster.plume is not None,
         "a supply whose voltage varies": point.supply is not None,
-        "charge_states 2": thruster.charge_states > 1,
+        f"charge_states {thruster.charge_states}": thruster.highest_charge > 1,
         "conduction_coulomb": thruster.conduction_coulomb > 0.0,
         "an anode and a cathode of different T_e_eV": (
             thruster.anode.T_e_eV != thruster.cathode_T_e_eV
