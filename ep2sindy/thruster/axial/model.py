@@ -63,6 +63,7 @@ def build_model(
     end_s: end of the record, to which the supply's voltage must be known.
     """
     distance = lengths_and_centres(faces)[1] - thruster.channel_length
+    neutral_speed = float(point.neutral_speed_at(distance)[0])
     omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
     mass, anode, wall = thruster.propellant.mass, thruster.anode, thruster.wall
     table = closure_table(thruster)
@@ -72,10 +73,10 @@ def build_model(
         area=thruster.area,
         ion_mass=mass,
         sound_speed_squared=K_BOLTZMANN * thruster.ion_temperature / mass,
-        neutral_speed=point.neutral_speed,
+        neutral_speed=neutral_speed,
         neutral_wave=0.0,
-        birth_speed=0.0 if thruster.ions_born_at_rest else point.neutral_speed,
-        neutral_inflow=1e-6 * point.mass_flow_mg_s / (mass * thruster.area),
+        birth_speed=0.0 if thruster.ions_born_at_rest else neutral_speed,
+        neutral_inflow=1e-6 * point.inflow_mg_s(thruster) / (mass * thruster.area),
         **_circuit(thruster, point, end_s),
         pressure_factor=thruster.pressure_factor,
         conduction_factor=thruster.conduction_factor,
@@ -89,7 +90,7 @@ def build_model(
         coldest_eV=coldest_eV,
         cfl=cfl,
         omega_ce=omega_ce,
-        anomalous=thruster.transport.at(distance) * omega_ce,
+        anomalous=thruster.transport_at(distance, point.background) * omega_ce,
         wall_ion_weight=wall.ion_weight(distance),
         wall_collision_weight=wall.collision_weight(distance),
         wall_power_weight=wall.power_weight(distance),
