@@ -158,11 +158,61 @@ def test_walls_conduction_and_anode_follow_the_file(folder: Path) -> None:
     assert np.all(made.propellant.coulomb(np.ones(3)) == 0.0)
 
 
+SHIFTED = {
+    "type": "LogisticPressureShift", "model": MODELS[3][0], "z0": -0.1, "dz": 0.2, "pstar": 4e-5,
+    "alpha": 15.0,
+}  # fmt: skip
+
+
+def test_a_pressure_shifts_the_transport_in_channel_lengths(folder: Path) -> None:
+    made = read(folder, changed(anom_model=SHIFTED, background_pressure_Torr=1e-5))
+    shifted = made.thruster.transport
+    assert shifted.transport == MODELS[3][1]
+    assert shifted.pressure_Pa == pytest.approx(4e-5 * 133.322, rel=1e-5)
+    pressure_Pa = made.operating_point.background.pressure_Pa
+    assert pressure_Pa == pytest.approx(1e-5 * 133.322, rel=1e-5)
+    assert shifted.shift(pressure_Pa) == pytest.approx(-0.1 + 0.2 / (1.0 + 14.0**-0.5))
+
+
+def test_ingestion_takes_the_number_in_Torr_for_one_in_Pa(folder: Path) -> None:
+    """As their stored runs: u_n n_n at the anode of ref_spt100_baseline leaves 1e18 1/(m^2 s)."""
+    gas = {"background_pressure_Torr": 1e-5, "background_temperature_K": 300.0}
+    made = read(folder, changed(**gas, neutral_ingestion_multiplier=6.0))
+    mass, thermal = made.thruster.propellant.mass, K_BOLTZMANN * 300.0
+    flux = 6.0 * 1e-5 / thermal * 0.25 * np.sqrt(8.0 * thermal / (np.pi * mass))
+    flow = made.operating_point.inflow_mg_s(made.thruster) - 5.0
+    assert flow == pytest.approx(1e6 * flux * mass * made.thruster.area)
+    still = read(folder, changed(neutral_ingestion_multiplier=6.0)).operating_point
+    assert still.background is None
+
+
+def test_three_charges_are_read(folder: Path) -> None:
+    flow = {"gas": "Xenon", "flow_rate_kg_s": 5e-6, "max_charge": 3}
+    assert read(folder, changed(propellants=[flow])).thruster.charge_states == 3
+
+
+def test_what_stands_beside_a_list_of_propellants_is_not_read(folder: Path) -> None:
+    """HallThruster.jl runs such files at 150 m/s: u of the neutrals in ref_spt100_baseline."""
+    beside = {"neutral_velocity": 278.0, "neutral_temperature_K": 300.0, "ion_temperature_K": 1.0}
+    assert read(folder, changed(**beside)) == read(folder, TUTORIAL)
+
+
+def test_the_coupling_voltage_has_two_names(folder: Path) -> None:
+    for name in ("cathode_coupling_voltage", "cathode_potential"):
+        assert read(folder, changed(**{name: 30.0})).thruster.cathode_potential == 30.0
+
+
+@pytest.mark.parametrize("corrected", [True, False])
+def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> None:
+    content = changed(solve_plume=True, apply_thrust_divergence_correction=corrected)
+    expected = ep.thruster.ThermalPlume(axial_thrust=corrected)
+    assert read(folder, content).thruster.plume == expected
+    assert read(folder, changed(apply_thrust_divergence_correction=True)).thruster.plume is None
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"solve_plume": True}, r"config\.solve_plume is not supported here but at False: True"),
-        ({"background_pressure_Torr": 1e-5}, r"config\.background_pressure_Torr is not supported"),
         ({"LANDMARK": True}, r"config\.LANDMARK is not supported here but at False"),
         ({"domian": [0, 1]}, r"config has keys that are not supported: \['domian'\]"),
         ({"domain": [0.01, 0.08]}, r"config\.domain must begin at the anode"),
@@ -170,8 +220,16 @@ def test_walls_conduction_and_anode_follow_the_file(folder: Path) -> None:
         ({"propellants": [{}, {}]}, r"a mixture of 2 is not supported"),
         ({"propellants": [{"gas": "Bismuth"}]}, r"propellants\[0\]\.gas must be one of .*Bismuth"),
         (
-            {"propellants": [{"flow_rate_kg_s": 5e-6, "max_charge": 3}]},
-            r"must ask for one or two charges: \[1, 2, 3\] is not supported",
+            {"propellants": [{"flow_rate_kg_s": 5e-6, "max_charge": 4}]},
+            r"must ask for the charges of xenon_5eV from 1 to at most 3: \[1, 2, 3, 4\] is not",
+        ),
+        (
+            {"propellants": [{"flow_rate_kg_s": 5e-6, "allowed_charges": [2]}]},
+            r"must ask for the charges of xenon_5eV from 1 to at most 3: \[2\] is not supported",
+        ),
+        (
+            {"propellants": [{"gas": "Argon", "flow_rate_kg_s": 5e-6, "max_charge": 2}]},
+            r"must ask for the charges of argon from 1 to at most 1: \[1, 2\] is not supported",
         ),
         (
             {"propellants": [{"flow_rate_kg_s": 5e-6, "velocity_m_s": {"xs": [], "ys": []}}]},
@@ -181,7 +239,15 @@ def test_walls_conduction_and_anode_follow_the_file(folder: Path) -> None:
             {"propellants": [{"flow_rate_kg_s": 5e-6, "excited_levels": [1]}]},
             r"config\.propellants\[0\] has keys that are not supported: \['excited_levels'\]",
         ),
-        ({"anom_model": {"type": "LogisticPressureShift"}}, r"anom_model\.type must be TwoZone"),
+        ({"anom_model": {"type": "NoAnom"}}, r"anom_model\.type must be TwoZone"),
+        (
+            {"anom_model": {"type": "LogisticPressureShift"}},
+            r"anom_model must have the key 'model'",
+        ),
+        (
+            {"anom_model": SHIFTED | {"model": {"type": "LogisticPressureShift"}}},
+            r"config\.anom_model\.model\.type must be TwoZoneBohm",
+        ),
         ({"wall_loss_model": {"type": "Glue"}}, r"wall_loss_model\.type must be WallSheath"),
         (
             {"wall_loss_model": {"type": "WallSheath", "material": "Gold"}},

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.thruster.closures import FURTHER, TABLE_STEP_EV, TRANSITIONS, closure_table
 from ep2sindy.thruster.constants import ATOMIC_MASS, E_CHARGE, M_ELECTRON
 from ep2sindy.thruster.propellants import (
+    FURTHER_IONIZATIONS,
     PropellantTable,
     TabulatedRates,
     XenonFits,
@@ -17,6 +19,7 @@ from ep2sindy.thruster.propellants import (
 )
 
 T = np.linspace(1.0, 100.0, 300)
+TRIPLE = ("triple_ionization", "ion_double_ionization")
 HEADER = "T_e_eV,ionization,excitation,momentum\n"
 ROWS = "1,0,0,1e-13\n10,4e-14,4e-14,6e-13\n"
 OWN = {"mass_u": 131.3, "ionization_eV": 12.1, "excitation_eV": 8.3}
@@ -48,13 +51,24 @@ def published_rows():
         ("krypton", "momentum", 12.0, 4.442043303835405e-13),
         ("krypton", "double_ionization", 95.0, 1.0712449550813328e-14),
         ("krypton", "second_ionization", 47.0, 4.817796571804203e-14),
+        ("xenon", "triple_ionization", 60.55, 2.158e-15),
+        ("xenon", "ion_double_ionization", 30.27, 1.567e-15),
+        ("xenon", "third_ionization", 100.9, 6.858e-14),
+        ("krypton", "triple_ionization", 59.0, 2.5007508934167187e-16),
+        ("krypton", "ion_double_ionization", 31.0, 3.66695060975228e-16),
+        ("krypton", "third_ionization", 149.0, 4.9823060837566686e-14),
     ]
 
 
 @pytest.mark.parametrize(("gas", "name", "mean_energy_eV", "expected"), published_rows())
 def test_tables_are_those_of_hallthruster(gas, name, mean_energy_eV, expected):
-    rate = getattr(ep.thruster.propellant(gas), name)(np.array(mean_energy_eV / 1.5))
-    assert rate == pytest.approx(expected, rel=2e-3)  # rows left out
+    made, T_e_eV = ep.thruster.propellant(gas), np.array(mean_energy_eV / 1.5)
+    pairs = {column: pair for pair, column in FURTHER_IONIZATIONS.items()}
+    if name in pairs:
+        rate = made.further_ionization(*pairs[name], T_e_eV)
+    else:
+        rate = getattr(made, name)(T_e_eV)
+    assert rate == pytest.approx(expected, rel=1e-2 if name in TRIPLE else 2e-3)  # rows left out
 
 
 def test_xenon_meets_the_stored_tutorial_of_hallthruster():
@@ -112,12 +126,23 @@ def test_two_descriptions_of_xenon_are_alike():
 
 def test_charge_states_follow_the_columns():
     states = [ep.thruster.propellant(gas).charge_states for gas in ("xenon", "krypton", "argon")]
-    assert states == [2, 2, 1]
+    assert states == [3, 3, 1]
     assert (
         XenonFits().charge_states
         == TabulatedRates((1.0, 2.0), (0.0,) * 2, (0.0,) * 2).charge_states
     )
-    assert np.all(ep.thruster.propellant("argon").second_ionization(T) == 0.0)
+    argon = ep.thruster.propellant("argon")
+    message = r"argon has further ionisations between the charges \[\]: \(1, 2\) came"
+    with pytest.raises(ValueError, match=message):
+        argon.further_ionization(1, 2, T)
+
+
+@pytest.mark.parametrize("gas", ["xenon", "krypton"])
+def test_energies_of_a_charge_do_not_depend_on_the_way(gas):
+    made = ep.thruster.propellant(gas)
+    at_once, twice = made.further_energy(0, 3), made.further_energy(0, 2)
+    assert at_once == pytest.approx(twice + made.further_energy(2, 3), rel=1e-3)
+    assert at_once == pytest.approx(made.ionization_eV + made.further_energy(1, 3), rel=1e-3)
 
 
 def test_coulomb_collisions_can_be_left_out():
@@ -162,7 +187,12 @@ def test_a_table_over_the_mean_energy_is_the_same_gas(tmp_path):
         (
             "T_e_eV,ionization,excitation,momentum,second_ionization\n1,0,0,0,0\n9,0,0,0,1e-14\n",
             {"second_ionization_eV": 21.0},
-            r"a second charge needs double_ionization and second_ionization",
+            r"a second charge needs double_ionization, second_ionization, .* own lacks double_ion",
+        ),
+        (
+            "T_e_eV,ionization,excitation,momentum,third_ionization\n1,0,0,0,0\n9,0,0,0,1e-14\n",
+            {"third_ionization_eV": 31.0},
+            r"a third charge needs double_ionization, .*: own lacks double_ionization, second_ion",
         ),
     ],
 )
@@ -201,17 +231,37 @@ def test_a_run_beyond_the_table_says_how_far_it_got():
     assert "and the run reached T_e of 120 eV, where" in str(describe_uncovered(still, 120.0))
 
 
-def test_a_second_charge_needs_its_rates():
-    with pytest.raises(ValueError, match=r"charge_states 2 needs rates .* XenonFits has not"):
+def test_a_charge_needs_its_rates():
+    for charges, gas in ((2, "argon"), (3, "argon")):
+        made = ep.thruster.propellant(gas)
+        with pytest.raises(
+            ValueError, match=rf"charge_states {charges} needs .* argon has .* to 1"
+        ):
+            ep.thruster.Thruster(charge_states=charges, propellant=made)
+    with pytest.raises(
+        ValueError, match=r"charge_states 2 needs rates .* XenonFits has them up to"
+    ):
         ep.thruster.Thruster(charge_states=2)
-    with pytest.raises(ValueError, match=r"charge_states must be 1 or 2, got 3"):
-        ep.thruster.Thruster(charge_states=3, propellant=ep.thruster.propellant("xenon"))
-    assert (
-        ep.thruster.Thruster(
-            charge_states=2, propellant=ep.thruster.propellant("xenon")
-        ).charge_states
-        == 2
-    )
+    with pytest.raises(ValueError, match=r"charge_states must be 1, 2 or 3, got 4"):
+        ep.thruster.Thruster(charge_states=4, propellant=ep.thruster.propellant("xenon"))
+
+
+@pytest.mark.parametrize(
+    ("gas", "asked", "charges"),
+    [("xenon", None, 2), ("argon", None, 1), ("krypton", 1, 1), ("xenon", 3, 3)],
+)
+def test_two_charges_are_taken_where_the_gas_has_their_rates(gas, asked, charges):
+    made = ep.thruster.propellant(gas)
+    thruster = ep.thruster.Thruster(propellant=made, charge_states=asked)
+    assert thruster.charge_states == thruster.highest_charge == charges
+    assert ep.thruster.Thruster().charge_states == 1  # formulas
+    table = closure_table(thruster)
+    T_e_eV = TABLE_STEP_EV * np.arange(len(table))
+    further = [pair for pair in TRANSITIONS if pair[1] <= charges]
+    assert table.shape[1] == FURTHER + len(further) == FURTHER + {1: 0, 2: 2, 3: 5}[charges]
+    for column, pair in enumerate(further, FURTHER):
+        expected = made.further_ionization(*pair, T_e_eV)
+        np.testing.assert_allclose(table[1:, column], expected[1:])
 
 
 def test_another_gas_is_simulated():

@@ -2,6 +2,8 @@
 from ep2sindy.thruster.parameters import Thruster as Thruster  # for configs
 from ep2sindy.thruster.parameters import OperatingPoint as OperatingPoint  # for configs
 from ep2sindy.thruster.parameters import OPERATING_POINTS as OPERATING_POINTS
+from ep2sindy.thruster.parameters import Background as Background  # for configs
+from ep2sindy.thruster.parameters import NeutralSpeed as NeutralSpeed  # for configs
 from ep2sindy.thruster.parameters import Circuit as Circuit  # for configs
 from ep2sindy.thruster.parameters import ModulatedVoltage as ModulatedVoltage  # for configs
 from ep2sindy.thruster.parameters import VoltageTable as VoltageTable  # for configs
@@ -26,9 +28,12 @@ from ep2sindy.thruster.magnetic_field import MagneticFieldTable as MagneticField
 from ep2sindy.thruster.magnetic_field import (
     read_magnetic_field as read_magnetic_field,
 )  # for configs
+from ep2sindy.thruster.plume import ConicalPlume as ConicalPlume  # for configs
+from ep2sindy.thruster.plume import ThermalPlume as ThermalPlume  # for configs
 from ep2sindy.thruster.transport import AnomalousTransport as AnomalousTransport  # for configs
 from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport  # for configs
 from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport  # for configs
+from ep2sindy.thruster.transport import PressureShift as PressureShift  # for configs
 from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall  # for configs
 from ep2sindy.thruster.walls import SheathWall as SheathWall  # for configs
 from ep2sindy.thruster.walls import wall_material as wall_material  # for configs

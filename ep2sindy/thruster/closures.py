@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.thruster.parameters import Thruster
-from ep2sindy.thruster.propellants import PropellantTable
+from ep2sindy.thruster.propellants import FURTHER_IONIZATIONS, PropellantTable
 
 TABLE_STEP_EV = 0.02  # linear interpolation is then within 5e-4 of the formulas above 2 eV
 TABLE_TOP_EV = 200.0  # the fits end below; a higher T_e counts as divergence
@@ -23,18 +23,21 @@ TABLE_TOP_EV = 200.0  # the fits end below; a higher T_e counts as divergence
     WALL_POWER,
     ION_LOSS,
     DRIFT_EVENTS,
-    DOUBLE,
-    SECOND,
-) = range(12)
-FURTHER = DOUBLE
+    FURTHER,
+) = range(11)
+TRANSITIONS = tuple(FURTHER_IONIZATIONS)  # charges before and after, one column each from FURTHER
 
 
-def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 12"]:
-    """Tabulate every closure at steps of TABLE_STEP_EV; columns as named in this module."""
+def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures columns"]:
+    """Tabulate every closure at steps of TABLE_STEP_EV; columns as named in this module.
+
+    From FURTHER on stand the coefficients of TRANSITIONS up to the thruster's highest charge.
+    """
     T = TABLE_STEP_EV * np.arange(round(TABLE_TOP_EV / TABLE_STEP_EV) + 1)
     T[0] = 0.1 * TABLE_STEP_EV  # the formulas divide by T; all rates vanish at so low a T
     rates, wall, mass = thruster.propellant, thruster.wall, thruster.propellant.mass
-    table = np.zeros((T.size, 12))
+    further = further_transitions(thruster)
+    table = np.zeros((T.size, FURTHER + len(further)))
     table[:, IONIZATION] = rates.ionization(T)
     table[:, EVENTS] = rates.events(T)
     table[:, MOMENTUM] = rates.momentum(T)
@@ -45,11 +48,15 @@ def closure_table(thruster: Thruster) -> Float[np.ndarray, "temperatures 12"]:
     table[:, WALL_POWER] = wall.power(T, thruster.gap, mass)
     table[:, ION_LOSS] = wall.ion_loss(T, thruster.gap, mass)
     table[:, DRIFT_EVENTS] = rates.drift_events(T)
-    if thruster.charge_states > 1:
+    for column, (charge, higher) in enumerate(further, FURTHER):
         assert isinstance(rates, PropellantTable)  # the thruster checks this
-        table[:, DOUBLE] = rates.double_ionization(T)
-        table[:, SECOND] = rates.second_ionization(T)
+        table[:, column] = rates.further_ionization(charge, higher, T)
     return table
+
+
+def further_transitions(thruster: Thruster) -> list[tuple[int, int]]:
+    """Charges before and after of the transitions that a thruster's ions take beyond X -> X+."""
+    return [pair for pair in TRANSITIONS if pair[1] <= thruster.highest_charge]
 
 
 def coulomb_log_at_unit_density(T_e_eV: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:

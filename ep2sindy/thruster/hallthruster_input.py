@@ -20,13 +20,17 @@ from ep2sindy.runtime.progress import Progress
 from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.magnetic_field import MagneticFieldTable, read_magnetic_field
-from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.parameters import Background, OperatingPoint, Thruster
+from ep2sindy.thruster.plume import ThermalPlume
 from ep2sindy.thruster.propellant_files import propellant
 from ep2sindy.thruster.propellants import PropellantTable
+from ep2sindy.thruster.tables import Node
 from ep2sindy.thruster.transport import (
     AnomalousTransport,
+    BohmTransport,
     GaussianTransport,
     MultiLogTransport,
+    PressureShift,
     Transport,
 )
 from ep2sindy.thruster.walls import (
@@ -38,55 +42,7 @@ from ep2sindy.thruster.walls import (
     wall_material,
 )
 
-NEEDED: Any = object()
-
-
-class Node:
-    """A mapping and its place in the file. `end()` refuses the keys that were not taken."""
-
-    def __init__(self, values: Any, place: str) -> None:
-        if not isinstance(values, Mapping):
-            raise ValueError(f"{place} must be a mapping: {values!r} came")
-        self.place = place
-        self._left = dict(values)
-
-    def take(self, key: str, default: Any = NEEDED) -> Any:
-        """The value of a key, or the default; raises ValueError if a required key is missing."""
-        if key in self._left:
-            return self._left.pop(key)
-        if default is NEEDED:
-            raise ValueError(f"{self.place} must have the key {key!r}: it is not there")
-        return default
-
-    def number(self, key: str, default: Any = NEEDED) -> float:
-        """Take a number."""
-        value = self.take(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{self.place}.{key} must be a number: {value!r} came")
-        return float(value)
-
-    def node(self, key: str, default: Any = NEEDED) -> Node:
-        """Take a nested mapping."""
-        return Node(self.take(key, default), f"{self.place}.{key}")
-
-    def at_rest(self, values: Mapping[str, Any]) -> None:
-        """Take keys that are supported at a single value only."""
-        for key, value in values.items():
-            if (came := self.take(key, value)) != value:
-                raise ValueError(
-                    f"{self.place}.{key} is not supported here but at {value!r}: {came!r} came"
-                )
-
-    def idle(self, *keys: str) -> None:
-        """Take keys that have no effect here."""
-        for key in keys:
-            self.take(key, None)
-
-    def end(self) -> None:
-        """Raise ValueError for the remaining keys."""
-        if self._left:
-            raise ValueError(f"{self.place} has keys that are not supported: {sorted(self._left)}")
-
+TORR = 101325.0 / 760.0  # Pa
 
 MATERIALS = {
     "BNSiO2": "BN-SiO2",
@@ -116,14 +72,30 @@ def field_of(node: Node, length: float, folder: Path, scale: float) -> MagneticF
 
 
 def transport_of(node: Node, length: float, transition: float) -> Transport:
-    """Bohm-like models; their positions count from the anode, ours from the exit."""
+    """A Bohm-like model, or one that the background's pressure shifts."""
     kind = node.take("type")
+    if kind != "LogisticPressureShift":
+        return bohm_of(kind, node, length, transition)
+    inner = node.node("model")
+    shifted = PressureShift(
+        bohm_of(inner.take("type"), inner, length, transition),
+        z0=node.number("z0"),
+        dz=node.number("dz"),
+        pressure_Pa=TORR * node.number("pstar"),
+        alpha=node.number("alpha"),
+    )
+    node.end()
+    return shifted
+
+
+def bohm_of(kind: Any, node: Node, length: float, transition: float) -> BohmTransport:
+    """Bohm-like models; their positions count from the anode, ours from the exit."""
     if kind == "TwoZoneBohm":
         c = node.take("coeffs", None) or (
             node.number("c1", 1 / 160),
             node.number("c2", 1 / 16),
         )
-        model: Transport = AnomalousTransport(float(c[0]), float(c[1]), transition)
+        model: BohmTransport = AnomalousTransport(float(c[0]), float(c[1]), transition)
     elif kind == "Bohm":
         c_everywhere = node.number("c")
         model = AnomalousTransport(c_everywhere, c_everywhere, 0.0)
@@ -139,8 +111,8 @@ def transport_of(node: Node, length: float, transition: float) -> Transport:
         model = MultiLogTransport(tuple(z.tolist()), tuple(map(float, node.take("cs"))))
     else:
         raise ValueError(
-            f"{node.place}.type must be TwoZoneBohm, Bohm, GaussianBohm or MultiLogBohm: {kind!r} "
-            "is not supported here"
+            f"{node.place}.type must be TwoZoneBohm, Bohm, GaussianBohm, MultiLogBohm or "
+            f"LogisticPressureShift of one of these: {kind!r} is not supported here"
         )
     node.end()
     return model
@@ -205,8 +177,6 @@ GASES |= {"Xe": "xenon", "Kr": "krypton", "Ar": "argon"}
 RATES_OF = {"xenon": "xenon_5eV", "krypton": "krypton", "argon": "argon"}
 # Keys that are supported at this value only; any other would change the simulation.
 CONFIG_AT_REST: dict[str, Any] = {
-    "background_pressure_Torr": 0.0,
-    "solve_plume": False,
     "anom_smoothing_iters": 0,
     "LANDMARK": False,
     "ionization_model": "Lookup",
@@ -216,11 +186,14 @@ CONFIG_AT_REST: dict[str, Any] = {
     "propellant_config": "",
     "implicit_energy": 1.0,
 }
-# Keys without effect here: they concern missing features, or the other code's output.
-CONFIG_IDLE = (
-    "background_temperature_K", "neutral_ingestion_multiplier", "initial_condition",
-    "apply_thrust_divergence_correction",
-)  # fmt: skip
+# Keys of the propellant before 0.19; beside `propellants` HallThruster.jl reads none of them.
+FLOW = {
+    "gas": "propellant", "flow_rate_kg_s": "anode_mass_flow_rate",
+    "velocity_m_s": "neutral_velocity", "temperature_K": "neutral_temperature_K",
+    "ion_temperature_K": "ion_temperature_K", "max_charge": "ncharge",
+}  # fmt: skip
+# Keys without effect here.
+CONFIG_IDLE = ("initial_condition",)
 SIMULATION_IDLE = (
     "dt", "adaptive", "CFL", "min_dt", "max_dt", "max_small_steps", "verbose", "print_errors",
 )  # fmt: skip
@@ -263,8 +236,9 @@ def read_hallthruster_input(path: str | Path) -> HallThrusterInput:
     beside the JSON file, then in the current folder. The single loss_scale of a wall in
     HallThruster.jl sets both of ours. Its conductivity multiplies the gradient of 1.5 T_e, so that
     our factor is 1.5 times its own. Raises ValueError for an unknown key, and for one that asks for
-    physics that is missing here (background gas, plume expansion, three charges, mixtures, a
-    shielded wall, LANDMARK), naming it.
+    physics that is missing here (mixtures, a shielded wall, LANDMARK), naming it.
+    The channel ingests background gas as it does there, where a pressure in Torr counts as if it
+    were in Pa: 133 times less than at that pressure.
     """
     path = Path(path)
     if not path.is_file():
@@ -298,7 +272,10 @@ def _input_of(config: Node, simulation: Node, folder: Path) -> HallThrusterInput
     config.idle(*CONFIG_IDLE)
     thruster = _thruster(config, gas, folder)
     point = OperatingPoint(
-        config.number("discharge_voltage"), 1e6 * gas["flow_rate_kg_s"], gas["velocity_m_s"]
+        config.number("discharge_voltage"),
+        1e6 * gas["flow_rate_kg_s"],
+        gas["velocity_m_s"],
+        background=_background(config),
     )
     config.end()
     return HallThrusterInput(thruster, point, _run(simulation, reconstruct, floor))
@@ -323,6 +300,7 @@ def _thruster(config: Node, gas: dict[str, Any], folder: Path) -> Thruster:
     transition = config.number("transition_length", 0.1 * length)
     factor, coulomb = conduction_of(config.node("conductivity_model", {"type": "Mitchner"}))
     cathode_T_e_eV = config.number("cathode_Tev", 2.0)
+    coupling = config.number("cathode_potential", 0.0)  # its older name
     return Thruster(
         channel_length=length,
         domain_length=float(stop),
@@ -343,11 +321,27 @@ def _thruster(config: Node, gas: dict[str, Any], folder: Path) -> Thruster:
         ion_temperature=gas["ion_temperature_K"],
         anode=_anode(config, cathode_T_e_eV),
         cathode_T_e_eV=cathode_T_e_eV,
-        cathode_potential=config.number("cathode_coupling_voltage", 0.0),
+        cathode_potential=config.number("cathode_coupling_voltage", coupling),
         series_resistance=0.0,
         conduction_factor=factor,
         conduction_coulomb=coulomb,
+        plume=_plume(config),
     )
+
+
+def _background(config: Node) -> Background | None:
+    """The facility's gas. HallThruster.jl takes the number in Torr for one in Pa as it ingests."""
+    pressure = config.number("background_pressure_Torr", 0.0)
+    temperature = config.number("background_temperature_K", 100.0)
+    multiplier = config.number("neutral_ingestion_multiplier", 1.0)
+    if pressure == 0.0:
+        return None
+    return Background(TORR * pressure, temperature, ingestion=multiplier / TORR)
+
+
+def _plume(config: Node) -> ThermalPlume | None:
+    corrected = bool(config.take("apply_thrust_divergence_correction", False))
+    return ThermalPlume(axial_thrust=corrected) if config.take("solve_plume", False) else None
 
 
 def _anode(config: Node, cathode_T_e_eV: float) -> FixedAnode | AnodeSheath:
@@ -364,12 +358,7 @@ def _flow(config: Node) -> dict[str, Any]:
     """The propellant: in a list of one (from version 0.19), or by keys of the config."""
     flows = config.take("propellants", None)
     if flows is None:
-        names = {
-            "gas": "propellant", "flow_rate_kg_s": "anode_mass_flow_rate",
-            "velocity_m_s": "neutral_velocity", "temperature_K": "neutral_temperature_K",
-            "ion_temperature_K": "ion_temperature_K", "max_charge": "ncharge",
-        }  # fmt: skip
-        given = {key: config.take(name, None) for key, name in names.items()}
+        given = {key: config.take(name, None) for key, name in FLOW.items()}
         flow = Node({key: value for key, value in given.items() if value is not None}, "config")
     else:
         if len(flows) != 1:
@@ -377,14 +366,16 @@ def _flow(config: Node) -> dict[str, Any]:
                 f"config.propellants must be one: a mixture of {len(flows)} is not supported here"
             )
         flow = Node(flows[0], "config.propellants[0]")
+        config.idle(*FLOW.values())
     gas = _gas(flow, bool(config.take("electron_ion_collisions", True)))
     charge = flow.take("max_charge", None)
     charges = flow.take("allowed_charges", None)
     if charges is None:
         charges = list(range(1, int(charge or 1) + 1))
-    if list(charges) not in ([1], [1, 2]):
+    if not 1 <= len(charges) <= gas.charge_states or list(charges) != [1, 2, 3][: len(charges)]:
         raise ValueError(
-            f"{flow.place} must ask for one or two charges: {list(charges)} is not supported here"
+            f"{flow.place} must ask for the charges of {gas.name} from 1 to at most "
+            f"{gas.charge_states}: {list(charges)} is not supported here"
         )
     found = {
         "propellant": gas,

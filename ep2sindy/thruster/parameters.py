@@ -15,10 +15,12 @@ from ep2sindy.thruster.checks import (
     check_positive,
     check_rows,
 )
+from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
+from ep2sindy.thruster.plume import Plume, relative_area
 from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
 from ep2sindy.thruster.tables import number, numbers, read_cells
-from ep2sindy.thruster.transport import AnomalousTransport, Transport
+from ep2sindy.thruster.transport import AnomalousTransport, PressureShift, Transport
 from ep2sindy.thruster.walls import Anode, FixedAnode, SheathWall, Wall
 
 Volts = Float[np.ndarray, " times"]
@@ -138,14 +140,68 @@ def read_voltage(path: str | Path) -> VoltageTable:
 
 
 @dataclass(frozen=True)
+class Background:
+    """The facility's residual gas, of the same kind as the propellant.
+
+    The channel takes in ingestion p/(k_B T) sqrt(8 k_B T/(pi m))/4 per area, the flux of a gas at
+    rest, beside the anode's flow. pressure_Pa: 1e-5 Torr are 1.33e-3 Pa. ingestion: factor on that
+    flux, as gas enters from the plume, too. A `PressureShift` follows the pressure.
+    Raises ValueError for a pressure or ingestion below 0, or a temperature that is not positive.
+    """
+
+    pressure_Pa: float
+    temperature_K: float = 300.0
+    ingestion: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "pressure_Pa", "ingestion")
+        check_positive(self, "temperature_K")
+
+    def flow_mg_s(self, area: float, mass: float) -> float:
+        """Flow in mg/s into an area in m^2, for atoms of a mass in kg."""
+        energy = K_BOLTZMANN * self.temperature_K
+        speed = math.sqrt(8.0 * energy / (math.pi * mass))
+        return 1e6 * self.ingestion * mass * self.pressure_Pa / energy * 0.25 * speed * area
+
+
+@dataclass(frozen=True)
+class NeutralSpeed:
+    """Axial speed of the neutrals in m/s at increasing distances from the exit in m.
+
+    Linear between the points, constant beyond their ends; distances are negative in the channel.
+    Slow neutrals are ionised first, so that the mean speed grows along the channel.
+    Raises ValueError for gaps, points out of order, or a speed that is not positive.
+    """
+
+    distance: tuple[float, ...]
+    speed: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "speed"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        check_increasing(self, "distance")
+        check_rows(self, "distance", "speed")
+        if min(self.speed) <= 0.0:
+            raise ValueError(
+                f"NeutralSpeed.speed must be positive everywhere, got {min(self.speed):g} m/s"
+            )
+
+    def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Speed in m/s at distances from the exit in m."""
+        return np.interp(distance, self.distance, self.speed)
+
+
+@dataclass(frozen=True)
 class Thruster:
     """Geometry, field, closures and boundary values of one thruster; the default is SPT-100-like.
 
     kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e; 4.66 and 0 are
-    Braginskii's values for singly charged ions. charge_states: highest charge of the ions, 1 or 2.
+    Braginskii's values for singly charged ions. charge_states: highest charge of the ions,
+    1 to 3; None takes 2 where the gas has the rates, else 1.
     cathode_potential: potential of the cathode plane relative to the cathode (coupling voltage).
     ions_born_at_rest: if True, ionisation adds no momentum to the ions, as in LANDMARK; otherwise
-    it adds the neutrals' momentum.
+    it adds the neutrals' momentum. plume: how the plasma spreads beyond the exit; None keeps
+    the channel's cross-section.
     """
 
     channel_length: float = 0.025  # m
@@ -155,7 +211,7 @@ class Thruster:
     magnetic_field: Field = field(default_factory=MagneticField)
     transport: Transport = field(default_factory=AnomalousTransport)
     propellant: Propellant = field(default_factory=XenonFits)
-    charge_states: int = 1
+    charge_states: int | None = None
     wall: Wall = field(default_factory=SheathWall)
     ion_temperature: float = 1000.0  # K
     anode: Anode = field(default_factory=FixedAnode)
@@ -167,6 +223,7 @@ class Thruster:
     conduction_factor: float = 4.66
     conduction_coulomb: float = 0.0
     ions_born_at_rest: bool = False
+    plume: Plume | None = None
 
     def __post_init__(self) -> None:
         check_positive(
@@ -197,12 +254,15 @@ class Thruster:
         self._check_propellant()
 
     def _check_propellant(self) -> None:
-        if self.charge_states not in (1, 2):
-            raise ValueError(f"charge_states must be 1 or 2, got {self.charge_states!r}")
-        if self.charge_states > self.propellant.charge_states:
+        known = self.propellant.charge_states
+        if self.charge_states is None:
+            object.__setattr__(self, "charge_states", min(2, known))
+        if self.highest_charge not in (1, 2, 3):
+            raise ValueError(f"charge_states must be 1, 2 or 3, got {self.charge_states!r}")
+        if self.highest_charge > known:
             raise ValueError(
-                "charge_states 2 needs rates of the second charge, which the propellant "
-                f"{gas_name(self.propellant)} has not; take "
+                f"charge_states {self.charge_states} needs rates of every charge up to it, and the "
+                f"propellant {gas_name(self.propellant)} has them up to {known}; take "
                 "ep2sindy.thruster.propellant(name='xenon')"
             )
         if self.propellant.range_eV is None:
@@ -216,6 +276,12 @@ class Thruster:
                 )
 
     @property
+    def highest_charge(self) -> int:
+        """Highest charge of the ions; `charge_states` with its default filled in."""
+        assert self.charge_states is not None
+        return self.charge_states
+
+    @property
     def gap(self) -> float:
         """Channel width in m."""
         return self.outer_radius - self.inner_radius
@@ -225,21 +291,56 @@ class Thruster:
         """Channel cross-section in m^2."""
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
+    def transport_at(
+        self, distance: Float[np.ndarray, " z"], background: Background | None
+    ) -> Float[np.ndarray, " z"]:
+        """Coefficient c of the transport, which a background's pressure may shift; None: vacuum."""
+        if not isinstance(self.transport, PressureShift):
+            return self.transport.at(distance)
+        pressure_Pa = 0.0 if background is None else background.pressure_Pa
+        shift = self.channel_length * self.transport.shift(pressure_Pa)
+        return self.transport.transport.at(distance - shift)
+
+    def relative_area(
+        self, distance: Float[np.ndarray, " z"], tangents: Float[np.ndarray, " z"]
+    ) -> Float[np.ndarray, " z"]:
+        """Cross-section over the channel's at distances from the exit; see `relative_area`."""
+        return relative_area(
+            distance, tangents, inner_radius=self.inner_radius, outer_radius=self.outer_radius
+        )
+
 
 @dataclass(frozen=True)
 class OperatingPoint:
     """The operator's settings: supply voltage in V, anode flow in mg/s; and the neutrals' speed.
 
-    supply: how the voltage varies in time; None keeps it constant.
+    supply: how the voltage varies in time; None keeps it constant. neutral_speed: in m/s, or along
+    the axis as a `NeutralSpeed`. background: the facility's gas; None is a perfect vacuum.
     """
 
     voltage: float  # V
     mass_flow_mg_s: float
-    neutral_speed: float = 280.0  # m/s, tuned
+    neutral_speed: float | NeutralSpeed = 280.0  # m/s, tuned
     supply: Supply | None = None
+    background: Background | None = None
 
     def __post_init__(self) -> None:
-        check_positive(self, "voltage", "mass_flow_mg_s", "neutral_speed")
+        check_positive(self, "voltage", "mass_flow_mg_s")
+        if not isinstance(self.neutral_speed, NeutralSpeed):
+            check_positive(self, "neutral_speed")
+
+    def neutral_speed_at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
+        """Speed of the neutrals in m/s at distances from the exit in m."""
+        if isinstance(self.neutral_speed, NeutralSpeed):
+            return self.neutral_speed.at(distance)
+        return np.full_like(distance, self.neutral_speed)
+
+    def inflow_mg_s(self, thruster: Thruster) -> float:
+        """Flow of neutrals at the anode in mg/s: the anode's own and what the channel ingests."""
+        if self.background is None:
+            return self.mass_flow_mg_s
+        ingested = self.background.flow_mg_s(thruster.area, thruster.propellant.mass)
+        return self.mass_flow_mg_s + ingested
 
     @property
     def label(self) -> str:

@@ -9,21 +9,24 @@ from typing import Any
 import numpy as np
 
 from ep2sindy.thruster.constants import ATOMIC_MASS, M_ARGON, M_KRYPTON, M_XENON
-from ep2sindy.thruster.propellants import PropellantTable
+from ep2sindy.thruster.propellants import FURTHER_IONIZATIONS, PropellantTable
 from ep2sindy.thruster.tables import numbers, read_cells
 
 GASES = Path(__file__).parent / "gases"
 RATES = ("ionization", "excitation", "momentum")
-SECOND = ("double_ionization", "second_ionization")
 # Energies in eV: HallThruster.jl's tables, whose lumped levels they are; argon: its cross sections
 ENERGIES: dict[str, dict[str, float]] = {
     "xenon": {
         "ionization_eV": 12.1298437, "excitation_eV": 8.32,
         "double_ionization_eV": 33.1048437, "second_ionization_eV": 20.975,
+        "triple_ionization_eV": 64.1548427, "ion_double_ionization_eV": 52.025,
+        "third_ionization_eV": 31.05,
     },
     "krypton": {
         "ionization_eV": 13.9996055, "excitation_eV": 9.99,
         "double_ionization_eV": 38.3594455, "second_ionization_eV": 24.35984,
+        "triple_ionization_eV": 74.2174455, "ion_double_ionization_eV": 60.21784,
+        "third_ionization_eV": 35.838,
     },
     "argon": {"ionization_eV": 15.8, "excitation_eV": 11.5},
 }  # fmt: skip
@@ -33,10 +36,10 @@ MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
 def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     """A gas that comes with the package: xenon, krypton, argon, or xenon_5eV.
 
-    Xenon and krypton are the tables of HallThruster.jl, for T_e up to 170 and 100 eV, with a second
-    charge. Argon is computed from the cross sections of Phelps & Petrovic (1999), up to 100 eV.
-    Each file in `gases/` names its sources. xenon_5eV has the ionisation table of the stored runs
-    of HallThruster.jl v0.22, linear over 5 eV. The default `XenonFits` are formulas.
+    Xenon and krypton are the tables of HallThruster.jl, for T_e up to 170 and 100 eV, with ions
+    of up to three charges. Argon is computed from the cross sections of Phelps & Petrovic (1999),
+    up to 100 eV. Each file in `gases/` names its sources. xenon_5eV has the ionisation table of the
+    stored runs of HallThruster.jl v0.22, linear over 5 eV. The default `XenonFits` are formulas.
     """
     if name == "xenon_5eV":
         return _resample_ionization(propellant("xenon", coulomb_weight=coulomb_weight), name)
@@ -56,7 +59,7 @@ def _resample_ionization(xenon: PropellantTable, name: str) -> PropellantTable:
     energy = np.arange(1.0 + np.floor(stored["mean_energy_eV"][-1]))
     rates: dict[str, Any] = {
         f"{rate}_rate": tuple(np.interp(energy / 1.5, xenon.T_e_eV, getattr(xenon, f"{rate}_rate")))
-        for rate in (*RATES, *SECOND)
+        for rate in (*RATES, *FURTHER_IONIZATIONS.values())
     }
     rates["ionization_rate"] = tuple(
         np.interp(energy, stored["mean_energy_eV"], stored["ionization"])
@@ -72,14 +75,18 @@ def read_propellant(
     excitation_eV: float,
     double_ionization_eV: float | None = None,
     second_ionization_eV: float | None = None,
+    triple_ionization_eV: float | None = None,
+    ion_double_ionization_eV: float | None = None,
+    third_ionization_eV: float | None = None,
     name: str | None = None,
 ) -> PropellantTable:
     """Read a user's gas from a CSV file whose header names the columns.
 
     Columns: T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing; ionization, excitation and
     momentum, rate coefficients in m^3/s; for a second charge double_ionization (X -> X2+) and
-    second_ionization (X+ -> X2+). Lines that begin with # are ignored. mass_u: mass of the atom in
-    atomic mass units. The energies are an electron's loss per event, in eV.
+    second_ionization (X+ -> X2+), for a third triple_ionization (X -> X3+), ion_double_ionization
+    (X+ -> X3+) and third_ionization (X2+ -> X3+). Lines that begin with # are ignored. mass_u: mass
+    of the atom in atomic mass units. The energies are an electron's loss per event, in eV.
     Raises ValueError for a missing file, a missing or unknown column, or a gap.
     """
     given = {
@@ -87,6 +94,9 @@ def read_propellant(
         "excitation_eV": excitation_eV,
         "double_ionization_eV": double_ionization_eV,
         "second_ionization_eV": second_ionization_eV,
+        "triple_ionization_eV": triple_ionization_eV,
+        "ion_double_ionization_eV": ion_double_ionization_eV,
+        "third_ionization_eV": third_ionization_eV,
     }
     energies = {key: value for key, value in given.items() if value is not None}
     return _table(Path(path), name or Path(path).stem, mass_u * ATOMIC_MASS, energies)
@@ -98,14 +108,16 @@ def _table(
     columns = _columns(path)
     scale = {"T_e_eV": 1.0, "mean_energy_eV": 1.5}
     first = [column for column in scale if column in columns]
-    known = {*scale, *RATES, *SECOND}
+    known = {*scale, *RATES, *FURTHER_IONIZATIONS.values()}
     if len(first) != 1 or set(columns) - known or set(RATES) - set(columns):
         raise ValueError(
             f"{path} must have the columns T_e_eV or mean_energy_eV, {', '.join(RATES)}, and may "
-            f"have {' and '.join(SECOND)}: it has {list(columns)}"
+            f"have {', '.join(FURTHER_IONIZATIONS.values())}: it has {list(columns)}"
         )
     rates: dict[str, Any] = {
-        f"{key}_rate": columns[key] for key in (*RATES, *SECOND) if key in columns
+        f"{key}_rate": columns[key]
+        for key in (*RATES, *FURTHER_IONIZATIONS.values())
+        if key in columns
     }
     rates["T_e_eV"] = tuple(value / scale[first[0]] for value in columns[first[0]])
     rates |= energies

@@ -7,7 +7,8 @@ takes any of them:
   `charge_states` (the highest charge that has coefficients), energies in eV;
 - `ionization`, `energy_loss`, `events`, `momentum`, `coulomb` for X and X+;
 - `drift_events`: the inelastic events that take their energy from drift and heat together;
-- `double_ionization` (X -> X2+) and `second_ionization` (X+ -> X2+), if charge_states is 2.
+- `further_ionization(charge, higher, T_e_eV)` and `further_energy(charge, higher)` of what makes
+  X2+ and X3+ (`FURTHER_IONIZATIONS`), if charge_states is above 1.
 """
 
 from __future__ import annotations
@@ -28,6 +29,15 @@ from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON, M_XENON
 
 E_IONIZATION_EV = 12.13  # eV, first ionisation of xenon (Goebel & Katz, appendix E)
 E_EXCITATION_EV = 8.32  # eV, lowest excited level (Goebel & Katz, appendix E)
+
+# Ionisations beyond X -> X+, by charge before and after: the names of their columns.
+FURTHER_IONIZATIONS = {
+    (0, 2): "double_ionization",
+    (1, 2): "second_ionization",
+    (0, 3): "triple_ionization",
+    (1, 3): "ion_double_ionization",
+    (2, 3): "third_ionization",
+}
 
 FloatArray = Float[np.ndarray, "..."] | np.float64  # NumPy turns arrays without axes into scalars
 
@@ -180,7 +190,9 @@ class PropellantTable:
     """Any gas: rate coefficients in m^3/s over the electron temperature, linear between rows.
 
     T_e_eV: increasing. There are two kinds of inelastic events, ionisation and one lumped
-    excitation. If both columns of the second charge are given, X2+ is made from X and from X+.
+    excitation. With both columns of the second charge (double: X -> X2+, second: X+ -> X2+) and
+    their energies there are X2+; with the three of the third (triple: X -> X3+, ion_double: X+ ->
+    X3+, third: X2+ -> X3+) X3+ as well; a charge whose columns are not all there is refused.
     coulomb_weight: 0 leaves electron-ion collisions out. drift_weight: as in `XenonFits`. Of the
     inelastic events, only excitation takes part of its energy from the drift, as in
     HallThruster.jl. Beyond the rows the end values are held, and a run that gets there reports it.
@@ -198,6 +210,12 @@ class PropellantTable:
     second_ionization_rate: tuple[float, ...] = ()
     double_ionization_eV: float | None = None
     second_ionization_eV: float | None = None
+    triple_ionization_rate: tuple[float, ...] = ()
+    ion_double_ionization_rate: tuple[float, ...] = ()
+    third_ionization_rate: tuple[float, ...] = ()
+    triple_ionization_eV: float | None = None
+    ion_double_ionization_eV: float | None = None
+    third_ionization_eV: float | None = None
     drift_weight: float = 1.0
     coulomb_weight: float = 1.0
 
@@ -205,19 +223,31 @@ class PropellantTable:
         check_positive(self, "mass", "ionization_eV", "excitation_eV")
         check_not_negative(self, "drift_weight", "coulomb_weight")
         check_increasing(self, "T_e_eV")
-        second = [n for n in ("double_ionization", "second_ionization") if self._has(n)]
-        rates = [f"{n}_rate" for n in ("ionization", "excitation", "momentum", *second)]
+        given = self._complete()
+        rates = [f"{n}_rate" for n in ("ionization", "excitation", "momentum", *given)]
         check_rows(self, "T_e_eV", *rates)
         for name in rates:
             if min(getattr(self, name)) < 0.0:
                 raise ValueError(f"PropellantTable.{name} must be zero or more in every row")
-        if len(second) == 1:
-            raise ValueError(
-                "a second charge needs double_ionization and second_ionization, both with their "
-                f"energy: {self.name} has only {second[0]}"
-            )
-        if second:
-            check_positive(self, "double_ionization_eV", "second_ionization_eV")
+        if given:
+            check_positive(self, *(f"{name}_eV" for name in given))
+
+    def _complete(self) -> list[str]:
+        """Names of the further ionisations, once all of a charge and of those below are there."""
+        given = [name for name in FURTHER_IONIZATIONS.values() if self._has(name)]
+        for highest, word in ((2, "second"), (3, "third")):
+            needed = [
+                name for (_, higher), name in FURTHER_IONIZATIONS.items() if higher <= highest
+            ]
+            making = [
+                name for (_, higher), name in FURTHER_IONIZATIONS.items() if higher == highest
+            ]
+            if set(given) & set(making) and (lacking := [n for n in needed if n not in given]):
+                raise ValueError(
+                    f"a {word} charge needs {', '.join(needed)}, each with its energy: {self.name} "
+                    f"lacks {', '.join(lacking)}"
+                )
+        return given
 
     def _has(self, name: str) -> bool:
         rate, energy = getattr(self, f"{name}_rate"), getattr(self, f"{name}_eV")
@@ -234,8 +264,8 @@ class PropellantTable:
 
     @property
     def charge_states(self) -> int:
-        """The highest charge: 2 if there are rates of the second charge, else 1."""
-        return 2 if self.second_ionization_rate else 1
+        """The highest charge that has rates: 1, 2 or 3."""
+        return 3 if self.third_ionization_rate else 2 if self.second_ionization_rate else 1
 
     def _interpolate(self, T_e_eV: FloatArray, values: tuple[float, ...]) -> FloatArray:
         return np.interp(T_e_eV, self.T_e_eV, values)
@@ -269,15 +299,26 @@ class PropellantTable:
         """nu_ei divided by n and ln(Lambda)."""
         return self.coulomb_weight * coulomb_rate(T_e_eV)
 
-    def double_ionization(self, T_e_eV: FloatArray) -> FloatArray:
-        """X -> X2+, in m^3/s; zero without that column."""
-        values = self.double_ionization_rate
-        return self._interpolate(T_e_eV, values) if values else np.zeros_like(T_e_eV)
+    def further_ionization(self, charge: int, higher: int, T_e_eV: FloatArray) -> FloatArray:
+        """From one charge to a higher one in a single event, in m^3/s.
 
-    def second_ionization(self, T_e_eV: FloatArray) -> FloatArray:
-        """X+ -> X2+, in m^3/s; zero without that column."""
-        values = self.second_ionization_rate
-        return self._interpolate(T_e_eV, values) if values else np.zeros_like(T_e_eV)
+        charge, higher: a pair of `FURTHER_IONIZATIONS`. Raises ValueError for one without rates.
+        """
+        return self._interpolate(T_e_eV, getattr(self, f"{self._further(charge, higher)}_rate"))
+
+    def further_energy(self, charge: int, higher: int) -> float:
+        """Energy in eV that an electron loses in the event of `further_ionization`."""
+        return float(getattr(self, f"{self._further(charge, higher)}_eV"))
+
+    def _further(self, charge: int, higher: int) -> str:
+        name = FURTHER_IONIZATIONS.get((charge, higher))
+        if name is None or higher > self.charge_states:
+            there = [pair for pair in FURTHER_IONIZATIONS if pair[1] <= self.charge_states]
+            raise ValueError(
+                f"{self.name} has further ionisations between the charges {there}: "
+                f"{(charge, higher)} came; X -> X+ is `ionization`"
+            )
+        return name
 
 
 Propellant = XenonFits | TabulatedRates | PropellantTable

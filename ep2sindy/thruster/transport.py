@@ -1,7 +1,8 @@
 """Anomalous transport: an effective collision frequency nu = c(z) omega_ce, not given by theory.
 
 The classes share one method: `at(distance)`, the coefficient c at a distance from the exit in m,
-negative inside the channel. Their numbers are tuned, as in every 1-D code; see docs/thruster.md.
+negative inside the channel; `PressureShift` moves any of them. Their numbers are tuned, as in every
+1-D code; see docs/thruster.md.
 """
 
 from __future__ import annotations
@@ -93,4 +94,42 @@ class MultiLogTransport:
         return np.exp(np.interp(distance, self.distance, np.log(self.c)))
 
 
-Transport = AnomalousTransport | GaussianTransport | MultiLogTransport
+BohmTransport = AnomalousTransport | GaussianTransport | MultiLogTransport
+
+
+@dataclass(frozen=True)
+class PressureShift:
+    """A transport that the facility's pressure p moves along the axis.
+
+    It stands at z* = z0 + dz/(1 + (alpha - 1)^(2 p/pressure_Pa - 1)), in channel lengths towards
+    the plume. With alpha above 2 and dz positive it moves from z0 + dz (1 - 1/alpha) in vacuum
+    towards the anode, by half of the way at half of pressure_Pa. The field B stays.
+    Raises ValueError for alpha at or below 1, a pressure that is not positive, or a shift that is
+    not finite. Source: LogisticPressureShift of HallThruster.jl, Marks et al., JOSS 8 (2023) 4672.
+    """
+
+    transport: BohmTransport
+    z0: float
+    dz: float
+    pressure_Pa: float
+    alpha: float
+
+    def __post_init__(self) -> None:
+        check_positive(self, "pressure_Pa")
+        if not (np.isfinite(self.alpha) and self.alpha > 1.0):
+            raise ValueError(f"PressureShift.alpha must be above 1, got {self.alpha!r}")
+        if not np.isfinite([self.z0, self.dz]).all():
+            raise ValueError(
+                f"PressureShift.z0 and dz must be finite, in channel lengths: {self.z0!r} and "
+                f"{self.dz!r} came"
+            )
+
+    def shift(self, pressure_Pa: float) -> float:
+        """Where the transport stands at a pressure, in channel lengths from its own place."""
+        power = 2.0 * pressure_Pa / self.pressure_Pa - 1.0
+        return self.z0 + self.dz * float(
+            np.exp(-np.logaddexp(0.0, power * np.log(self.alpha - 1.0)))
+        )
+
+
+Transport = BohmTransport | PressureShift

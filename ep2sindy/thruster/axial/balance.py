@@ -31,10 +31,12 @@ def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
         )
     first, beyond = int(inside[0]), int(inside[-1]) + 1
     dz = field["dz"].values[first:beyond].astype(float)
+    _check_in_channel(field, beyond)
 
     def summed(name: str) -> np.ndarray:
         """Sum over the charge states of the run."""
-        found = [field[each].values for each in (name, f"{name}2") if each in field]
+        charges = (name, f"{name}2", f"{name}3")
+        found = [field[each].values for each in charges if each in field]
         return np.sum(found, axis=0, dtype=float)
 
     def mean(name: str) -> np.ndarray:
@@ -57,3 +59,12 @@ def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
     )
     data = {name: (("time",), values, {"units": "m^-3/s"}) for name, values in terms.items()}
     return xr.Dataset(data, coords={"time": field["time"]})
+
+
+def _check_in_channel(field: xr.Dataset, beyond: int) -> None:
+    """Raise ValueError if the plasma's cross-section changes within a zone's cells."""
+    if "area" in field and bool((field["area"][:, : beyond + 1] != 1.0).any()):
+        raise ValueError(
+            "a zone's balance holds where the cross-section is that of the channel: this zone "
+            f"reaches to {float(field['z'][beyond - 1]):g} m, into the plume; end it at the exit"
+        )

@@ -19,6 +19,7 @@ from ep2sindy.thruster.axial.state_kernels import (
     PER_CHARGE,
     R_ION,
     SHORTEST_STEP,
+    SPREAD,
     T_E,
     U_IZ,
     inside,
@@ -112,6 +113,7 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
             add_instant(sums, state, dt, w)
             left -= dt
         add_changes(sums, state, 1.0)
+        add_scaled(sums.cells[SPREAD], model.spread, weight)
         for i in range(size):
             reached = state.T_e_eV[i] + model.drift_weight * state.drift_eV[i] * 2.0 / 3.0
             state.hottest_eV[0] = max(state.hottest_eV[0], reached)

@@ -12,7 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.thruster.axial.state_kernels import AxialModel
-from ep2sindy.thruster.closures import DRIFT_EVENTS, TABLE_STEP_EV, closure_table
+from ep2sindy.thruster.closures import (
+    DRIFT_EVENTS,
+    TABLE_STEP_EV,
+    closure_table,
+    further_transitions,
+)
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import PropellantTable
@@ -63,6 +68,7 @@ def build_model(
     end_s: end of the record, to which the supply's voltage must be known.
     """
     distance = lengths_and_centres(faces)[1] - thruster.channel_length
+    born = (0.0 if thruster.ions_born_at_rest else 1.0) * point.neutral_speed_at(distance)
     omega_ce = E_CHARGE * thruster.magnetic_field.at(distance) / M_ELECTRON
     mass, anode, wall = thruster.propellant.mass, thruster.anode, thruster.wall
     table = closure_table(thruster)
@@ -72,12 +78,10 @@ def build_model(
         area=thruster.area,
         ion_mass=mass,
         sound_speed_squared=K_BOLTZMANN * thruster.ion_temperature / mass,
-        neutral_speed=np.full(faces.size, point.neutral_speed),
+        neutral_speed=point.neutral_speed_at(faces - thruster.channel_length),
         neutral_wave=0.0,
-        birth_speed=np.full(
-            distance.size, 0.0 if thruster.ions_born_at_rest else point.neutral_speed
-        ),
-        neutral_inflow=1e-6 * point.mass_flow_mg_s / (mass * thruster.area),
+        birth_speed=born,
+        neutral_inflow=1e-6 * point.inflow_mg_s(thruster) / (mass * thruster.area),
         **_circuit(thruster, point, end_s),
         pressure_factor=thruster.pressure_factor,
         conduction_factor=thruster.conduction_factor,
@@ -91,7 +95,7 @@ def build_model(
         coldest_eV=coldest_eV,
         cfl=cfl,
         omega_ce=omega_ce,
-        anomalous=thruster.transport.at(distance) * omega_ce,
+        anomalous=thruster.transport_at(distance, point.background) * omega_ce,
         wall_ion_weight=wall.ion_weight(distance),
         wall_collision_weight=wall.collision_weight(distance),
         wall_power_weight=wall.power_weight(distance),
@@ -149,9 +153,10 @@ def lengths_and_centres(
 
 
 def _further(thruster: Thruster) -> dict[str, Any]:
-    if thruster.charge_states == 1:
+    """Transitions beyond X -> X+ in the order of the closure table, with their energies."""
+    pairs, propellant = further_transitions(thruster), thruster.propellant
+    if not pairs:
         return {"further": np.zeros((0, 2), np.int64), "further_eV": np.zeros(0)}
-    propellant = thruster.propellant
     assert isinstance(propellant, PropellantTable)  # the thruster checks this
-    energies = propellant.double_ionization_eV, propellant.second_ionization_eV
-    return {"further": np.array([(0, 2), (1, 2)]), "further_eV": np.array(energies)}
+    energies = [propellant.further_energy(*pair) for pair in pairs]
+    return {"further": np.array(pairs), "further_eV": np.array(energies)}

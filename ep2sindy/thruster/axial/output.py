@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.state_kernels import AxialModel
 from ep2sindy.thruster.constants import E_CHARGE
+from ep2sindy.thruster.plume import Plume
 from ep2sindy.thruster.recording import as_dataset, notes
 
 FIELDS = {  # variable -> index among the cell sums, unit, long name
@@ -33,6 +34,7 @@ AVERAGES = {
     "dn_i_dt": (recorded.CHANGE_I, "m^-3/s", "change of n_i over the sample"),
     "dn_n_dt": (recorded.CHANGE_N, "m^-3/s", "change of n_n over the sample"),
 }
+SPREAD = {"area": (recorded.SPREAD, "1", "cross-section of the plasma over the channel's")}
 OF_CHARGE = ("n_i", "u_iz", "flux_i", "face_flux_i", "dn_i_dt")
 # Variable -> the product it averages; a second charge state has its own ionisation rates.
 PRODUCTS = {"ionization": "n_i*n_n*R_ion", "flux_i": "n_i*u_iz"}
@@ -41,6 +43,7 @@ SERIES = {  # variable -> unit, long name
     "I_d": ("A", "discharge current"),
     "V_d": ("V", "discharge voltage behind resistance and circuit"),
     "V_supply": ("V", "voltage of the supply"),
+    "half_angle": ("degree", "half-angle of the plume at the cathode plane"),
     "thrust": ("N", "ion momentum flux through the cathode plane"),
     "I_beam": ("A", "ion current through the cathode plane"),
     "I_wall": ("A", "ion current to the channel walls"),
@@ -57,9 +60,11 @@ SERIES = {  # variable -> unit, long name
 POWERS = ("P_in", "P_ions", "P_inelastic", "P_wall", "P_anode", "P_cathode")
 
 
-def field_columns(*, charges: int, averaged: bool) -> dict[str, tuple[int, str, str]]:
+def field_columns(
+    *, charges: int, averaged: bool, spreads: bool = False
+) -> dict[str, tuple[int, str, str]]:
     """Variables of a run: index among the cell sums, unit and long name."""
-    first = FIELDS | (AVERAGES if averaged else {})
+    first = FIELDS | (AVERAGES if averaged else {}) | (SPREAD if spreads else {})
     columns = dict(first)
     for k in range(1, charges):
         for name in OF_CHARGE:
@@ -76,18 +81,23 @@ def series_of(
     *,
     cathode_V: float,
     sample_s: float,
+    plume: Plume | None,
 ) -> dict[str, Float[np.ndarray, " samples"]]:
     """The named time series of a run. cathode_V: potential of the cathode plane."""
     current = sums[:, recorded.CURRENT]
     particles = model.ion_mass * model.area
     flow_i, flow_n = sums[:, recorded.IONS_OUT], sums[:, recorded.NEUTRALS_OUT]
     powers = sums[:, recorded.POWER : recorded.P_CATHODE + 1].T
-    driven = {"V_supply": cathode_V + sums[:, recorded.SUPPLY]} if model.supply.size > 1 else {}
+    some = {"V_supply": cathode_V + sums[:, recorded.SUPPLY]} if model.supply.size > 1 else {}
+    angle = np.arctan(sums[:, recorded.TANGENT])
+    if plume is not None:
+        some["half_angle"] = np.degrees(angle)
+    axial = plume is not None and plume.axial_thrust
     return {
         "I_d": current,
         "V_d": cathode_V + sums[:, recorded.VOLTAGE],
-        **driven,
-        "thrust": sums[:, recorded.THRUST],
+        **some,
+        "thrust": sums[:, recorded.THRUST] * (np.cos(angle) if axial else 1.0),
         "I_beam": E_CHARGE * model.area * sums[:, recorded.BEAM],
         "I_wall": sums[:, recorded.WALL_CURRENT],
         "mass_flow_i": particles * flow_i,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from ep2sindy.thruster.axial.output import (
     series_of,
 )
 from ep2sindy.thruster.axial.settings import Settings, to_json
+from ep2sindy.thruster.axial.spreading import Spreading
 from ep2sindy.thruster.axial.starts import (
     Beginning,
     GuessedStart,
@@ -44,6 +46,7 @@ from ep2sindy.thruster.axial.state_kernels import (
 )
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.plume import Plume
 from ep2sindy.thruster.propellants import describe_uncovered
 from ep2sindy.thruster.recording import CHUNK_ROWS, March, record_samples, warm_up
 from ep2sindy.thruster.verdict import outcome
@@ -121,10 +124,12 @@ def simulate_as(
         reconstruct=settings.reconstruct, coldest_eV=settings.coldest_T_e_eV,
     )  # fmt: skip
     beginning = start.begin(model, lengths_and_centres(faces)[1], parameters)
+    spreading = Spreading(thruster, model, beginning.state, faces)
+    followers = [spreading.follow] if spreading.follows else []
     n_samples = sum(sample_counts(beginning, settings))
     with as_progress(progress).stage(n_samples, "sample", point.label) as advance:
-        record = run(model, beginning, settings, advance)
-    field = _dataset(record, model, settings, point, faces)
+        record = run(model, beginning, settings, advance, followers)
+    field = _dataset(record, model, settings, point, faces, thruster.plume)
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
         "parameters": parameters,
@@ -141,6 +146,11 @@ def as_start(initial: Start | xr.Dataset | str | Path | None) -> Start:
     if isinstance(initial, xr.Dataset | str | Path):
         return Restart(initial)
     return initial
+
+
+# What depends on the plasma and changes little in a sample, such as the areas of a plume, is set
+# before each one, outside the compiled loop; the argument is the length of the sample in s.
+Follower = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +172,13 @@ def sample_counts(beginning: Beginning, settings: Settings) -> tuple[int, int, i
     return n_hold, n_warm_up, n_recorded + 1
 
 
-def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Advance) -> Record:
+def run(
+    model: AxialModel,
+    beginning: Beginning,
+    settings: Settings,
+    advance: Advance,
+    followers: Sequence[Follower] = (),
+) -> Record:
     """Hold, warm up and record; a run that breaks ends with its last complete sample."""
     state = beginning.state
     n_fields = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1)
@@ -173,11 +189,12 @@ def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Ad
     state.clock[0] = -settings.sample_s * (n_hold + n_warm_up)
     whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
-        march = _march(each, state, settings, *_room(n_fields, CHUNK_ROWS, state))
+        march = _march(each, state, settings, *_room(n_fields, CHUNK_ROWS, state), followers)
         whole = whole and warm_up(march, n_rows, advance) is None
     before, state.hottest_eV[0], state.clock[0] = stored_energy(state, model), 0.0, 0.0
     fields, series = _room(n_fields, n_samples if whole else 0, state)
-    filled = record_samples(_march(model, state, settings, fields, series), len(series), advance)
+    march = _march(model, state, settings, fields, series, followers)
+    filled = record_samples(march, len(series), advance)
     return Record(
         fields[:, :filled],
         series[:filled],
@@ -194,17 +211,29 @@ def first_fields(state: AxialState, model: AxialModel) -> bool:
 
 
 def _march(
-    model: AxialModel, state: AxialState, settings: Settings, fields: np.ndarray, series: np.ndarray
+    model: AxialModel,
+    state: AxialState,
+    settings: Settings,
+    fields: np.ndarray,
+    series: np.ndarray,
+    followers: Sequence[Follower],
 ) -> March:
     """A function that records samples of a run into a slice of rows of these arrays."""
-
     sums, work = new_sums(len(fields), state.n_n.size), new_work(*state.n_i.shape)
 
     def march(rows: slice) -> int:
         recorded = settings.sample_s, settings.averaged, fields[:, rows], series[rows]
         return kernels.advance(state, model, sums, work, *recorded)
 
-    return march
+    def march_by_samples(rows: slice) -> int:
+        for row in range(rows.start, rows.stop):
+            for follow in followers:
+                follow(settings.sample_s)
+            if not march(slice(row, row + 1)):
+                return row - rows.start
+        return rows.stop - rows.start
+
+    return march_by_samples if followers else march
 
 
 def _room(
@@ -221,15 +250,19 @@ def _dataset(
     settings: Settings,
     point: OperatingPoint,
     faces: Float[np.ndarray, " faces"],
+    plume: Plume | None,
 ) -> xr.Dataset:
-    columns = field_columns(charges=len(record.state.n_i), averaged=settings.averaged)
+    columns = field_columns(
+        charges=len(record.state.n_i), averaged=settings.averaged, spreads=plume is not None
+    )
     fields = {
         name: (record.fields[place], unit, text) for name, (place, unit, text) in columns.items()
     }
     offset = point.voltage - float(model.supply[0])  # the cathode's potential
-    series = series_of(record.series, model, cathode_V=offset, sample_s=settings.sample_s)
+    sample_s = settings.sample_s
+    series = series_of(record.series, model, cathode_V=offset, sample_s=sample_s, plume=plume)
     end = end_of(record.state)
-    return labelled(fields, series, end, sample_s=settings.sample_s, faces=faces)
+    return labelled(fields, series, end, sample_s=sample_s, faces=faces)
 
 
 def _attributes(
@@ -258,7 +291,8 @@ def _attributes(
 def mass_balance(field: xr.Dataset, model: AxialModel, seconds: float) -> float:
     """Propellant that left plus propellant that accumulated, over propellant that entered."""
     heavy = [name for name in field.data_vars if str(name).startswith("dn_")]
-    gained = sum(field[name].mean("time").astype(float) for name in heavy)
+    area = field["area"].astype(float) if "area" in field else 1.0
+    gained = sum((field[name] * area).mean("time").astype(float) for name in heavy)
     per_area = model.ion_mass * model.area
     accumulated = per_area * float((gained * field["dz"]).sum()) * seconds
     return (float(field["mass_out"][-1]) + accumulated) / (

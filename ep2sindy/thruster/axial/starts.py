@@ -32,10 +32,10 @@ Profile = Float[np.ndarray, " cells"]
 END = "end_"
 SPECIES = ("n_i", "flux_i")  # one array for every charge
 CELLS = ("n_n", "T_e_eV", "energy_e", "drift_eV", "E_z", "wall_loss_rate")
-RATES = ("R_ion", "R_double", "R_second")
+RATES = ("R_ion", "R_double", "R_second", "R_triple", "R_ion_double", "R_third")
 UNITS = {
     "n_i": "m^-3", "flux_i": "m^-2/s", "n_n": "m^-3", "T_e_eV": "eV", "energy_e": "eV*m^-3",
-    "drift_eV": "eV", "E_z": "V/m", "wall_loss_rate": "1/s",
+    "drift_eV": "eV", "E_z": "V/m", "wall_loss_rate": "1/s", "tangent": "1",
     **dict.fromkeys(RATES, "m^3/s"),
 }  # fmt: skip
 # A run can continue another one only if these are equal.
@@ -43,6 +43,9 @@ FIXED = (
     "channel_length", "domain_length", "inner_radius", "outer_radius", "propellant",
     "charge_states",
 )  # fmt: skip
+
+
+FIRST_SHARES = (0.01, 0.001)  # of the electrons, from ions of charge 2 and 3
 
 
 class Beginning(NamedTuple):
@@ -176,6 +179,8 @@ class Restart:
         ions, flux = ([cells(_of(name, k)) for k in range(charges)] for name in SPECIES)
         state = _state(parameters, ions, flux, cells("n_n"), cells("T_e_eV"))
         state.drift_eV[1:-1] = cells("drift_eV")[1:-1]
+        if END + "tangent" in self._end:
+            state.tangent[:] = cells("tangent")
         current = state.instant[CURRENT] = float(self._end.attrs["end_I_d"])
         state.instant[SUPPLY_CURRENT] = self._end.attrs.get("end_I_supply", current)
         at_rest = model.supply[0] - model.resistance * current
@@ -184,7 +189,7 @@ class Restart:
             return Beginning(state, note=f"interpolated from {points.size} to {z.size - 2} cells")
         state.energy[:], state.E[:] = cells("energy_e"), cells("E_z")
         state.wall_loss[:] = cells("wall_loss_rate")
-        for k, name in enumerate(RATES[: 1 if charges == 1 else 3]):
+        for k, name in enumerate(RATES[: len(state.rates)]):
             state.rates[k] = cells(name)
         return Beginning(state, whole=True)
 
@@ -207,8 +212,10 @@ def end_of(state: AxialState) -> dict[str, tuple[Profile, str]]:
     kept = dict(zip(CELLS, cells, strict=True))
     for k in range(charges):
         kept |= {_of("n_i", k): state.n_i[k], _of("flux_i", k): state.flux_i[k]}
-    kept |= {name: state.rates[k] for k, name in enumerate(RATES[: 1 if charges == 1 else 3])}
-    return {END + n: (v[1:-1].copy(), UNITS[n.rstrip("2")]) for n, v in kept.items()}
+    kept |= dict(zip(RATES, state.rates, strict=False))
+    if state.tangent.any():
+        kept["tangent"] = state.tangent
+    return {END + n: (v[1:-1].copy(), UNITS[n.rstrip("23")]) for n, v in kept.items()}
 
 
 def _state(
@@ -221,22 +228,23 @@ def _state(
     """A state with these profiles; a single ion profile means singly charged ions."""
     size, charges = n_n.size, json.loads(parameters)["thruster"]["charge_states"]
     n, g = np.array(n_i), np.array(flux_i)
-    if len(n) < charges:  # one per cent of the electrons come from doubly charged ions
-        n = np.concatenate([0.99 * n, 0.005 * n])
-        g = np.concatenate([0.99 * g, 0.005 * np.sqrt(2.0) * g])
+    if len(n) < charges:  # few electrons come from ions of higher charges
+        shares = np.array(FIRST_SHARES[: charges - 1])
+        given = np.append(1.0 - shares.sum(), shares / np.arange(2.0, charges + 1.0))[:, None]
+        n, g = given * n, given * np.sqrt(np.arange(1.0, charges + 1.0))[:, None] * g
     n_e = n.T @ np.arange(1.0, charges + 1.0)
     zeros = np.zeros((3, size))
     return AxialState(
         n_i=n, flux_i=g, n_n=n_n.copy(), T_e_eV=T_e_eV.copy(), energy=1.5 * n_e * T_e_eV,
         drift_eV=zeros[0], n_e=n_e, flux_q=zeros[1], log_n=np.ones((2, size)), E=zeros[2],
-        rates=np.zeros((1 if charges == 1 else 3, size)), wall_loss=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
+        rates=np.zeros((1 + charges * (charges + 1) // 2 - 1, size)), wall_loss=np.zeros(size), tangent=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
         clock=np.zeros(1), hottest_eV=np.zeros(1),
     )  # fmt: skip
 
 
 def stored_energy(state: AxialState, model: AxialModel) -> float:
     """Thermal energy of the electrons in J."""
-    return E_CHARGE * model.area * float(state.energy[1:-1] @ model.dz[1:-1])
+    return E_CHARGE * model.area * float((state.energy * model.spread)[1:-1] @ model.dz[1:-1])
 
 
 def _ended_run(run: xr.Dataset | str | Path) -> xr.Dataset:

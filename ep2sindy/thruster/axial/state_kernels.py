@@ -37,14 +37,14 @@ SHORTEST_STEP = 1e-5  # of a sample: a run that needs shorter steps has diverged
 
 # Quantities recorded, in the order of `Sums.cells`: averages over a sample, or its last values.
 CELL_SUMS = (
-    N_N, T_E, R_ION, E_Z, IONIZATION, WALL_LOSS, ENERGY, FACE_N, CHANGE_N,
+    N_N, T_E, R_ION, E_Z, IONIZATION, WALL_LOSS, ENERGY, FACE_N, CHANGE_N, SPREAD,
     N_I, U_IZ, FLUX_I, FACE_I, CHANGE_I,
-) = range(14)  # fmt: skip
+) = range(15)  # fmt: skip
 PER_CHARGE = 5  # the last five repeat for every further charge state
 SERIES_SUMS = (
     CURRENT, THRUST, WALL_CURRENT, BEAM, IONS_OUT, NEUTRALS_OUT,
-    POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE, VOLTAGE, SUPPLY, SUPPLY_CURRENT,
-) = range(15)  # fmt: skip
+    POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE, VOLTAGE, SUPPLY, SUPPLY_CURRENT, TANGENT,
+) = range(16)  # fmt: skip
 
 
 # Unsigned indices: numba wraps negative ones around, which prevents vectorisation.
@@ -126,6 +126,7 @@ class AxialState(NamedTuple):
     E: np.ndarray  # (n + 2,), V/m
     rates: np.ndarray  # (1 + k, n + 2), m^3/s: X -> X+ and the model's further ionisations
     wall_loss: np.ndarray  # (n + 2,), 1/s, of singly charged ions
+    tangent: np.ndarray  # (n + 2,), of the plume's half-angle
     instant: np.ndarray  # (series,), the series' present values
     clock: np.ndarray  # (1,), s since the record began
     hottest_eV: np.ndarray  # (1,), highest T_e + 2 K/3 at the ends of samples

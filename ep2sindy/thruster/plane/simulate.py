@@ -17,7 +17,7 @@ from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.closures import TABLE_STEP_EV, closure_table
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
-from ep2sindy.thruster.parameters import OperatingPoint, Thruster
+from ep2sindy.thruster.parameters import NeutralSpeed, OperatingPoint, Thruster
 from ep2sindy.thruster.plane import state_kernels as kernels
 from ep2sindy.thruster.plane.grid import MaskedGrid
 from ep2sindy.thruster.plane.kernels import advance
@@ -230,8 +230,11 @@ def check_thruster(thruster: Thruster, point: OperatingPoint) -> None:
     unsolved = {
         "an AnodeSheath": not isinstance(thruster.anode, FixedAnode),
         "a circuit": thruster.circuit is not None,
+        "a plume that spreads": thruster.plume is not None,
         "a supply whose voltage varies": point.supply is not None,
-        "charge_states 2": thruster.charge_states > 1,
+        "a background gas": point.background is not None,
+        "a neutral speed that varies": isinstance(point.neutral_speed, NeutralSpeed),
+        f"charge_states {thruster.charge_states}": thruster.highest_charge > 1,
         "conduction_coulomb": thruster.conduction_coulomb > 0.0,
         "an anode and a cathode of different T_e_eV": (
             thruster.anode.T_e_eV != thruster.cathode_T_e_eV
@@ -286,7 +289,7 @@ def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> 
         ion_mass=mass,
         ion_sound_squared=K_BOLTZMANN * thruster.ion_temperature / mass,
         electron_sound_squared=E_CHARGE / mass,
-        neutral_speed=point.neutral_speed,
+        neutral_speed=float(point.neutral_speed_at(np.zeros(1))[0]),
         neutral_diffusion=NEUTRAL_DIFFUSION,
         neutral_inflow=1e-6 * point.mass_flow_mg_s / (mass * thruster.area),
         voltage=point.voltage - thruster.cathode_potential,
@@ -296,7 +299,7 @@ def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> 
         boundary_T_e_eV=thruster.cathode_T_e_eV,
         cfl=CFL,
         omega_ce=omega_ce,
-        anomalous=thruster.transport.at(distance) * omega_ce,
+        anomalous=thruster.transport_at(distance, point.background) * omega_ce,
         table=plane_table(thruster),
         table_step_eV=TABLE_STEP_EV,
     )
