@@ -24,6 +24,7 @@ from ep2sindy.thruster.axial.state_kernels import (
 from ep2sindy.thruster.constants import E_CHARGE
 
 TINY = 1e-60  # avoids 0/0
+RAREST = 1e-12  # least density of a higher charge, of the first: near the anode nothing makes them
 
 
 @compiled(**LOOP)
@@ -179,6 +180,16 @@ def follow_neutrals(
         new[i] = keep * new[i] + take * (nn[i] + dt * d_nn)
 
 
+@compiled(**LOOP)
+def hold_above_zero(n, g, n_1, g_1):
+    """Let rare ions of a higher charge move with the singly charged ones."""
+    for i in inside(n):
+        least = RAREST * n_1[i]
+        rare = n[i] < least
+        n[i] = least if rare else n[i]
+        g[i] = RAREST * g_1[i] if rare else g[i]
+
+
 @compiled(**FAST)
 def stage_of_ions(k, new, new_g, n, g, keep, dt, state, model, sums, w):
     """One stage of Heun's step for ions of charge k + 1; returns their flux into the anode."""
@@ -211,6 +222,8 @@ def stage(new, new_g, new_nn, n, g, nn, keep, dt, state, model, sums, w):
     at_anode = 0.0
     for k in range(n.shape[0]):
         at_anode += stage_of_ions(k, new[k], new_g[k], n[k], g[k], keep, dt, state, model, sums, w)
+    for k in range(1, n.shape[0]):
+        hold_above_zero(new[k], new_g[k], new[0], new_g[0])
     half_slopes(nn, model.to_left, model.to_right, model.slope_weight, w.slope_nn)
     neutral_fluxes(nn, w.slope_nn, model.neutral_speed, model.neutral_wave, flux)
     flux[0] = model.neutral_inflow - at_anode
