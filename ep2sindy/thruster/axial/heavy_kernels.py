@@ -228,7 +228,7 @@ def stage(new, new_g, new_nn, n, g, nn, keep, dt, state, model, sums, w):
     neutral_fluxes(nn, w.slope_nn, model.neutral_speed, model.neutral_wave, flux)
     flux[0] = model.neutral_inflow - at_anode
     follow_neutrals(
-        new_nn, nn, flux, w.consumed, w.neutralised, model.per_before, model.per_behind,
+        new_nn, nn, flux, w.consumed, w.neutralised, model.neutral_before, model.neutral_behind,
         sums.cells[IONIZATION], sums.cells[FACE_N], keep, dt, weight,
     )  # fmt: skip
     sums.series[NEUTRALS_OUT] += weight * flux[-2] * model.spread_at[-1]

@@ -127,14 +127,16 @@ def _circuit(thruster: Thruster, point: OperatingPoint, end_s: float) -> dict[st
 def _lengths(faces: Float[np.ndarray, " faces"]) -> dict[str, Any]:
     """The length arrays of a model: of its cells and between their centres."""
     dz, z = lengths_and_centres(faces)
-    between = np.diff(z)
+    between, before, behind = np.diff(z), 1.0 / dz, 1.0 / dz
     return {
         "dz": dz,
         "inverse_dz": 1.0 / dz,
         "spread": np.ones(dz.size),
         "spread_at": np.ones(dz.size - 1),
-        "per_before": 1.0 / dz,
-        "per_behind": 1.0 / dz,
+        "per_before": before,
+        "per_behind": behind,
+        "neutral_before": before,
+        "neutral_behind": behind,
         "per_between": 1.0 / between,
         "per_span": np.pad(1.0 / (between[1:] + between[:-1]), 1, mode="edge"),
         "to_left": np.append(1.0, dz[1:] / between),

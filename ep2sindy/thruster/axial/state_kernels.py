@@ -80,6 +80,8 @@ class AxialModel(NamedTuple):
     per_behind: np.ndarray  # (n + 2,), 1/m: of the face behind it
     ion_mass: float  # kg
     sound_speed_squared: float  # k_B T_i / m, m^2/s^2
+    neutral_before: np.ndarray  # per_before of the neutrals; another one only in comparisons
+    neutral_behind: np.ndarray
     neutral_speed: np.ndarray  # (n + 1,), m/s, at the faces
     neutral_wave: float  # m/s: wave speed beyond it in the neutrals' flux, 0 but in comparisons
     birth_speed: np.ndarray  # (n + 2,), of ions born of neutrals, m/s
