@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -44,7 +45,11 @@ from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import describe_uncovered
 from ep2sindy.thruster.recording import CHUNK_ROWS, March, record_samples, warm_up
+from ep2sindy.thruster.transport import FunctionTransport, Plasma
 from ep2sindy.thruster.verdict import outcome
+
+# Sets the model's anomalous collisions from a state, in place.
+Follow = Callable[[AxialState], None]
 
 
 def simulate(
@@ -121,7 +126,8 @@ def simulate_as(
     beginning = start.begin(model, lengths_and_centres(faces)[1], parameters)
     n_samples = sum(sample_counts(beginning, settings))
     with as_progress(progress).stage(n_samples, "sample", point.label) as advance:
-        record = run(model, beginning, settings, advance)
+        follow = follower(thruster, model, faces)
+        record = run(model, beginning, settings, advance, follow)
     field = _dataset(record, model, settings, point, faces)
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
@@ -160,8 +166,38 @@ def sample_counts(beginning: Beginning, settings: Settings) -> tuple[int, int, i
     return n_hold, n_warm_up, n_recorded + 1
 
 
-def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Advance) -> Record:
-    """Hold, warm up and record; a run that breaks ends with its last complete sample."""
+def follower(
+    thruster: Thruster, model: AxialModel, faces: Float[np.ndarray, " faces"]
+) -> Follow | None:
+    """What sets the model's collisions from a state, if the transport is a function; else None."""
+    transport = thruster.transport
+    if not isinstance(transport, FunctionTransport):
+        return None
+    distance = lengths_and_centres(faces)[1][1:-1] - thruster.channel_length
+    B = thruster.magnetic_field.at(distance)
+
+    def follow(state: AxialState) -> None:
+        cells = (state.n_e, state.T_e_eV, state.E, state.n_n)
+        n_e, T_e_eV, E, n_n = (values[1:-1].copy() for values in cells)
+        u_i = (state.flux_i.sum(axis=0) / state.n_i.sum(axis=0))[1:-1]
+        plasma = Plasma(n_e=n_e, T_e_eV=T_e_eV, E=E, n_n=n_n, u_i=u_i, B=B.copy())
+        c = transport.at(distance.copy(), float(state.clock[0]), plasma)
+        model.anomalous[:] = np.pad(c, 1, mode="edge") * model.omega_ce
+
+    return follow
+
+
+def run(
+    model: AxialModel,
+    beginning: Beginning,
+    settings: Settings,
+    advance: Advance,
+    follow: Follow | None = None,
+) -> Record:
+    """Hold, warm up and record; a run that breaks ends with its last complete sample.
+
+    follow: called before every sample, if the transport follows the plasma.
+    """
     state = beginning.state
     n_fields = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1)
     quiet = model
@@ -169,13 +205,16 @@ def run(model: AxialModel, beginning: Beginning, settings: Settings, advance: Ad
         quiet = model._replace(resistance=beginning.resistance)
     n_hold, n_warm_up, n_samples = sample_counts(beginning, settings)
     state.clock[0] = -settings.sample_s * (n_hold + n_warm_up)
+    if follow is not None:
+        follow(state)
     whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
-        march = _march(each, state, settings, *_room(n_fields, CHUNK_ROWS, state))
+        march = _march(each, state, settings, follow, *_room(n_fields, CHUNK_ROWS, state))
         whole = whole and warm_up(march, n_rows, advance) is None
     before, state.hottest_eV[0], state.clock[0] = stored_energy(state, model), 0.0, 0.0
     fields, series = _room(n_fields, n_samples if whole else 0, state)
-    filled = record_samples(_march(model, state, settings, fields, series), len(series), advance)
+    march = _march(model, state, settings, follow, fields, series)
+    filled = record_samples(march, len(series), advance)
     return Record(
         fields[:, :filled],
         series[:filled],
@@ -193,7 +232,12 @@ def first_fields(state: AxialState, model: AxialModel) -> bool:
 
 
 def _march(
-    model: AxialModel, state: AxialState, settings: Settings, fields: np.ndarray, series: np.ndarray
+    model: AxialModel,
+    state: AxialState,
+    settings: Settings,
+    follow: Follow | None,
+    fields: np.ndarray,
+    series: np.ndarray,
 ) -> March:
     """A function that records samples of a run into a slice of rows of these arrays."""
 
@@ -201,7 +245,15 @@ def _march(
         sample_s, averaged = settings.sample_s, settings.averaged
         return kernels.advance(state, model, sample_s, averaged, fields[:, rows], series[rows])
 
-    return march
+    def march_behind(rows: slice) -> int:
+        assert follow is not None
+        for row in range(rows.start, rows.stop):
+            follow(state)
+            if march(slice(row, row + 1)) == 0:
+                return row - rows.start
+        return rows.stop - rows.start
+
+    return march if follow is None else march_behind
 
 
 def _room(
