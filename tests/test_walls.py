@@ -1,5 +1,7 @@
 """Channel walls: emission, named materials, and where they act."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -88,3 +90,18 @@ def test_landmark_wall_is_the_benchmarks_formula():
 def test_bad_walls_say_what_must_hold(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_a_shielded_wall_meets_the_electrons_of_its_own_temperature():
+    """Whatever T_e is, the losses are those of an unshielded wall at that temperature."""
+    open_wall, gap = ep.thruster.SheathWall(), 0.015
+    shielded = ep.thruster.wall_material("BN-SiO2", shielded_T_e_eV=3.0)
+    T = np.array([1.0, 3.0, 40.0])
+    for name in ("ion_loss", "collision", "power"):
+        cold = getattr(open_wall, name)(np.array(3.0), gap, M_XENON)
+        np.testing.assert_allclose(getattr(shielded, name)(T, gap, M_XENON), cold)
+    with pytest.raises(ValueError, match=r"shielded_T_e_eV must be finite and positive, got 0\.0"):
+        ep.thruster.SheathWall(shielded_T_e_eV=0.0)
+    thruster = replace(ep.thruster.THRUSTER_2D, wall=shielded)
+    with pytest.raises(ValueError, match=r"does not solve a shielded wall"):
+        ep.thruster.simulate_2d(thruster, progress=False)

@@ -32,6 +32,8 @@ from ep2sindy.thruster.plume import ConicalPlume as ConicalPlume  # for configs
 from ep2sindy.thruster.plume import ThermalPlume as ThermalPlume  # for configs
 from ep2sindy.thruster.transport import AnomalousTransport as AnomalousTransport  # for configs
 from ep2sindy.thruster.transport import GaussianTransport as GaussianTransport  # for configs
+from ep2sindy.thruster.transport import FunctionTransport as FunctionTransport  # for configs
+from ep2sindy.thruster.transport import Plasma as Plasma
 from ep2sindy.thruster.transport import MultiLogTransport as MultiLogTransport  # for configs
 from ep2sindy.thruster.transport import PressureShift as PressureShift  # for configs
 from ep2sindy.thruster.walls import ExponentialWall as ExponentialWall  # for configs
@@ -39,6 +41,8 @@ from ep2sindy.thruster.walls import SheathWall as SheathWall  # for configs
 from ep2sindy.thruster.walls import wall_material as wall_material  # for configs
 from ep2sindy.thruster.walls import AnodeSheath as AnodeSheath  # for configs
 from ep2sindy.thruster.walls import FixedAnode as FixedAnode  # for configs
+from ep2sindy.thruster.instruments import ion_velocities as ion_velocities
+from ep2sindy.thruster.instruments import probe as probe
 from ep2sindy.thruster.hallthruster_input import HallThrusterInput as HallThrusterInput
 from ep2sindy.thruster.hallthruster_input import read_hallthruster_input as read_hallthruster_input
 from ep2sindy.thruster.hallthruster_input import (

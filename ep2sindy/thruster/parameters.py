@@ -20,7 +20,12 @@ from ep2sindy.thruster.magnetic_field import Field, MagneticField
 from ep2sindy.thruster.plume import Plume, relative_area
 from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
 from ep2sindy.thruster.tables import number, numbers, read_cells
-from ep2sindy.thruster.transport import AnomalousTransport, PressureShift, Transport
+from ep2sindy.thruster.transport import (
+    AnomalousTransport,
+    FunctionTransport,
+    PressureShift,
+    Transport,
+)
 from ep2sindy.thruster.walls import Anode, FixedAnode, SheathWall, Wall
 
 Volts = Float[np.ndarray, " times"]
@@ -294,7 +299,12 @@ class Thruster:
     def transport_at(
         self, distance: Float[np.ndarray, " z"], background: Background | None
     ) -> Float[np.ndarray, " z"]:
-        """Coefficient c of the transport, which a background's pressure may shift; None: vacuum."""
+        """Coefficient c of the transport, which a background's pressure may shift; None: vacuum.
+
+        A `FunctionTransport` is not known before the plasma is: NaN everywhere.
+        """
+        if isinstance(self.transport, FunctionTransport):
+            return np.full_like(distance, np.nan)
         if not isinstance(self.transport, PressureShift):
             return self.transport.at(distance)
         pressure_Pa = 0.0 if background is None else background.pressure_Pa

@@ -7,8 +7,9 @@ negative inside the channel; `PressureShift` moves any of them. Their numbers ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +20,7 @@ from ep2sindy.thruster.checks import (
     check_positive,
     check_rows,
 )
+from ep2sindy.trust.user_code import identify, load_marked
 
 Points = Sequence[float] | Float[np.ndarray, " points"]
 
@@ -132,4 +134,82 @@ class PressureShift:
         )
 
 
-Transport = BohmTransport | PressureShift
+@dataclass(frozen=True)
+class Plasma:
+    """What a transport may depend on, in the cells between anode and cathode plane, in SI.
+
+    n_e, n_n: m^-3. T_e_eV: eV. E: axial field in V/m. u_i: speed of the ions in m/s, a mean over
+    the charges. B: T.
+    """
+
+    n_e: Float[np.ndarray, " z"]
+    T_e_eV: Float[np.ndarray, " z"]
+    E: Float[np.ndarray, " z"]
+    n_n: Float[np.ndarray, " z"]
+    u_i: Float[np.ndarray, " z"]
+    B: Float[np.ndarray, " z"]
+
+
+Coefficients = Callable[[Float[np.ndarray, " z"], float, Plasma], Any]
+
+
+@dataclass(frozen=True)
+class FunctionTransport:
+    """The coefficient as a function of your own: c(z, t, plasma), once for every sample.
+
+    function: takes the distances from the exit in m, the time in s (negative in the warm-up) and a
+    `Plasma`, and gives c at each distance or one number. In a config it is the dotted name of a
+    function marked with `@ep.for_configs`, as `my_module.c`. Numbers that vary belong into a frozen
+    dataclass with `__call__`. At the very first call the field may be zero, for none is known yet.
+    identity: module, name and hash of the source, by which kept simulations are told apart.
+    Raises ValueError for a function that is not there or not known by its source.
+    """
+
+    function: Coefficients | str
+    identity: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not callable(self.function) and not isinstance(self.function, str):
+            raise ValueError(
+                "FunctionTransport.function must be a function c(z, t, plasma), or the dotted name "
+                f"of one: {self.function!r} came"
+            )
+        try:
+            identity = identify(self.called)
+        except (ModuleNotFoundError, AttributeError) as error:
+            raise ValueError(
+                "FunctionTransport.function must be a function of yours, as my_module.c, below the "
+                f"folder that you start in: {self.function!r} came, and {error}"
+            ) from error
+        object.__setattr__(self, "identity", identity)
+
+    @property
+    def called(self) -> Coefficients:
+        """The function itself."""
+        return load_marked(self.function) if isinstance(self.function, str) else self.function
+
+    def at(
+        self, distance: Float[np.ndarray, " z"], t: float, plasma: Plasma
+    ) -> Float[np.ndarray, " z"]:
+        """Coefficient c at distances from the exit in m.
+
+        Raises ValueError for another number of values, or one that is negative or not finite.
+        """
+        found = np.asarray(self.called(distance, t, plasma), dtype=float)
+        if found.shape not in ((), distance.shape):
+            raise ValueError(
+                f"a transport must give one coefficient for each of {distance.size} distances, or "
+                f"one for all: {self.identity} gave the shape {found.shape}"
+            )
+        c = np.broadcast_to(found, distance.shape)
+        good = np.isfinite(c) & (c >= 0.0)
+        if not good.all():
+            k = int(np.argmin(good))
+            raise ValueError(
+                f"a transport must be finite and zero or more everywhere: {self.identity} gave "
+                f"{c[k]:g} at {1e3 * distance[k]:.3g} mm from the exit, t = {t:g} s"
+            )
+        return c
+
+
+Transport = BohmTransport | PressureShift | FunctionTransport

@@ -46,6 +46,8 @@ class SheathWall:
     gamma) phi_w, phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e))). Beyond the exit, the share
     `plume_collisions` of the collisions and the share `plume_power` of the power remain; ions are
     lost in the channel only. transition: length in m over which the shares change at the exit.
+    shielded_T_e_eV: temperature at the walls of a magnetically shielded thruster, whose field lines
+    bring the anode's cold electrons there; it replaces T_e in all losses. None: not shielded.
     Default: BN-SiO2. Sources: Marks et al., JOSS 8 (2023) 4672; Goebel & Katz, chapter 7.
     """
 
@@ -56,9 +58,12 @@ class SheathWall:
     plume_collisions: float = 1.0
     plume_power: float = 1.0
     transition: float = 0.0  # m
+    shielded_T_e_eV: float | None = None
 
     def __post_init__(self) -> None:
         check_positive(self, "crossover_eV")
+        if self.shielded_T_e_eV is not None:
+            check_positive(self, "shielded_T_e_eV")
         check_not_negative(
             self, "yield_0", "electron_scale", "ion_scale", "plume_collisions", "plume_power",
             "transition",
@@ -72,22 +77,29 @@ class SheathWall:
         linear = self.yield_0 + (1.0 - self.yield_0) * 1.5 * T_e_eV / self.crossover_eV
         return np.minimum(limit, linear)
 
+    def _at_wall(self, T_e_eV: FloatArray) -> FloatArray:
+        """Temperature of the electrons that reach the wall."""
+        if self.shielded_T_e_eV is None:
+            return T_e_eV
+        return np.full_like(T_e_eV, self.shielded_T_e_eV)
+
     def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
         """Frequency at which an ion reaches the wall, in 1/s; gap: channel width in m."""
-        bohm = np.sqrt(E_CHARGE * T_e_eV / ion_mass)
+        bohm = np.sqrt(E_CHARGE * self._at_wall(T_e_eV) / ion_mass)
         return self.ion_scale * SHEATH_DENSITY_RATIO * bohm / gap
 
     def collision(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
         """Frequency at which an electron reaches the wall, in 1/s."""
-        bohm = np.sqrt(E_CHARGE * T_e_eV / ion_mass)
-        arriving = self.electron_scale * SHEATH_DENSITY_RATIO * bohm / gap
-        return arriving / (1.0 - self.emission(T_e_eV, ion_mass))
+        T = self._at_wall(T_e_eV)
+        arriving = self.electron_scale * SHEATH_DENSITY_RATIO * np.sqrt(E_CHARGE * T / ion_mass)
+        return arriving / gap / (1.0 - self.emission(T, ion_mass))
 
     def power(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
         """Power lost to the wall per electron, in eV/s."""
-        kept = 1.0 - self.emission(T_e_eV, ion_mass)
-        sheath = T_e_eV * np.log(kept * np.sqrt(ion_mass / (2.0 * np.pi * M_ELECTRON)))
-        return self.collision(T_e_eV, gap, ion_mass) * (2.0 * T_e_eV + kept * sheath)
+        T = self._at_wall(T_e_eV)
+        kept = 1.0 - self.emission(T, ion_mass)
+        sheath = T * np.log(kept * np.sqrt(ion_mass / (2.0 * np.pi * M_ELECTRON)))
+        return self.collision(T, gap, ion_mass) * (2.0 * T + kept * sheath)
 
     def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """Share of the ion loss at a distance from the exit in m, negative inside."""
@@ -110,6 +122,7 @@ def wall_material(
     plume_collisions: float = 1.0,
     plume_power: float = 1.0,
     transition: float = 0.0,
+    shielded_T_e_eV: float | None = None,
 ) -> SheathWall:
     """A wall of a named material: BN-SiO2, BN, alumina, SiC or SiO2; the rest as `SheathWall`."""
     if name not in MATERIALS:
@@ -119,8 +132,9 @@ def wall_material(
         )
     yield_0, crossover_eV = MATERIALS[name]
     return SheathWall(
-        yield_0, crossover_eV, electron_scale, ion_scale, plume_collisions, plume_power, transition
-    )
+        yield_0, crossover_eV, electron_scale, ion_scale, plume_collisions, plume_power, transition,
+        shielded_T_e_eV,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

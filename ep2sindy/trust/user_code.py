@@ -7,6 +7,8 @@ may hold files by others that shadow module names, so nothing in it is imported 
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -85,6 +87,45 @@ def for_configs(call: Called) -> Called:
 
 def is_for_configs(value: object) -> bool:
     return getattr(value, MARK, None) is value
+
+
+def identify(call: Callable[..., Any]) -> str:
+    """Module and name of a function or of a callable's class, with a hash of the file it is from.
+
+    A function that is not from a file (typed at a prompt) is known by its compiled code.
+    Raises ValueError for what a source does not tell apart: a function that holds values of the one
+    around it, and a callable whose class is no frozen dataclass, such as functools.partial.
+    """
+    is_function = inspect.isfunction(call)
+    named: Any = call if is_function else type(call)
+    settings = vars(named).get("__dataclass_params__")
+    if not (call.__closure__ is None if is_function else settings and settings.frozen):
+        raise ValueError(
+            "a function must be known by its source, so it must hold no values of its own: "
+            f"{call!r} came; write its numbers into it, or make it a frozen dataclass with __call__"
+        )
+    try:
+        source = Path(inspect.getfile(named)).read_bytes()
+    except (OSError, TypeError):
+        code = (named if is_function else named.__call__).__code__
+        source = repr((code.co_code, code.co_consts, code.co_names)).encode()
+    defaults = repr(call.__defaults__) if is_function else ""
+    digest = hashlib.sha256(source + defaults.encode()).hexdigest()[:16]
+    return f"{named.__module__}.{named.__qualname__} {digest}"
+
+
+def load_marked(name: str) -> Any:
+    """A function or class that the user has marked, by its dotted name; see `load_user_module`.
+
+    Raises ModuleNotFoundError or AttributeError if it is not there, ValueError if it is not marked.
+    """
+    module, _, last = name.rpartition(".")
+    found = getattr(load_user_module(module), last)
+    if not is_for_configs(found):
+        raise ValueError(
+            f"{name} must be for configs: mark it with @ep.for_configs where it is defined"
+        )
+    return found
 
 
 def load_user_module(name: str) -> ModuleType:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial import kernels
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
+from ep2sindy.thruster.axial.followers import Follower, followers_of
 from ep2sindy.thruster.axial.model import CFL, build_model, cell_faces, lengths_and_centres
 from ep2sindy.thruster.axial.output import (
     POWERS,
@@ -23,7 +24,6 @@ from ep2sindy.thruster.axial.output import (
     series_of,
 )
 from ep2sindy.thruster.axial.settings import Settings, to_json
-from ep2sindy.thruster.axial.spreading import Spreading
 from ep2sindy.thruster.axial.starts import (
     Beginning,
     GuessedStart,
@@ -124,8 +124,7 @@ def simulate_as(
         reconstruct=settings.reconstruct, coldest_eV=settings.coldest_T_e_eV,
     )  # fmt: skip
     beginning = start.begin(model, lengths_and_centres(faces)[1], parameters)
-    spreading = Spreading(thruster, model, beginning.state, faces)
-    followers = [spreading.follow] if spreading.follows else []
+    followers = followers_of(thruster, model, beginning.state, faces)
     n_samples = sum(sample_counts(beginning, settings))
     with as_progress(progress).stage(n_samples, "sample", point.label) as advance:
         record = run(model, beginning, settings, advance, followers)
@@ -146,11 +145,6 @@ def as_start(initial: Start | xr.Dataset | str | Path | None) -> Start:
     if isinstance(initial, xr.Dataset | str | Path):
         return Restart(initial)
     return initial
-
-
-# What depends on the plasma and changes little in a sample, such as the areas of a plume, is set
-# before each one, outside the compiled loop; the argument is the length of the sample in s.
-Follower = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +181,8 @@ def run(
         quiet = model._replace(resistance=beginning.resistance)
     n_hold, n_warm_up, n_samples = sample_counts(beginning, settings)
     state.clock[0] = -settings.sample_s * (n_hold + n_warm_up)
+    for follow in followers:
+        follow(0.0)
     whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
         march = _march(each, state, settings, *_room(n_fields, CHUNK_ROWS, state), followers)

@@ -237,7 +237,8 @@ def _state(
     return AxialState(
         n_i=n, flux_i=g, n_n=n_n.copy(), T_e_eV=T_e_eV.copy(), energy=1.5 * n_e * T_e_eV,
         drift_eV=zeros[0], n_e=n_e, flux_q=zeros[1], log_n=np.ones((2, size)), E=zeros[2],
-        rates=np.zeros((1 + charges * (charges + 1) // 2 - 1, size)), wall_loss=np.zeros(size), tangent=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
+        rates=np.zeros((charges * (charges + 1) // 2, size)), wall_loss=np.zeros(size),
+        tangent=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
         clock=np.zeros(1), hottest_eV=np.zeros(1),
     )  # fmt: skip
 

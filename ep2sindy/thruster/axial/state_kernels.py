@@ -43,7 +43,8 @@ CELL_SUMS = (
 PER_CHARGE = 5  # the last five repeat for every further charge state
 SERIES_SUMS = (
     CURRENT, THRUST, WALL_CURRENT, BEAM, IONS_OUT, NEUTRALS_OUT,
-    POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE, VOLTAGE, SUPPLY, SUPPLY_CURRENT, TANGENT,
+    POWER, P_IONS, P_INELASTIC, P_WALL, P_ANODE, P_CATHODE, VOLTAGE, SUPPLY, SUPPLY_CURRENT,
+    TANGENT,
 ) = range(16)  # fmt: skip
 
 
@@ -188,6 +189,4 @@ class Work(NamedTuple):
 def new_work(charges: int, size: int) -> Work:
     """Zeros for cells, with ghosts, of this number."""
     per_charge = ("gain", "push", "stage_n", "stage_flux")
-    return Work(
-        **{k: np.zeros((charges, size) if k in per_charge else size) for k in Work._fields}
-    )
+    return Work(**{k: np.zeros((charges, size) if k in per_charge else size) for k in Work._fields})

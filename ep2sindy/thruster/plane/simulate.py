@@ -31,7 +31,7 @@ from ep2sindy.thruster.recording import (
     record_samples,
     warm_up,
 )
-from ep2sindy.thruster.transport import AnomalousTransport
+from ep2sindy.thruster.transport import AnomalousTransport, FunctionTransport
 from ep2sindy.thruster.verdict import outcome
 from ep2sindy.thruster.walls import SHEATH_DENSITY_RATIO, FixedAnode, SheathWall
 
@@ -230,8 +230,10 @@ def check_thruster(thruster: Thruster, point: OperatingPoint) -> None:
     unsolved = {
         "an AnodeSheath": not isinstance(thruster.anode, FixedAnode),
         "a circuit": thruster.circuit is not None,
+        "a shielded wall": thruster.wall.shielded_T_e_eV is not None,
         "a plume that spreads": thruster.plume is not None,
         "a supply whose voltage varies": point.supply is not None,
+        "a transport by a function": isinstance(thruster.transport, FunctionTransport),
         "a background gas": point.background is not None,
         "a neutral speed that varies": isinstance(point.neutral_speed, NeutralSpeed),
         f"charge_states {thruster.charge_states}": thruster.highest_charge > 1,
