@@ -142,7 +142,7 @@ def wall_of(node: Node, *, transition: float, plume_power: float, ion_losses: bo
         wall = wall_material(
             MATERIALS[material],
             electron_scale=scale,
-            ion_scale=1.0 if ion_losses else 0.0,
+            ion_scale=scale if ion_losses else 0.0,
             plume_collisions=0.0,
             plume_power=plume_power,
             transition=transition,

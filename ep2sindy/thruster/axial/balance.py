@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 
 NEEDED = ("dn_i_dt", "dn_n_dt", "face_flux_i", "face_flux_n", "ionization", "wall_loss", "dz")
+CHARGES = ("", "2", "3")  # ends of the names of variables that every charge has
 
 
 def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
@@ -35,8 +36,7 @@ def zone_balance(field: xr.Dataset, z: tuple[float, float]) -> xr.Dataset:
 
     def summed(name: str) -> np.ndarray:
         """Sum over the charge states of the run."""
-        charges = (name, f"{name}2", f"{name}3")
-        found = [field[each].values for each in charges if each in field]
+        found = [field[each].values for k in CHARGES if (each := name + k) in field]
         return np.sum(found, axis=0, dtype=float)
 
     def mean(name: str) -> np.ndarray:

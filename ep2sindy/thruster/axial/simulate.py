@@ -15,8 +15,14 @@ from jaxtyping import Float
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial import kernels
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
-from ep2sindy.thruster.axial.followers import Follower, followers_of
-from ep2sindy.thruster.axial.model import CFL, build_model, cell_faces, lengths_and_centres
+from ep2sindy.thruster.axial.model import (
+    CFL,
+    Follower,
+    build_model,
+    cell_faces,
+    followers_of,
+    lengths_and_centres,
+)
 from ep2sindy.thruster.axial.output import (
     POWERS,
     field_columns,

@@ -147,7 +147,7 @@ def new_sums(n_cell_sums: int, size: int) -> Sums:
     return Sums(np.zeros((n_cell_sums, size)), np.zeros(len(SERIES_SUMS)))
 
 
-class Work(NamedTuple):
+class Scratch(NamedTuple):
     """Arrays of the loop that no step needs from the one before."""
 
     u: np.ndarray  # (n + 2,), as all that follow but where said
@@ -186,7 +186,8 @@ class Work(NamedTuple):
     before: np.ndarray  # T_e before the step
 
 
-def new_work(charges: int, size: int) -> Work:
+def new_work(charges: int, size: int) -> Scratch:
     """Zeros for cells, with ghosts, of this number."""
     per_charge = ("gain", "push", "stage_n", "stage_flux")
-    return Work(**{k: np.zeros((charges, size) if k in per_charge else size) for k in Work._fields})
+    shapes = {k: (charges, size) if k in per_charge else size for k in Scratch._fields}
+    return Scratch(**{k: np.zeros(shape) for k, shape in shapes.items()})
