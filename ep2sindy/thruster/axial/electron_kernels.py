@@ -221,13 +221,13 @@ def heat_through_faces(g, total, kappa, model, down, up):
 
     Patankar's power law, which is within 3 % of the exact flux between two fixed temperatures:
     central where conduction dominates, upwind where convection does (Patankar, Numerical Heat
-    Transfer and Fluid Flow, 1980, section 5.2-6).
+    Transfer and Fluid Flow, 1980, section 5.2-6). Without slopes, upwind everywhere.
     """
-    per_between, spread = model.per_between, model.spread_at
+    per_between, spread, steep = model.per_between, model.spread_at, 0.1 * model.slope_weight
     for i in faces(g):
         flux = 2.5 * (0.5 * (g[i] + g[i + ONE]) - total / spread[i])
         conducting = 0.5 * (kappa[i] + kappa[i + ONE]) * per_between[i]
-        conducting *= max(1.0 - 0.1 * abs(flux) / conducting, 0.0) ** 5
+        conducting *= max(1.0 - steep * abs(flux) / conducting, 0.0) ** 5
         down[i] = max(flux, 0.0) + conducting
         up[i] = min(flux, 0.0) - conducting
 
