@@ -14,7 +14,7 @@ TORR = 133.322  # Pa
 POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 GAUSS = ep.thruster.GaussianTransport()
 SHIFT = ep.thruster.PressureShift(
-    GAUSS, z0=-0.17682, dz=0.3594, pressure_Pa=4.735e-5 * TORR, alpha=15
+    GAUSS, z0=-0.17682, dz=0.3594, pressure_Pa=4.735e-5 * TORR, alpha=15.0
 )
 Z = np.linspace(-0.02, 0.02, 81)
 

@@ -130,7 +130,8 @@ def test_a_config_names_a_marked_function(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     Path("bohm_of_mine.py").write_text(text.format(0.02))
     made = ep.thruster.FunctionTransport("bohm_of_mine.c")
-    np.testing.assert_array_equal(made.at(np.zeros(2), 0.0, None), [0.02, 0.02])
+    plasma = ep.thruster.Plasma(*np.zeros((6, 2)))
+    np.testing.assert_array_equal(made.at(np.zeros(2), 0.0, plasma), [0.02, 0.02])
     assert made.identity.startswith("bohm_of_mine.c ")
     with pytest.raises(ValueError, match=r"bohm_of_mine\.bare must be for configs: mark it with"):
         ep.thruster.FunctionTransport("bohm_of_mine.bare")

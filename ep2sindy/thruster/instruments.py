@@ -27,9 +27,10 @@ def ion_velocities(
     Ions born in a place at the rate `ionization`, with the neutrals' speed u_n (or at rest), have
     u^2 = u_n^2 + 2 e (drop of the potential since)/m and the density (rate dz)/u. Each sample is
     taken as steady, since ions cross the thruster in a few samples; its densities are added up over
-    the record. Left out: losses to walls, collisions, ions that move towards the anode, and the
-    share of births with two charges. The fluid has one velocity in a place, so its u_iz agrees with
-    the mean of f where ions are born upstream, and is up to 15 % above it where they are born.
+    the record. Left out: losses to walls, collisions, a plume that spreads, ions that move towards
+    the anode, and that some are born with two charges. The fluid has one velocity in a place: its
+    u_iz agrees with the mean of f where ions come from upstream, and is some 15 % above it where
+    they are born.
 
     field: record of `simulate` with averages. z: places in m from the anode. speeds: edges of bins
     in m/s, increasing; None takes 200 up to the fastest ion. Returns f in s/m on (z, u), with u at
@@ -63,7 +64,7 @@ def _ions(field: xr.Dataset) -> tuple[float, float, float]:
     parameters = read_json(field.attrs["parameters"])
     thruster, speed = parameters["thruster"], parameters["operating_point"]["neutral_speed"]
     mass = float(thruster["propellant"].get("mass", M_XENON))  # formulas are of xenon
-    if isinstance(speed, dict):  # a NeutralSpeed: by its mean, 1 % of the ions' speed
+    if isinstance(speed, dict):  # a NeutralSpeed: its mean, for it hardly counts
         speed = float(np.mean(speed["speed"]))
     return mass, 0.0 if thruster["ions_born_at_rest"] else float(speed), 2.0 * E_CHARGE / mass
 

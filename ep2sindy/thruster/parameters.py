@@ -23,6 +23,7 @@ from ep2sindy.thruster.tables import number, numbers, read_cells
 from ep2sindy.thruster.transport import (
     AnomalousTransport,
     FunctionTransport,
+    Points,
     PressureShift,
     Transport,
 )
@@ -178,8 +179,8 @@ class NeutralSpeed:
     Raises ValueError for gaps, points out of order, or a speed that is not positive.
     """
 
-    distance: tuple[float, ...]
-    speed: tuple[float, ...]
+    distance: Points
+    speed: Points
 
     def __post_init__(self) -> None:
         for name in ("distance", "speed"):

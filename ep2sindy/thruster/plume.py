@@ -53,8 +53,8 @@ class ThermalPlume:
     The tangent is sqrt(5 e T_e/(3 m)) / u_i with T_e at the exit, at most 1; slower ions and those
     that move back spread by 45 degrees. u_i is the mean over the charges, weighted by density.
     axial_thrust: as for `ConicalPlume`, with the half-angle at the cathode plane.
-    Source: the plume of HallThruster.jl (Marks et al., JOSS 8 (2023) 4672), which holds the tangent
-    at pi/4 or not at all, by version.
+    Source: the plume of HallThruster.jl, Marks et al., JOSS 8 (2023) 4672; its older versions hold
+    the tangent at pi/4 or not at all.
     """
 
     axial_thrust: bool = True
