@@ -9,7 +9,7 @@ import ep2sindy as ep
 from benchmarks.hallthruster import calibrated_run
 from ep2sindy.thruster.axial.electron_kernels import solve_from_both_ends
 from ep2sindy.thruster.axial.model import cell_faces
-from ep2sindy.thruster.verdict import diagnose, judge_status
+from ep2sindy.thruster.verdict import cycle_peaks, diagnose, judge_status, multiplicity
 
 POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 BRIEF = {
@@ -282,3 +282,22 @@ def test_rates_that_do_not_cover_the_run_say_so():
     assert float(field["T_e_eV"].max()) < 30.0
     assert "cover T_e up to 30 eV" in field.attrs["rates"]
     assert simulate().attrs["rates"] == "covered"
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_a_cycle_that_repeats_after_m_has_that_multiplicity(m):
+    t = 1.5e-6 * np.arange(6000)
+    heights = 1.0 + np.arange(m) / m
+    current = 4.0 + heights[np.floor(15e3 * t).astype(int) % m] * np.sin(2 * np.pi * 15e3 * t)
+    peaks = cycle_peaks(current, 1.5e-6, 15e3)
+    assert peaks.size == 135
+    again, spread = multiplicity(peaks)
+    assert again == m
+    assert spread == pytest.approx(heights.std() / (4.0 + heights.mean()), abs=2e-3)
+
+
+def test_peaks_without_order_have_a_spread_and_no_multiplicity():
+    again, spread = multiplicity(5.0 + np.random.default_rng(0).normal(size=400))
+    assert np.isnan(again)
+    assert spread == pytest.approx(0.2, rel=0.1)
+    assert np.isnan(multiplicity(np.ones(5))).all()

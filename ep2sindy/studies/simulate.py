@@ -52,13 +52,13 @@ CAPTIONS = {
     "are ionised, and fill it again. Dashed: the channel's exit.",
 }
 NUMBERS = (
-    "f_kHz", "I_d_mean", "I_d_std", "thrust_N", "isp_s", "anode_efficiency", "I_beam_mean",
-    "I_wall_mean", "mass_balance", "energy_balance",
+    "f_kHz", "multiplicity", "peak_spread", "I_d_mean", "I_d_std", "thrust_N", "isp_s",
+    "anode_efficiency", "I_beam_mean", "I_wall_mean", "mass_balance", "energy_balance",
 )  # fmt: skip
 FAILED = "failed"
 SCANNED = (
-    "f_kHz", "I_d_mean", "I_d_std", "thrust_N", "isp_s", "anode_efficiency", "mass_balance",
-    "energy_balance",
+    "f_kHz", "multiplicity", "peak_spread", "I_d_mean", "I_d_std", "thrust_N", "isp_s",
+    "anode_efficiency", "mass_balance", "energy_balance",
 )  # fmt: skip
 HEADING = 9  # characters per line in a table's heading
 MAP = (
@@ -298,6 +298,7 @@ class Outcome:
                 places(n["I_d_std"], 2), f"A, {share} % of the mean"
             ),
             f"{mode} frequency": _with(places(n["f_kHz"], 2), "kHz"),
+            "peaks of the current": _peaks(n),
             "thrust": _with(places(1e3 * n["thrust_N"], 1), "mN"),
             "specific impulse": _with(places(n["isp_s"], 0), "s"),
             "anode efficiency": _with(places(100.0 * n["anode_efficiency"], 1), "%"),
@@ -330,6 +331,16 @@ class Outcome:
 
 def _with(number: str, unit: str) -> str:
     return number if number == "-" else f"{number} {unit}"
+
+
+def _peaks(numbers: Mapping[str, float]) -> str:
+    """How the current's peaks differ from cycle to cycle; `-` where nothing oscillates."""
+    if not np.isfinite(numbers["peak_spread"]):
+        return "-"
+    again, spread = numbers["multiplicity"], places(100.0 * numbers["peak_spread"], 1)
+    cycles = "every cycle" if again == 1.0 else f"after {again:g} cycles"
+    repeat = f"the same {cycles}" if np.isfinite(again) else "not repeating"
+    return f"{spread} % spread, {repeat}"
 
 
 def power_table(field: xr.Dataset) -> pd.DataFrame:
@@ -454,6 +465,7 @@ class ScanOutcome:
                     "f (kHz)": places(row["f_kHz"], 1),
                     "thrust (mN)": places(1e3 * row["thrust_N"], 1),
                     "efficiency (%)": places(100.0 * row["anode_efficiency"], 1),
+                    "spread of peaks (%)": places(100.0 * row["peak_spread"], 1),
                     "mass balance": places(row["mass_balance"], 4),
                     "energy balance": places(row["energy_balance"], 4),
                 }

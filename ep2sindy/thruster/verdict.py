@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
+from scipy.signal import find_peaks
 
 from ep2sindy.signals.oscillation import SIMULATED, oscillation
 from ep2sindy.signals.spectrum import dominant_frequency
@@ -19,6 +20,7 @@ STANDARD_GRAVITY = 9.80665  # m/s^2, exact (CGPM 1901)
 TRANSIT_HZ = 60e3  # ions cross the domain in microseconds; the breathing mode is slower
 BREATHING = replace(SIMULATED, max_Hz=TRANSIT_HZ)
 STRONG_SHARE = 0.9  # of the mean: the strong cycle has a larger standard deviation
+SAME_PEAKS, MOST_CYCLES = 0.01, 16  # of their mean; how many cycles it takes to tell
 OUT_SHARE = 0.1  # of the current that the gas carries if each of its atoms is ionised once
 
 
@@ -35,10 +37,33 @@ def judge_status(current: Float[np.ndarray, " time"], sample_s: float) -> str:
     return str(oscillation(sample_s * np.arange(late.size), late[:, None], BREATHING))
 
 
+def cycle_peaks(
+    current: Float[np.ndarray, " time"], sample_s: float, f_Hz: float
+) -> Float[np.ndarray, " cycles"]:
+    """Highest current of every cycle in A: peaks above the mean, at least 0.6 of a period apart."""
+    apart = max(0.6 / (f_Hz * sample_s), 1.0)
+    return find_peaks(current, height=current.mean(), distance=apart)[1]["peak_heights"]
+
+
+def multiplicity(peaks: Float[np.ndarray, " cycles"]) -> tuple[float, float]:
+    """After how many cycles the peaks come again within SAME_PEAKS of their mean, and their spread.
+
+    The first is NaN if they do not within MOST_CYCLES; the second is their standard deviation over
+    their mean. A cycle that repeats after two or more carries another one, such as ions in transit.
+    """
+    if peaks.size < MOST_CYCLES:
+        return math.nan, math.nan
+    mean = float(peaks.mean())
+    for m in range(1, MOST_CYCLES // 2 + 1):
+        if np.sqrt(np.mean((peaks[m:] - peaks[:-m]) ** 2)) < SAME_PEAKS * mean:
+            return float(m), float(peaks.std()) / mean
+    return math.nan, float(peaks.std()) / mean
+
+
 def diagnose(field: xr.Dataset, *, diverged: bool, flow_A: float) -> dict[str, Any]:
     """Status, cycle, dominant frequency in kHz, and mean and standard deviation of the current.
 
-    flow_A: mass flow in A, one charge per atom. A discharge whose current ends far below has gone
+    For a discharge that oscillates `multiplicity` and `peak_spread`, too: see `multiplicity`. flow_A: mass flow in A, one charge per atom. A discharge whose current ends far below has gone
     out.
     """
     current, time = field["I_d"].values, field["time"].values
@@ -49,14 +74,19 @@ def diagnose(field: xr.Dataset, *, diverged: bool, flow_A: float) -> dict[str, A
     else:
         status = judge_status(current, float(time[1] - time[0]))
     moves = status in ("oscillating", "transit")
+    f_Hz = dominant_frequency(time, current) if moves else math.nan
     mean, std = (float(current.mean()), float(current.std())) if current.size else (np.nan,) * 2
-    cycle = "none"
+    cycle, again, spread = "none", math.nan, math.nan
     if status == "oscillating":
         cycle = "strong" if std > STRONG_SHARE * mean else "weak"
+        late = current[current.size // 2 :]
+        again, spread = multiplicity(cycle_peaks(late, float(time[1] - time[0]), f_Hz))
     return {
         "status": status,
         "cycle": cycle,
-        "f_kHz": 1e-3 * dominant_frequency(time, current) if moves else np.nan,
+        "f_kHz": 1e-3 * f_Hz,
+        "multiplicity": again,
+        "peak_spread": spread,
         "I_d_mean": mean,
         "I_d_std": std,
     }
