@@ -26,7 +26,7 @@ ESTIMATES = {
 }
 THREE = (
     "points=[{V_D_V: 200.0, mdot_mg_s: 5.0},{V_D_V: 300.0, mdot_mg_s: 5.0},"
-    "{V_D_V: 300.0, mdot_mg_s: 2.0, data: {operating_point: {neutral_speed: 190.0}}}]"
+    "{V_D_V: 300.0, mdot_mg_s: 2.0, data: {operating_point: {neutral_speed: 195.0}}}]"
 )
 
 LIBRARY_KEYS = "library may have ['degree', 'products', 'variables'] and needs variables and degree"

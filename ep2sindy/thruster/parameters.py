@@ -197,12 +197,19 @@ class NeutralSpeed:
         return np.interp(distance, self.distance, self.speed)
 
 
+def _tuned_wall() -> SheathWall:
+    return SheathWall(
+        electron_scale=0.8, ion_scale=0.9, plume_collisions=0.5, plume_power=0.72, transition=1e-3
+    )
+
+
 @dataclass(frozen=True)
 class Thruster:
     """Geometry, field, closures and boundary values of one thruster; the default is SPT-100-like.
 
     kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e; 4.66 and 0 are
-    Braginskii's values for singly charged ions. charge_states: highest charge of the ions,
+    Braginskii's values for singly charged ions. Transport, wall, resistance and conduction are
+    tuned (docs/thruster.md). charge_states: highest charge of the ions,
     1 to 3; None takes 2 where the gas has the rates, else 1.
     cathode_potential: potential of the cathode plane relative to the cathode (coupling voltage).
     ions_born_at_rest: if True, ionisation adds no momentum to the ions, as in LANDMARK; otherwise
@@ -218,15 +225,15 @@ class Thruster:
     transport: Transport = field(default_factory=AnomalousTransport)
     propellant: Propellant = field(default_factory=XenonFits)
     charge_states: int | None = None
-    wall: Wall = field(default_factory=SheathWall)
+    wall: Wall = field(default_factory=_tuned_wall)
     ion_temperature: float = 1000.0  # K
     anode: Anode = field(default_factory=FixedAnode)
     cathode_T_e_eV: float = 3.0
     cathode_potential: float = 20.0  # V
-    series_resistance: float = 1.0  # ohm
+    series_resistance: float = 0.85  # ohm
     circuit: Circuit | None = None  # besides the series resistance
     pressure_factor: float = 1.0  # p_e = factor n T_e
-    conduction_factor: float = 4.66
+    conduction_factor: float = 7.5
     conduction_coulomb: float = 0.0
     ions_born_at_rest: bool = False
     plume: Plume | None = None
@@ -331,7 +338,7 @@ class OperatingPoint:
 
     voltage: float  # V
     mass_flow_mg_s: float
-    neutral_speed: float | NeutralSpeed = 280.0  # m/s, tuned
+    neutral_speed: float | NeutralSpeed = 330.0  # m/s, tuned
     supply: Supply | None = None
     background: Background | None = None
 
@@ -361,7 +368,7 @@ class OperatingPoint:
 
 OPERATING_POINTS = (
     OperatingPoint(200.0, 5.0),
-    OperatingPoint(300.0, 2.0, neutral_speed=190.0),
+    OperatingPoint(300.0, 2.0, neutral_speed=195.0),
     OperatingPoint(300.0, 4.0),
     OperatingPoint(300.0, 5.0),
     OperatingPoint(300.0, 6.0),

@@ -56,8 +56,9 @@ SERIES = {
 
 # Its cycle is nearly the same on every grid from 62 x 74 on: see docs/thruster.md.
 THRUSTER_2D = Thruster(
-    transport=AnomalousTransport(c_channel=1 / 300, c_plume=1 / 160),
+    transport=AnomalousTransport(c_channel=1 / 300, c_plume=1 / 160, transition=3e-3),
     propellant=XenonFits(drift_weight=0.0),
+    wall=SheathWall(),
     conduction_factor=2.4,
     series_resistance=2.0,
 )
