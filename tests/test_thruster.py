@@ -94,7 +94,8 @@ def test_nominal_point_oscillates(short_run):
 
 def test_discharge_voltage_follows_the_series_resistance(short_run):
     drop = 300.0 - short_run["V_d"].values
-    np.testing.assert_allclose(drop, 1.0 * short_run["I_d"].values, atol=1e-11)
+    resistance = Thruster().series_resistance
+    np.testing.assert_allclose(drop, resistance * short_run["I_d"].values, atol=1e-11)
 
 
 def test_damped_discharge_is_reported():
@@ -113,11 +114,11 @@ def test_electrons_that_are_held_back_ignite_without_divergence():
     assert field.attrs["energy_balance"] == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(("sample_s", "n_samples"), [(1e-7, 1), (1.5e-6, 0)])
+@pytest.mark.parametrize(("sample_s", "n_samples"), [(1e-7, 2), (1.5e-6, 0)])
 def test_diverged_run_comes_back_marked_and_finite(sample_s, n_samples):
-    """Ten times the voltage heats the electrons beyond 200 eV at once."""
+    """Eight times the voltage heats the electrons beyond 200 eV at once."""
     settings = {"duration_s": 100 * sample_s, "warm_up_s": 0.0, "sample_s": sample_s}
-    field = simulate(Thruster(), OperatingPoint(3000.0, 5.0), **settings, progress=False)
+    field = simulate(Thruster(), OperatingPoint(2500.0, 5.0), **settings, progress=False)
     assert field.attrs["status"] == "diverged"
     assert field.attrs["cycle"] == "none"
     assert field.sizes["time"] == n_samples
@@ -178,5 +179,5 @@ def test_rate_table_with_a_missing_column_is_refused(tmp_path):
 def test_six_operating_points():
     assert len({point.label for point in OPERATING_POINTS}) == 6
     speeds = {point.label: point.neutral_speed for point in OPERATING_POINTS}
-    assert speeds.pop("300V_2mgs") == 190.0
-    assert set(speeds.values()) == {280.0}
+    assert speeds.pop("300V_2mgs") == 195.0
+    assert set(speeds.values()) == {OperatingPoint(300.0, 5.0).neutral_speed}

@@ -7,7 +7,8 @@ import ep2sindy as ep
 
 
 def test_anomalous_coefficient_is_linear_across_the_exit():
-    c = ep.thruster.AnomalousTransport().at(np.array([-2e-3, -1.5e-3, 0.0, 1.5e-3, 2e-3]))
+    transport = ep.thruster.AnomalousTransport(1 / 300, 1 / 145, 3e-3)
+    c = transport.at(np.array([-2e-3, -1.5e-3, 0.0, 1.5e-3, 2e-3]))
     middle = 0.5 * (1 / 300 + 1 / 145)
     np.testing.assert_allclose(c, [1 / 300, 1 / 300, middle, 1 / 145, 1 / 145])
 
