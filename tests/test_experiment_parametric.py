@@ -284,7 +284,7 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     assert steady["ci95"]["free"] is None
     assert summary["laws"] == {}
     assert {row["n_points"] for row in summary["trends"] if row["along"] == "V_D_V"} == {2}
-    words = "a.nc; average over z 15 to 25 mm (all 3 points), the last 40% of the channel's 25 mm"
+    words = "a.nc; average over z 15 to 25 mm (all 3 points), the last 40% of the channel, 25 mm"
     assert words.replace(" ", "") in "".join(found.log.split())  # a long path is broken anywhere
     for text in (found.page, " ".join(found.log.split())):
         assert "V_D_V=400, mdot_mg_s=5: steady; 1000 samples of 1.5 µs; left out of t" in text

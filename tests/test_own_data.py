@@ -146,8 +146,13 @@ def test_downstream_is_the_last_part_of_a_channel_that_is_known() -> None:
     np.testing.assert_array_equal(run.states, by_hand.states)
     words = average.place(known)
     assert words == (
-        "average over z 15 to 25 mm (2 of 10 points), the last 40% of the channel's 25 mm"
+        "average over z 15 to 25 mm (2 of 10 points), the last 40% of the channel, 25 mm"
     )
+    whole = ep.zone_average(known, ep.Zone(z="channel"), states=["n_i"])
+    by_hand = ep.zone_average(GRID, ep.Zone(z=(0.0, 0.025)), states=["n_i"])
+    np.testing.assert_array_equal(whole.states, by_hand.states)
+    words_of_it = ep.data.ZoneAverage(["n_i"], ep.Zone(z="channel")).place(known)
+    assert words_of_it == "average over z 0 to 25 mm (5 of 10 points), the channel, 25 mm"
     simulated = GRID.assign_attrs(parameters=json.dumps({"thruster": {"channel_length": 0.025}}))
     assert average.place(simulated) == words
     assert ep.data.GridPoint(["n_i"], z=0.018).place(GRID) == "the grid point at z = 17.5 mm"
@@ -158,7 +163,7 @@ def test_a_channel_that_is_not_known_is_asked_for() -> None:
         ep.zone_average(GRID, ep.Zone(z="downstream"), states=["n_i"])
     flat = GRID.isel(z=0, drop=True)
     assert ep.zone_average(flat, ep.Zone(z="downstream"), states=["n_i"]).n_samples == 5
-    with pytest.raises(ValueError, match="must be two increasing numbers in m"):
+    with pytest.raises(ValueError, match="in m or one of channel, downstream: 'upstream' came"):
         ep.Zone(z="upstream")
 
 

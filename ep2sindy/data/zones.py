@@ -259,18 +259,20 @@ def _slab_means(
     return means
 
 
-# Zones: part of a grid in z and r, given by its ends or as the downstream part of a channel.
+# Zones: part of a grid in z and r, given by its ends or as a part of a thruster's channel.
 
 
-DOWNSTREAM, SHARE = "downstream", 0.4  # share of the channel over which the thesis averages
+# Shares of the channel's length up to its exit, by name. Through the ends of the whole channel pass
+# a known inflow and what leaves the thruster; the thesis averages over the downstream part.
+PARTS = {"channel": 1.0, "downstream": 0.4}
 
 
 @dataclass(frozen=True)
 class Zone:
     """Part of the grid: (from, to) in z and r, in m, ends included; None is the whole axis.
 
-    z: "downstream" is the last 40 % of the thruster's channel. The channel's length comes from the
-    field's attributes; a field without z needs none.
+    z: "channel" is the thruster's channel from the anode to the exit, "downstream" its last 40 %.
+    The channel's length comes from the field's attributes; a field without z needs none.
     """
 
     z: Sequence[float] | str | None = None
@@ -279,22 +281,23 @@ class Zone:
     def __post_init__(self) -> None:
         for axis in SPACE:
             bounds = getattr(self, axis)
-            if bounds is None or (axis == "z" and bounds == DOWNSTREAM):
+            if bounds is None or (axis == "z" and isinstance(bounds, str) and bounds in PARTS):
                 continue
             if isinstance(bounds, str) or len(bounds) != 2 or not bounds[0] < bounds[1]:
+                names = f" or one of {', '.join(PARTS)}" if axis == "z" else ""
                 raise ValueError(
-                    f"a zone's {axis} must be two increasing numbers in m: {list(bounds)} came"
+                    f"a zone's {axis} must be two increasing numbers in m{names}: {bounds!r} came"
                 )
             object.__setattr__(self, axis, (float(bounds[0]), float(bounds[1])))
 
 
 def resolve_zone(zone: Zone | None, field: xr.Dataset) -> Zone:
-    """Replace "downstream" by ends in m, and None by a zone that covers the whole field.
+    """Replace the name of a part by ends in m, and None by a zone that covers the whole field.
 
-    Raises ValueError for a downstream zone if the field does not give the channel's length.
+    Raises ValueError for a part of the channel if the field does not give the channel's length.
     """
     zone = zone or Zone()
-    if zone.z != DOWNSTREAM:
+    if not isinstance(zone.z, str):
         return zone
     if "z" not in field.dims:
         return replace(zone, z=None)
@@ -302,12 +305,16 @@ def resolve_zone(zone: Zone | None, field: xr.Dataset) -> Zone:
     if length_m is None:
         points = grid_points(field, "z")
         raise ValueError(
-            f"an average over the last {SHARE:.0%} of the channel needs its length, which the file "
-            f"does not say: give data.channel_m=LENGTH in m, or a zone of your own, "
+            f"an average over {_part_text(zone.z)} needs the channel's length, which the file does "
+            f"not say: give data.channel_m=LENGTH in m, or a zone of your own, "
             f"'trajectory.zone.z=[FROM,TO]' in m (null: all of it); its z runs from "
             f"{points[0]:.4g} to {points[-1]:.4g} m"
         )
-    return replace(zone, z=((1.0 - SHARE) * length_m, length_m))
+    return replace(zone, z=((1.0 - PARTS[zone.z]) * length_m, length_m))
+
+
+def _part_text(name: str) -> str:
+    return "the channel" if PARTS[name] == 1.0 else f"the last {PARTS[name]:.0%} of the channel"
 
 
 def describe_zone(zone: Zone | None, field: xr.Dataset) -> str:
@@ -325,9 +332,9 @@ def describe_zone(zone: Zone | None, field: xr.Dataset) -> str:
                 f"{axis} {1e3 * bounds[0]:.4g} to {1e3 * bounds[1]:.4g} mm "
                 f"({of_all} {len(points)} points)"
             )
-    if texts and zone is not None and zone.z == DOWNSTREAM:
+    if texts and zone is not None and isinstance(zone.z, str) and "z" in field.dims:
         length_mm = 1e3 * float(channel_length_m(field.attrs) or np.nan)
-        texts[0] += f", the last {SHARE:.0%} of the channel's {length_mm:.4g} mm"
+        texts[0] += f", {_part_text(zone.z)}, {length_mm:.4g} mm"
     return "; ".join(texts)
 
 

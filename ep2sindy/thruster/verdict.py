@@ -63,8 +63,8 @@ def multiplicity(peaks: Float[np.ndarray, " cycles"]) -> tuple[float, float]:
 def diagnose(field: xr.Dataset, *, diverged: bool, flow_A: float) -> dict[str, Any]:
     """Status, cycle, dominant frequency in kHz, and mean and standard deviation of the current.
 
-    For a discharge that oscillates `multiplicity` and `peak_spread`, too: see `multiplicity`. flow_A: mass flow in A, one charge per atom. A discharge whose current ends far below has gone
-    out.
+    Also `multiplicity` and `peak_spread` of the peaks of a discharge that oscillates. flow_A: mass
+    flow in A, one charge per atom. A discharge whose current ends far below has gone out.
     """
     current, time = field["I_d"].values, field["time"].values
     if diverged:

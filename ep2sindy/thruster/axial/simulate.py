@@ -80,7 +80,7 @@ def simulate(
     averaged: record averages over each sampling step, like probes and the output of most codes,
     with the products and fluxes that close its balance; False records the values at its end, which
     alias faster oscillations. stretch: length of the plume's cells relative to the channel's; 1
-    makes all equal. reconstruct: use van Leer's slopes; False takes first-order fluxes, of heat too.
+    makes all equal. reconstruct: use van Leer's slopes; False: fluxes of first order, of heat too.
     coldest_T_e_eV: lower bound of T_e, like the 1.5 eV of HallThruster.jl; the energy balance then
     lacks the added heat. initial: `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of
     another run, given as its Dataset or NetCDF file. cache: folder in which this simulation is
