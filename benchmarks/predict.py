@@ -34,9 +34,11 @@ VOLTAGES, FLOWS = (250.0, 287.5, 325.0, 362.5, 400.0), (4.0, 4.5, 5.0, 5.5, 6.0)
 
 LOW, LEAN = (150.0, 175.0, 200.0, 225.0), (2.0, 3.0, 4.0, 5.0)  # at the edge of the quiet
 HIGH = (300.0, 400.0)
+DEFAULT_SPEED = ep.thruster.OPERATING_POINTS[3].neutral_speed  # 280 m/s with TWO_CYCLES
 TWO_CYCLES = ep.thruster.Thruster(  # conf/thruster/two_cycles.yaml
-    transport=ep.thruster.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3)
-)
+    transport=ep.thruster.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3),
+    wall=ep.thruster.SheathWall(), conduction_factor=4.66, series_resistance=1.0,
+)  # fmt: skip
 
 
 def recorded(
@@ -45,7 +47,9 @@ def recorded(
     """None where the simulation does not breathe."""
     field = ep.thruster.simulate(
         thruster or ep.thruster.Thruster(),
-        ep.thruster.OperatingPoint(float(voltage), float(flow)),
+        ep.thruster.OperatingPoint(
+            float(voltage), float(flow), neutral_speed=280.0 if thruster else DEFAULT_SPEED
+        ),
         cache=".cache/simulations",
         duration_s=6e-3,
         progress=False,

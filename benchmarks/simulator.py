@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import ep2sindy as ep
 
-TARGETS_CPU_S_PER_MS = {100: 0.25, 200: 0.9}  # on the uniform grid, one core
+TARGETS_CPU_S_PER_MS = {100: 0.15, 200: 0.55}  # on the uniform grid, one core
 POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 
 
@@ -41,7 +41,7 @@ def cost(n_cells: int, *, duration_s: float = 2e-3, n_repeats: int = 3) -> tuple
 
 def draw_stability_map(path: Path) -> None:
     """Draw std(I_d) at 300 V, 5 mg/s from 3 to 5 ms over c2 and the series resistance."""
-    inverse_c2, ohms = (200, 180, 160, 145, 130, 115, 100, 80, 60), (0.0, 1.0, 2.0, 3.0, 5.0)
+    inverse_c2, ohms = (120, 105, 95, 85, 77, 69, 62, 55, 45), (0.0, 0.4, 0.8, 1.2, 2.0, 4.0)
     amplitude = np.full((len(ohms), len(inverse_c2)), np.nan)  # nan where a run diverged
     for i, resistance in enumerate(ohms):
         for j, inverse in enumerate(inverse_c2):

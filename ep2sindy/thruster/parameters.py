@@ -199,7 +199,7 @@ class NeutralSpeed:
 
 def _tuned_wall() -> SheathWall:
     return SheathWall(
-        electron_scale=0.8, ion_scale=0.9, plume_collisions=0.5, plume_power=0.72, transition=1e-3
+        electron_scale=0.8, ion_scale=0.95, plume_collisions=0.5, plume_power=0.6, transition=1e-3
     )
 
 
@@ -230,7 +230,7 @@ class Thruster:
     anode: Anode = field(default_factory=FixedAnode)
     cathode_T_e_eV: float = 3.0
     cathode_potential: float = 20.0  # V
-    series_resistance: float = 0.85  # ohm
+    series_resistance: float = 0.8  # ohm
     circuit: Circuit | None = None  # besides the series resistance
     pressure_factor: float = 1.0  # p_e = factor n T_e
     conduction_factor: float = 7.5
@@ -338,7 +338,7 @@ class OperatingPoint:
 
     voltage: float  # V
     mass_flow_mg_s: float
-    neutral_speed: float | NeutralSpeed = 330.0  # m/s, tuned
+    neutral_speed: float | NeutralSpeed = 338.0  # m/s, tuned
     supply: Supply | None = None
     background: Background | None = None
 
@@ -367,7 +367,7 @@ class OperatingPoint:
 
 
 OPERATING_POINTS = (
-    OperatingPoint(200.0, 5.0),
+    OperatingPoint(200.0, 5.0, neutral_speed=320.0),
     OperatingPoint(300.0, 2.0, neutral_speed=195.0),
     OperatingPoint(300.0, 4.0),
     OperatingPoint(300.0, 5.0),

@@ -29,9 +29,9 @@ Points = Sequence[float] | Float[np.ndarray, " points"]
 class AnomalousTransport:
     """Two zones, with c linear across a layer around the exit."""
 
-    c_channel: float = 1 / 350
-    c_plume: float = 1 / 72
-    transition: float = 2.6e-3  # m
+    c_channel: float = 1 / 365
+    c_plume: float = 1 / 69
+    transition: float = 3.5e-3  # m
 
     def __post_init__(self) -> None:
         check_positive(self, "c_channel", "c_plume")
