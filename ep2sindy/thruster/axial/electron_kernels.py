@@ -335,8 +335,8 @@ def record_powers(state, model, total, w):
     instant[P_CATHODE] = watts * end * (w.down[-2] * T[-2] + w.up[-2] * T[-1])
 
 
-@compiled(**ENTRY)
-def electron_step(state, model, dt, w):
+@compiled(**FAST)
+def follow_electrons(state, model, dt, w):
     """Collisions, discharge current, field and new temperature; returns False if the run breaks."""
     T = state.T_e_eV
     state.clock[0] += dt
@@ -357,3 +357,9 @@ def electron_step(state, model, dt, w):
     heat(state, model, dt, total, drop, w)
     record_powers(state, model, total, w)
     return True
+
+
+@compiled(**ENTRY)
+def electron_step(state, model, dt, w):
+    """`follow_electrons` by itself."""
+    return follow_electrons(state, model, dt, w)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
-from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
-from ep2sindy.thruster.axial.heavy_kernels import add_scaled, heavy_step
+from ep2sindy.thruster.axial.electron_kernels import follow_electrons, start_density
+from ep2sindy.thruster.axial.heavy_kernels import add_scaled, follow_heavy
 from ep2sindy.thruster.axial.state_kernels import (
     CHANGE_I,
     CHANGE_N,
@@ -107,8 +107,8 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
                 weight = dt
             if not dt > SHORTEST_STEP * sample_s:
                 return row
-            heavy_step(state, model, dt, sums, w)
-            if not electron_step(state, model, dt, w):
+            follow_heavy(state, model, dt, sums, w)
+            if not follow_electrons(state, model, dt, w):
                 return row
             add_instant(sums, state, dt, w)
             left -= dt
