@@ -16,7 +16,7 @@ import ep2sindy as ep
 from ep2sindy.model.free_run import free_run
 
 POINT = ep.thruster.OPERATING_POINTS[3]  # 300 V, 5 mg/s
-BREATHING_HZ = 12.3e3
+BREATHING_HZ = 19.15e3
 SHARE = 0.05
 N_PARTS = 4
 STATES = ("n_i", "n_n")
