@@ -310,6 +310,9 @@ class Outcome:
             "energy balance, (left + stored)/entered": places(n["energy_balance"], 4),
             "rates of the propellant": attributes.get("rates", "-"),
         }
+        if "half_angle" in self.field and self.field.sizes["time"]:
+            mean = float(self.field["half_angle"].mean())
+            rows["half-angle of the plume, mean"] = _with(places(mean, 1), "degrees")
         return pd.DataFrame({"quantity": list(rows), "value": list(rows.values())})
 
     def summary(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from ep2sindy.report.document import Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
+from ep2sindy.thruster.parameters import NeutralSpeed
 
 if TYPE_CHECKING:
     from ep2sindy.refinement.refine import Refinement
@@ -30,14 +31,14 @@ class Compared:
     """Quantities that the coefficients of ions and neutrals in a zone are compared to.
 
     ions, neutrals: the states. ion_velocity (m/s), ionization_rate (m^3/s): variables of the data.
-    neutral_speed: in m/s, None if it is not known.
+    neutral_speed: in m/s; of a table along the axis that at the exit; None if it is not known.
     """
 
     ions: str
     neutrals: str
     ion_velocity: str
     ionization_rate: str
-    neutral_speed: float | None
+    neutral_speed: float | NeutralSpeed | None
 
     def expected(
         self, data: Trajectory, length_m: float | None
@@ -54,7 +55,10 @@ class Compared:
             rate = float(data.columns([self.ion_velocity]).mean()) / length_m
             found[self.ions, self.ions] = (f"-mean {self.ion_velocity}/L", -rate)
         if self.neutral_speed is not None and length_m is not None:
-            found[self.neutrals, self.neutrals] = ("-u_n/L", -self.neutral_speed / length_m)
+            speed = self.neutral_speed
+            if isinstance(speed, NeutralSpeed):
+                speed = float(speed.at(np.zeros(1))[0])
+            found[self.neutrals, self.neutrals] = ("-u_n/L", -speed / length_m)
         if self.ionization_rate in data.names:
             rate = float(data.columns([self.ionization_rate]).mean())
             found[self.ions, product] = (f"mean {self.ionization_rate}", rate)

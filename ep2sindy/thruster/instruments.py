@@ -27,8 +27,8 @@ def ion_velocities(
     Ions born in a place at the rate `ionization`, with the neutrals' speed u_n (or at rest), have
     u^2 = u_n^2 + 2 e (drop of the potential since)/m and the density (rate dz)/u. Each sample is
     taken as steady, since ions cross the thruster in a few samples; its densities are added up over
-    the record. Left out: losses to walls, collisions, a plume that spreads, ions that move towards
-    the anode, and that some are born with two charges. The fluid has one velocity in a place: its
+    the record. Left out: losses to walls, collisions, ions that move towards the anode, and that
+    some are born with two charges. The fluid has one velocity in a place: its
     u_iz agrees with the mean of f where ions come from upstream, and is some 15 % above it where
     they are born.
 
@@ -48,6 +48,8 @@ def ion_velocities(
     if not np.all((places > 0.0) & (places <= faces[-1])):
         raise ValueError(f"places must lie in the record, 0 to {faces[-1]:g} m: {places} came")
     E, rate = (field[name].values.astype(float) for name in ("E_z", "ionization"))
+    if "area" in field:  # in a wider cell more ions are born; where they are seen, all spread alike
+        rate = rate * field["area"].values
     groups = [_births(faces, E, rate, place, born_m_s, per_volt) for place in places]
     edges = _edges(speeds, max(float(fast.max(initial=0.0)) for _, fast, _ in groups))
     f = np.array([_histogram(edges, *group) for group in groups])
