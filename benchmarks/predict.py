@@ -2,10 +2,11 @@
 
     python -m benchmarks.predict [--degree 2]
 
-The package's own discharge at 250 to 400 V and 4 to 6 mg/s, five by five, 6 ms each after 2 ms of
-warm-up; densities in the downstream zone; six coefficients of the structure below. First how
+The package's own discharge at 290 to 370 V and 4 to 5.5 mg/s, five by five, 6 ms each after 2 ms
+of warm-up; densities in the downstream zone; six coefficients of the structure below. First how
 smooth the measured frequencies and amplitudes are: interpolated by as many functions themselves.
-Then a map that reaches to where nothing oscillates, and the strong one of two cycles.
+Then the law of all 25 at points drawn between them, a map that reaches to where nothing
+oscillates, and the strong one of two cycles. The grid is that of conf/exp/predict.yaml.
 """
 
 import argparse
@@ -17,7 +18,9 @@ from itertools import product
 import numpy as np
 
 import ep2sindy as ep
+from ep2sindy.model.comparison import Verdict
 from ep2sindy.operating.fit import LeaveOneOut, OperatingFit, leave_one_out, operating_fit
+from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate, law_map
 from ep2sindy.operating.records import (
     OperatingRecord,
@@ -29,11 +32,13 @@ from ep2sindy.operating.records import (
 STRUCTURE = {"n_i": ["n_i", "n_n", "n_i*n_n"], "n_n": ["1", "n_i", "n_n"]}
 LIBRARY = ep.polynomial(["n_i", "n_n"], degree=2)
 ZONE = ep.Zone(z=(0.015, 0.025))
-VOLTAGES, FLOWS = (250.0, 287.5, 325.0, 362.5, 400.0), (4.0, 4.5, 5.0, 5.5, 6.0)
+VOLTAGES, FLOWS = (290.0, 310.0, 330.0, 350.0, 370.0), (4.0, 4.375, 4.75, 5.125, 5.5)
+N_BETWEEN = 20
 
-
-LOW, LEAN = (150.0, 175.0, 200.0, 225.0), (2.0, 3.0, 4.0, 5.0)  # at the edge of the quiet
-HIGH = (300.0, 400.0)
+EDGE = (  # to where it is quiet
+    *product((200.0, 225.0, 250.0), (2.5, 3.0, 4.0)),
+    *product((300.0, 340.0, 380.0), (2.5, 3.0, 3.5)),
+)
 DEFAULT_SPEED = ep.thruster.OPERATING_POINTS[3].neutral_speed  # 280 m/s with TWO_CYCLES
 TWO_CYCLES = ep.thruster.Thruster(  # conf/thruster/two_cycles.yaml
     transport=ep.thruster.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 80, transition=3e-3),
@@ -83,7 +88,7 @@ def line(name: str, found: Sequence[LeaveOneOut]) -> str:
     )
 
 
-def judged(fit: OperatingFit, degree: int) -> None:
+def judged(fit: OperatingFit, degree: int) -> OperatingLaw:
     functions = fit.functions(degree)
     f, amplitude = interpolation_errors(fit.records, fit.basis(functions))
     print(
@@ -100,6 +105,25 @@ def judged(fit: OperatingFit, degree: int) -> None:
     for each in inside:
         r = each.run
         print(f"  {each.record.label}: {r.verdict}, f {r.f_error:+.2%}")
+    return law
+
+
+def between(law: OperatingLaw, n: int) -> None:
+    """Free runs of the law at points inside the grid that no fit has seen, drawn at random."""
+    rng = np.random.default_rng(0)
+    low, high = (VOLTAGES[0], FLOWS[0]), (VOLTAGES[-1], FLOWS[-1])
+    drawn = [recorded(round(v, 1), round(m, 2)) for v, m in rng.uniform(low, high, (n, 2))]
+    records = [record for record in drawn if record is not None]
+    runs = [ep.free_run(law.model_at(record.parameters), record.run) for record in records]
+    f = [abs(run.f_error) for run in runs]
+    amplitude = [max(abs(ratio - 1) for ratio in run.amplitude_ratio.values()) for run in runs]
+    waveform = [max(run.waveform_error.values()) for run in runs]
+    lives = sum(run.verdict is Verdict.LIVES for run in runs)
+    print(
+        f"between, of {len(runs)}: {lives} live; f {np.median(f):.2%}, at most {max(f):.2%}; "
+        f"amplitude {np.median(amplitude):.1%}; waveform {np.median(waveform):.3f}",
+        flush=True,
+    )
 
 
 def mapped(strong: Sequence[OperatingRecord], quiet: Sequence[Mapping[str, float]]) -> None:
@@ -122,9 +146,10 @@ def main() -> None:
     degree = parser.parse_args().degree
     start = time.perf_counter()
     strong = one_branch([recorded(*point) for point in product(VOLTAGES, FLOWS)])
-    judged(operating_fit(strong, LIBRARY, STRUCTURE), degree)
+    law = judged(operating_fit(strong, LIBRARY, STRUCTURE), degree)
+    between(law, N_BETWEEN)
     print(f"{time.perf_counter() - start:.0f} s", flush=True)
-    edge = {point: recorded(*point) for point in (*product(LOW, LEAN), *product(HIGH, LEAN[:2]))}
+    edge = {point: recorded(*point) for point in EDGE}
     breathing = [record for record in edge.values() if record is not None]
     quiet = [{"V_D_V": v, "mdot_mg_s": m} for (v, m), record in edge.items() if record is None]
     mapped(one_branch([*strong, *breathing]), quiet)

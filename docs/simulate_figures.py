@@ -16,7 +16,7 @@ SCAN = [
     "+exp=simulate",
     "data.duration_s=3.0e-3",
     "scan={operating_point.voltage:[150,200,250,300,350,400],"
-    "thruster.transport.c_plume:[0.005,0.0077,0.01,0.0125]}",
+    "thruster.transport.c_plume:[0.008,0.011,0.0145,0.018]}",
 ]
 FIGURES = {"maps": ONE, "profiles": ONE, "stability": SCAN}
 
