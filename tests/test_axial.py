@@ -285,6 +285,14 @@ def test_rates_that_do_not_cover_the_run_say_so():
     assert simulate().attrs["rates"] == "covered"
 
 
+def test_a_discharge_that_falls_to_nothing_has_gone_out():
+    t = 1.5e-6 * np.arange(400)
+    for last, status in ((1e-300, "out"), (4.0, "diverged")):
+        current = np.geomspace(4.0, last, t.size)
+        field = xr.Dataset({"I_d": ("time", current)}, coords={"time": t})
+        assert diagnose(field, diverged=True, flow_A=4.0)["status"] == status
+
+
 @pytest.mark.parametrize("m", [1, 2, 3])
 def test_a_cycle_that_repeats_after_m_has_that_multiplicity(m):
     t = 1.5e-6 * np.arange(6000)

@@ -21,6 +21,7 @@ TRANSIT_HZ = 60e3  # ions cross the domain in microseconds; the breathing mode i
 BREATHING = replace(SIMULATED, max_Hz=TRANSIT_HZ)
 STRONG_SHARE = 0.9  # of the mean: the strong cycle has a larger standard deviation
 SAME_PEAKS, MOST_CYCLES = 0.01, 16  # of their mean; how many cycles it takes to tell
+GONE_A = 1e-9  # no discharge comes back from it
 OUT_SHARE = 0.1  # of the current that the gas carries if each of its atoms is ionised once
 
 
@@ -67,8 +68,8 @@ def diagnose(field: xr.Dataset, *, diverged: bool, flow_A: float) -> dict[str, A
     flow in A, one charge per atom. A discharge whose current ends far below has gone out.
     """
     current, time = field["I_d"].values, field["time"].values
-    if diverged:
-        status = "diverged"
+    if diverged:  # without a source of electrons a current falls until nothing can be divided by
+        status = "out" if current.size and abs(current[-1]) < GONE_A else "diverged"
     elif current[current.size // 2 :].mean() < OUT_SHARE * flow_A:
         status = "out"
     else:
