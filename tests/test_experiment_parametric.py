@@ -25,7 +25,8 @@ ESTIMATES = {
     "free": {"L_m", "g_inj", "eps_i", "eps_n"},
 }
 THREE = (
-    "points=[{V_D_V: 200.0, mdot_mg_s: 5.0},{V_D_V: 300.0, mdot_mg_s: 5.0},"
+    "points=[{V_D_V: 200.0, mdot_mg_s: 5.0, data: {operating_point: {neutral_speed: 320.0}}},"
+    "{V_D_V: 300.0, mdot_mg_s: 5.0},"
     "{V_D_V: 300.0, mdot_mg_s: 2.0, data: {operating_point: {neutral_speed: 195.0}}}]"
 )
 
