@@ -115,14 +115,14 @@ def collisions(state, model, w):
         w.inelastic, w.inelastic_slope,
     )  # fmt: skip
     if model.drift_credit:
-        by_column(T, drift, model, DRIFT_EVENTS, w.minor)
-        pay(w.inelastic, n, nn, w.minor, drift, -1.0)
+        by_column(T, drift, model, DRIFT_EVENTS, w.d)
+        pay(w.inelastic, n, nn, w.d, drift, -1.0)
     for k in range(model.further.shape[0]):
         by_column(T, drift, model, FURTHER + k, state.rates[k + 1])
         below = model.further[k, 0]
         source = nn if below == 0 else state.n_i[below - 1]
-        w.minor[:] = model.further_eV[k]
-        pay(w.inelastic, n, source, state.rates[k + 1], w.minor, 1.0)
+        w.c[:] = model.further_eV[k]
+        pay(w.inelastic, n, source, state.rates[k + 1], w.c, 1.0)
     return True
 
 

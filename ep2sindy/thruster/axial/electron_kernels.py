@@ -26,7 +26,6 @@ from ep2sindy.thruster.axial.state_kernels import (
 )
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
-SMALL = 1e-100  # of a minor
 COLDEST_EV = 1.0  # least T_e of the ghost cells: a steep end could turn them negative
 
 
@@ -176,85 +175,36 @@ def ohm(state, model, dt, drop, w):
     return total
 
 
-@compiled(**LOOP)
-def over_diagonal(lower, diagonal, upper, known):
-    for i in inside(diagonal):
-        inverse = 1.0 / diagonal[i]
-        lower[i] *= inverse
-        upper[i] *= inverse
-        known[i] *= inverse
+@compiled(**FAST)
+def solve_from_both_ends(lower, diagonal, upper, known, T, c, d):
+    """Solve a tridiagonal system for T[1:-1]; T[0] and T[-1] are given.
 
-
-@compiled(**LOOP)
-def leading_minors(lower, upper, minor, before):
-    """Determinants of the first rows, of the last ones, and of one row less; the diagonal is 1.
-
-    They fall along the rows, and both are made larger together before they are too small.
+    Elimination runs from both ends to the middle, so that two chains of divisions overlap in time.
     """
-    last, middle, j = lower.size - 2, (lower.size - 1) // 2, lower.size - 2
-    minor[1] = before[1] = minor[last] = before[last] = 1.0
-    less, here, less_behind, behind = 1.0, 1.0, 1.0, 1.0
-    for i in range(2, middle + 1):
-        before[i] = here
-        less, here = here, here - lower[i] * upper[i - 1] * less
-        minor[i] = here
-        if here < SMALL:
-            less, here = less / SMALL, here / SMALL
+    size = diagonal.size
+    middle = (size - 1) // 2  # last row eliminated from the left
+    c[0], d[0], c[size - 1], d[size - 1] = 0.0, T[0], 0.0, T[size - 1]
+    j = size - 1
+    for i in range(1, middle + 1):
         j -= 1
+        inverse = 1.0 / (diagonal[i] - lower[i] * c[i - 1])
+        c[i] = upper[i] * inverse
+        d[i] = (known[i] - lower[i] * d[i - 1]) * inverse
         if j > middle:
-            before[j] = behind
-            less_behind, behind = behind, behind - upper[j] * lower[j + 1] * less_behind
-            minor[j] = behind
-            if behind < SMALL:
-                less_behind, behind = less_behind / SMALL, behind / SMALL
-
-
-@compiled(**LOOP)
-def over_pivots(minor, before, lower, upper, known):
-    """The pivots of an elimination are ratios of minors: no division waits for another."""
-    for i in inside(minor):
-        inverse = before[i] / minor[i]
-        lower[i] *= inverse
-        upper[i] *= inverse
-        known[i] *= inverse
-
-
-@compiled(**LOOP)
-def sweep(lower, upper, known, T):
-    """Eliminate from both ends to the middle, so that two chains overlap in time, and go back."""
-    last, middle, j = T.size - 2, (T.size - 1) // 2, T.size - 2
-    known[1] -= lower[1] * T[0]
-    known[last] -= upper[last] * T[last + 1]
-    for i in range(2, middle + 1):
-        known[i] -= lower[i] * known[i - 1]
-        j -= 1
-        if j > middle:
-            known[j] -= upper[j] * known[j + 1]
-    c, d = upper[middle], lower[middle + 1]
-    T[middle] = (known[middle] - c * known[middle + 1]) / (1.0 - c * d)
-    T[middle + 1] = known[middle + 1] - d * T[middle]
+            other = 1.0 / (diagonal[j] - upper[j] * c[j + 1])
+            c[j] = lower[j] * other
+            d[j] = (known[j] - upper[j] * d[j + 1]) * other
+    T[middle] = (d[middle] - c[middle] * d[middle + 1]) / (1.0 - c[middle] * c[middle + 1])
+    T[middle + 1] = d[middle + 1] - c[middle + 1] * T[middle]
     j = middle + 1
     for i in range(middle - 1, 0, -1):
-        T[i] = known[i] - upper[i] * T[i + 1]
+        T[i] = d[i] - c[i] * T[i + 1]
         j += 1
-        if j <= last:
-            T[j] = known[j] - lower[j] * T[j - 1]
-    while j < last:
+        if j < size - 1:
+            T[j] = d[j] - c[j] * T[j - 1]
+    while j < size - 2:
         j += 1
-        T[j] = known[j] - lower[j] * T[j - 1]
-
-
-@compiled(**FAST)
-def solve_from_both_ends(lower, diagonal, upper, known, T, minor, before):
-    """Solve a tridiagonal system for T[1:-1], whose T[0] and T[-1] are given, in place.
-
-    Off the diagonal it must be weak, as equations of heat are: products of neighbours above and
-    below the diagonal positive, and at most a quarter of the product of the diagonal's two.
-    """
-    over_diagonal(lower, diagonal, upper, known)
-    leading_minors(lower, upper, minor, before)
-    over_pivots(minor, before, lower, upper, known)
-    sweep(lower, upper, known, T)
+        T[j] = d[j] - c[j] * T[j - 1]
 
 
 @compiled(**LOOP)
@@ -335,7 +285,7 @@ def heat(state, model, dt, total, drop, w):
         dt, state.energy, T, w.heating, w.inelastic, w.inelastic_slope, w.wall, w.wall_slope,
         w.diagonal, w.known, w.before,
     )  # fmt: skip
-    solve_from_both_ends(w.lower, w.diagonal, w.upper, w.known, T, w.minor, w.minor_before)
+    solve_from_both_ends(w.lower, w.diagonal, w.upper, w.known, T, w.c, w.d)
     settle(
         n, T, w.before, model.coldest_eV, w.inelastic_slope, w.wall_slope, state.energy,
         w.inelastic, w.wall,

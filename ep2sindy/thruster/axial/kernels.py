@@ -38,12 +38,13 @@ def fastest(n, g, inverse_dz, c):
 
 
 @compiled(**FAST)
-def fastest_of(state, model):
-    """The same of all species."""
-    top, c = 0.0, np.sqrt(model.sound_speed_squared)
+def time_step(state, model, left):
+    """Time step within the CFL number that divides the time left to the next sample equally."""
+    c = np.sqrt(model.sound_speed_squared)
+    top = 0.0
     for k in range(state.n_i.shape[0]):
         top = max(top, fastest(state.n_i[k], state.flux_i[k], model.inverse_dz, c))
-    return top
+    return left / np.ceil(left * top / model.cfl)
 
 
 @compiled(**LOOP)
@@ -56,35 +57,24 @@ def add_fields(sum_n, sum_T, sum_rate, sum_E, sum_energy, n, T, rate, E, energy,
         sum_energy[i] += weight * energy[i]
 
 
-@compiled(**{**LOOP, **NO_NAN})
-def add_ions(sum_n, sum_u, sum_g, n, g, inverse_dz, c, weight):
-    """Add to the sums; returns the largest (|u| + c)/dz, as `fastest`."""
-    top = 0.0
-    for i in inside(n):
-        u = g[i] / n[i]
+@compiled(**LOOP)
+def add_ions(sum_n, sum_u, sum_g, n, g, weight):
+    for i in range(n.size):
         sum_n[i] += weight * n[i]
-        sum_u[i] += weight * u
+        sum_u[i] += weight * (g[i] / n[i])
         sum_g[i] += weight * g[i]
-        top = max(top, (abs(u) + c) * inverse_dz[i])
-    return top
 
 
 @compiled(**FAST)
-def add_instant(sums, state, model, weight):
-    """Add weight times the present fields to the sums, except those that the heavy step adds.
-
-    Returns the present `fastest_of`.
-    """
-    top, c = 0.0, np.sqrt(model.sound_speed_squared)
+def add_instant(sums, state, weight, w):
+    """Add weight times the present fields to the sums, except those that the heavy step adds."""
     cells, E, energy = sums.cells, state.E, state.energy
     add_fields(cells[N_N], cells[T_E], cells[R_ION], cells[E_Z], cells[ENERGY], state.n_n,
                state.T_e_eV, state.rates[0], E, energy, weight)  # fmt: skip
     for k in range(state.n_i.shape[0]):
         n, u, g = N_I + PER_CHARGE * k, U_IZ + PER_CHARGE * k, FLUX_I + PER_CHARGE * k
-        n_k, flux_k, per_dz = state.n_i[k], state.flux_i[k], model.inverse_dz
-        top = max(top, add_ions(cells[n], cells[u], cells[g], n_k, flux_k, per_dz, c, weight))
+        add_ions(cells[n], cells[u], cells[g], state.n_i[k], state.flux_i[k], weight)
     add_scaled(sums.series, state.instant, weight)
-    return top
 
 
 @compiled(**FAST)
@@ -108,9 +98,9 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
         sums.cells[:] = 0.0
         sums.series[:] = 0.0
         add_changes(sums, state, -1.0)
-        left, weight, top = sample_s, sample_s, fastest_of(state, model)
+        left, weight = sample_s, sample_s
         while left > 1e-9 * sample_s:
-            dt = left / np.ceil(left * top / model.cfl)  # the time left in equal steps
+            dt = time_step(state, model, left)
             if not averaged:  # keep the last step only
                 sums.cells[:] = 0.0
                 sums.series[:] = 0.0
@@ -120,7 +110,7 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
             follow_heavy(state, model, dt, sums, w)
             if not follow_electrons(state, model, dt, w):
                 return row
-            top = add_instant(sums, state, model, dt)
+            add_instant(sums, state, dt, w)
             left -= dt
         add_changes(sums, state, 1.0)
         add_scaled(sums.cells[SPREAD], model.spread, weight)

@@ -181,8 +181,8 @@ class Scratch(NamedTuple):
     diagonal: np.ndarray
     upper: np.ndarray
     known: np.ndarray
-    minor: np.ndarray
-    minor_before: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
     before: np.ndarray  # T_e before the step
 
 
