@@ -60,8 +60,8 @@ TOYS: dict[str, list[str]] = {
         "+exp=parametric", "data.cache={cache}", "data.duration_s=2.0e-3", "data.warm_up_s=0.5e-3",
         "data.n_cells=30", "parallel=serial", "bootstraps.n=2", "bootstrap.n_draws=40",
         "refining.n_windows=20", "library.variables=[n_i,n_n,R_ion]",
-        "points=[{{V_D_V: 200.0, mdot_mg_s: 5.0, data: {{operating_point: {{neutral_speed: 320.0}}}}}},"
-        "{{V_D_V: 300.0, mdot_mg_s: 5.0}},"
+        "points=[{{V_D_V: 200.0, mdot_mg_s: 5.0, "
+        "data: {{operating_point: {{neutral_speed: 320.0}}}}}}, {{V_D_V: 300.0, mdot_mg_s: 5.0}},"
         "{{V_D_V: 300.0, mdot_mg_s: 2.0, data: {{operating_point: {{neutral_speed: 195.0}}}}}}]",
     ],
     "predict": [

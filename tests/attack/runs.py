@@ -26,7 +26,8 @@ SIMULATED = (
 RUNS = {
     "discover": ("data=recognised", "data.path=data/lorenz.csv", "trajectory.states=[x,y,z]"),
     "simulate": (
-        *SIMULATED, "thruster=two_cycles", "data.stretch=1.0", "data.duration_s=6.0e-4",
+        *SIMULATED, "thruster=two_cycles", "data.operating_point.neutral_speed=280.0",
+        "data.stretch=1.0", "data.duration_s=6.0e-4",
         "data.warm_up_s=0.0", "data.n_cells=24", "scan={operating_point.voltage:[250.0,300.0]}",
     ),
     "pointwise": (
