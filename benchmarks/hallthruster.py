@@ -41,9 +41,10 @@ STORED = {
     "baseline": {"I_d": 4.97, "beam": 3.99, "T_e": 24.5, "thrust": 95.3},
     "withplume": {"I_d": 5.47, "beam": 4.12, "T_e": 35.8, "thrust": 118.5},
 }
-# Singly charged ions of "withplume" beyond the exit, over mm from the anode, in 1e17 m^-3.
-STORED_PLUME = {29.6: 2.6895, 30.67: 2.1607, 31.73: 2.0106, 37.07: 1.7629, 42.4: 1.6212,
-                53.07: 1.4087}  # fmt: skip
+# Singly charged ions of "withplume" over mm from the anode, in 1e17 m^-3.
+STORED_N_I = {5.07: 1.9499, 10.4: 4.3175, 15.73: 7.1716, 18.93: 6.9584, 20.53: 6.7747,
+              22.13: 24.785, 24.27: 28.001, 26.93: 16.227, 29.6: 2.6895, 30.67: 2.1607,
+              31.73: 2.0106, 37.07: 1.7629, 42.4: 1.6212, 53.07: 1.4087}  # fmt: skip
 COMMON = {
     "transition_length": 4.174e-3, "cathode_Tev": 3.26173, "anode_Tev": 3.26173,
     "ion_wall_losses": True, "electron_ion_collisions": True, "solve_plume": True,
@@ -131,8 +132,8 @@ def calibrated_run(
 
     def build_model(*given: Any, **settings: Any) -> AxialModel:
         model = axial_model(*given, **settings)
-        per_dz = model.inverse_dz.copy()
-        return model._replace(neutral_before=per_dz, neutral_behind=per_dz)
+        before, behind = model.inverse_dz.copy(), model.inverse_dz.copy()
+        return model._replace(neutral_before=before, neutral_behind=behind)
 
     if not neutrals_stay:
         return spt100_run(config, n_cells, duration_s)
@@ -182,6 +183,12 @@ def figures(run: xr.Dataset) -> dict[str, float]:
         "T_e": float(mean["T_e_eV"].max()),
         "thrust": 1e3 * float(mean["thrust"]),
     }
+
+
+def n_i_over_theirs(run: xr.Dataset) -> np.ndarray:
+    """Mean density of singly charged ions over theirs, at the places of `STORED_N_I`."""
+    n_i = late(run)["n_i"].mean("time").interp(z=1e-3 * np.array(list(STORED_N_I)))
+    return 1e-17 * n_i.values / np.array(list(STORED_N_I.values()))
 
 
 def net_thrust(run: xr.Dataset) -> float:
@@ -247,7 +254,11 @@ def main() -> None:
         ):
             ours = figures(run)
             line = ", ".join(f"{k} {ours[k]:.2f} ({v})" for k, v in theirs.items())
-            print(f"{name}, {kind}: {line}; mass balance {run.attrs['mass_balance']:.4f}")
+            line += f"; mass balance {run.attrs['mass_balance']:.4f}"
+            if name == "withplume":
+                shares = n_i_over_theirs(run)
+                line += f"; n_i over theirs {', '.join(f'{share:.2f}' for share in shares)}"
+            print(f"{name}, {kind}: {line}")
     if not RATE_TABLE.exists():
         print("LANDMARK: name the folder of landmark_rates.csv with EP2SINDY_DATA")
         return

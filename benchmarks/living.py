@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -40,6 +41,12 @@ class Case:
     multiplier: float
     cpu_s: float
     confirmed: bool
+
+    @property
+    def structure(self) -> str:
+        """Terms of every equation."""
+        model = self.run.model
+        return "; ".join(f"{state}': {', '.join(model.terms(state))}" for state in model.states)
 
     @property
     def amplitude(self) -> float:
@@ -129,11 +136,12 @@ def line(name: str, cases: Sequence[Case]) -> str:
         f"{np.median(v):.3g} / {np.max(v):.3g}" for v in zip(*figures, strict=True)
     )
     cpu_s = np.median([c.cpu_s for c in cases])
+    found = Counter(each.structure for each in living) if len(cases) <= N_DRAWS else {}
     return (
         f"{name:24s} {len(living)} of {len(cases)} live ({wrong} refuted); f {f} %; "
         f"amplitude {amplitude} %; waveform {waveform}; terms {n_terms}; multiplier {multiplier}; "
         f"{cpu_s:.1f} CPU-s"
-    )
+    ) + "".join(f"\n    {n} x {terms}" for terms, n in found.items())
 
 
 def print_draws() -> None:
@@ -186,7 +194,7 @@ def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> e
 def print_noise() -> None:
     """White noise on both densities; judged on the clean record behind it."""
     for share, n_periods in NOISES:
-        print(f"\n{100 * share:.0f} % noise, {n_periods:.0f} periods: five draws of the noise")
+        print(f"\n{100 * share:.0f} % noise, {n_periods:.0f} periods: five draws; noise of n_n")
         for label in POINTS:
             run = record(label, DOWNSTREAM_MM)
             clean = run.window(round(0.75 * run.n_samples), run.n_samples)
@@ -194,7 +202,8 @@ def print_noise() -> None:
                 case(noisy(run, share, n_periods, seed=seed), clean, seed=seed, weak=True)
                 for seed in range(N_NOISE_DRAWS)
             ]
-            print(line(label, cases), flush=True)
+            spread = share * np.sqrt(np.square(run.states).mean(axis=0)) / run.states.std(axis=0)
+            print(line(f"{label}, {spread[1]:.1f} std", cases), flush=True)
 
 
 def main() -> None:

@@ -104,25 +104,25 @@ def by_column(T, drift, model, column, out):
 @compiled(**FAST)
 def collisions(state, model, w):
     """Frequencies, mobility, rates and losses at the present T_e; False if it leaves the table."""
-    T, drift, n, nn, nu = state.T_e_eV, state.drift_eV, state.n_e, state.n_n, w.up
+    T, drift, n, nn = state.T_e_eV, state.drift_eV, state.n_e, state.n_n
     if not within_table(T, 1.0 / model.table_step_eV, model.table.shape[0] - 2.0):
         return False
     by_temperature(
-        T, n, nn, state.log_n[0], model, nu, w.coulomb, state.wall_loss, w.wall, w.wall_slope
+        T, n, nn, state.log_n[0], model, w.nu, w.coulomb, state.wall_loss, w.wall, w.wall_slope
     )
     by_energy(
-        T, drift, n, nn, model, nu, w.per_nu, w.mobility, w.per_mobility, state.rates[0],
+        T, drift, n, nn, model, w.nu, w.per_nu, w.mobility, w.per_mobility, state.rates[0],
         w.inelastic, w.inelastic_slope,
     )  # fmt: skip
     if model.drift_credit:
-        by_column(T, drift, model, DRIFT_EVENTS, w.d)
-        pay(w.inelastic, n, nn, w.d, drift, -1.0)
+        by_column(T, drift, model, DRIFT_EVENTS, w.events)
+        pay(w.inelastic, n, nn, w.events, drift, -1.0)
     for k in range(model.further.shape[0]):
         by_column(T, drift, model, FURTHER + k, state.rates[k + 1])
         below = model.further[k, 0]
         source = nn if below == 0 else state.n_i[below - 1]
-        w.c[:] = model.further_eV[k]
-        pay(w.inelastic, n, source, state.rates[k + 1], w.c, 1.0)
+        w.cost[:] = model.further_eV[k]
+        pay(w.inelastic, n, source, state.rates[k + 1], w.cost, 1.0)
     return True
 
 

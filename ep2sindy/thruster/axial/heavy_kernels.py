@@ -242,7 +242,7 @@ def follow_heavy(state, model, dt, sums, w):
     """
     n, g, nn = state.n_i, state.flux_i, state.n_n
     new, new_g, new_nn, keep = w.stage_n, w.stage_flux, w.stage_nn, 0.0
-    for _ in range(2):  # one copy of the code, which then fits the processor's cache
+    for _ in range(2):  # one copy of the code for both stages
         stage(new, new_g, new_nn, n, g, nn, keep, dt, state, model, sums, w)
         n, g, nn, new, new_g, new_nn, keep = new, new_g, new_nn, n, g, nn, 0.5
 

@@ -66,11 +66,13 @@ def add_ions(sum_n, sum_u, sum_g, n, g, weight):
 
 
 @compiled(**FAST)
-def add_instant(sums, state, weight, w):
+def add_instant(sums, state, weight):
     """Add weight times the present fields to the sums, except those that the heavy step adds."""
-    cells, E, energy = sums.cells, state.E, state.energy
-    add_fields(cells[N_N], cells[T_E], cells[R_ION], cells[E_Z], cells[ENERGY], state.n_n,
-               state.T_e_eV, state.rates[0], E, energy, weight)  # fmt: skip
+    cells = sums.cells
+    add_fields(
+        cells[N_N], cells[T_E], cells[R_ION], cells[E_Z], cells[ENERGY], state.n_n, state.T_e_eV,
+        state.rates[0], state.E, state.energy, weight,
+    )  # fmt: skip
     for k in range(state.n_i.shape[0]):
         n, u, g = N_I + PER_CHARGE * k, U_IZ + PER_CHARGE * k, FLUX_I + PER_CHARGE * k
         add_ions(cells[n], cells[u], cells[g], state.n_i[k], state.flux_i[k], weight)
@@ -110,7 +112,7 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
             follow_heavy(state, model, dt, sums, w)
             if not follow_electrons(state, model, dt, w):
                 return row
-            add_instant(sums, state, dt, w)
+            add_instant(sums, state, dt)
             left -= dt
         add_changes(sums, state, 1.0)
         add_scaled(sums.cells[SPREAD], model.spread, weight)

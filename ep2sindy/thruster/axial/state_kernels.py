@@ -15,7 +15,7 @@ import numpy as np
 from ep2sindy.runtime.compilation import SEPARATE_ARRAYS, compiled
 
 # Sums may be reordered, but infinities and NaNs must be preserved: they end a run. Nothing is
-# allocated in a kernel, so that references need not be counted, which costs as much as the loops.
+# allocated in a kernel, so that references need not be counted, which costs half of what loops do.
 ENTRY: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "arcp", "nsz"},
@@ -166,8 +166,11 @@ class Scratch(NamedTuple):
     stage_nn: np.ndarray
     mobility: np.ndarray  # m^2/(V s)
     per_mobility: np.ndarray
-    per_nu: np.ndarray  # s
+    nu: np.ndarray  # 1/s: of collisions that T_e alone decides
+    per_nu: np.ndarray  # s: over the frequency of all collisions
     coulomb: np.ndarray  # 1/s, electron-ion collisions
+    events: np.ndarray  # m^3/s, and what each costs, in eV
+    cost: np.ndarray
     heating: np.ndarray  # eV/(m^3 s), and the losses, with their slopes in T_e
     inelastic: np.ndarray
     inelastic_slope: np.ndarray
