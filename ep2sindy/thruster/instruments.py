@@ -29,8 +29,8 @@ def ion_velocities(
     taken as steady, since ions cross the thruster in a few samples; its densities are added up over
     the record. Left out: losses to walls, collisions, ions that move towards the anode, and that
     some are born with two charges. The fluid has one velocity in a place: its
-    u_iz agrees with the mean of f where ions come from upstream, and is some 15 % above it where
-    they are born.
+    u_iz agrees with the mean of f where ions come from upstream, and is above it where they are
+    born.
 
     field: record of `simulate` with averages. z: places in m from the anode. speeds: edges of bins
     in m/s, increasing; None takes 200 up to the fastest ion. Returns f in s/m on (z, u), with u at
