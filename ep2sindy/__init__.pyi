@@ -17,6 +17,7 @@ from ep2sindy.library.units import Clock as Clock
 from ep2sindy.library.library import Library as Library
 from ep2sindy.library.library import polynomial as polynomial
 from ep2sindy.library.library import named_terms as named_terms
+from ep2sindy.library.roles import Roles as Roles  # for configs
 
 # Discover
 from ep2sindy.discovery.discover import discover as discover

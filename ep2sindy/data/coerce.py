@@ -22,6 +22,7 @@ from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, complete, relations_of
+from ep2sindy.library.roles import Roles
 from ep2sindy.runtime.values import check_kind, check_list
 
 if TYPE_CHECKING:
@@ -253,15 +254,18 @@ class Task:
 
     runs: trajectories of the same states, which agree in the units of the library's variables.
     relations: between coefficients. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation; it is not searched.
+    coefficients, all terms of that equation; it is not searched. roles: of terms, for equations
+    that conserve what states exchange.
     Raises ValueError for runs that do not agree or that share samples, a state that repeats
-    another, a variable that a run lacks, or a relation or term of unknown names.
+    another, a variable that a run lacks, a relation, term or role of unknown names, or roles beside
+    relations or terms.
     """
 
     runs: Sequence[Trajectory]
     library: Library
     relations: Sequence[Relation] = ()
     terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    roles: Roles | None = None
 
     def __post_init__(self) -> None:
         check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
@@ -297,6 +301,14 @@ class Task:
 
     def _check_known(self) -> None:
         """Raise ValueError for an unknown state or term, or an equation without terms."""
+        if self.roles is not None:
+            check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
+            if self.relations or self.terms:
+                raise ValueError(
+                    "roles say which terms the equations may have and how they are tied: relations "
+                    "and terms came as well; give roles alone, or leave them out"
+                )
+            self.roles.processes(self.library, self.states)
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.terms.items() for term in terms]
         for state in (*self.terms, *(state for state, _ in named)):

@@ -27,6 +27,7 @@ from ep2sindy.regression.weak import Weak
 from ep2sindy.regression.whitening import whitened_rows
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import (
+    Decision,
     Selection,
     SystemSelection,
     admissible,
@@ -102,7 +103,7 @@ class Choice:
     refinement. note: how the rule decided; else empty. left: for each state, the residuals of the
     final fit on rows whose noise is known; None if the model was not judged by rows. n_free: for
     each state named by a relation that holds in the model, the number of free coefficients of its
-    equation.
+    equation. constraint: that the coefficients obey; None if they are all free.
     """
 
     fronts: Sequence[ParetoFront]
@@ -111,6 +112,7 @@ class Choice:
     note: str = ""
     left: Mapping[str, LeftOver] | None = None
     n_free: Mapping[str, int] = field(default_factory=dict)
+    constraint: Constraint | None = None
 
 
 def choose(
@@ -142,7 +144,8 @@ def choose(
         model = constrained_fit(problems, held, units=units, provenance=provenance)
         won = [f.with_scores(_won(f.scores, int(k))) for f, k in zip(scored, place, strict=True)]
         best = [front.candidates[k] for front, k in zip(won, place, strict=True)]
-        return Choice(won, best, model, left={}, n_free=_count_free(held, bound))
+        n_free = _count_free(held, bound)
+        return Choice(won, best, model, left={}, n_free=n_free, constraint=held)
     best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
     model = assemble_model(library, fits, units=units, provenance=provenance)
@@ -165,10 +168,23 @@ def choose_by_runs(
     Raises ValueError for relations that no combination has the terms for.
     """
     decision = rule.decide(fronts, library, runs, relations, progress=progress)
+    return choice_of(fronts, decision, runs, provenance=provenance)
+
+
+def choice_of(
+    fronts: Sequence[ParetoFront],
+    decision: Decision,
+    runs: Sequence[Trajectory],
+    *,
+    provenance: Mapping[str, str],
+) -> Choice:
+    """The choice that a rule's decision makes, with its scores on the fronts."""
     scored = [f.with_scores(s) for f, s in zip(fronts, decision.scores, strict=True)]
     model = replace(decision.model, units=runs[0].units, provenance=provenance)
     best = [front.best for front in scored]
-    return Choice(scored, best, model, decision.note)
+    held = decision.constraint
+    is_tied = held is not None and len(held.free) < len(held.coefficients)
+    return Choice(scored, best, model, decision.note, constraint=held if is_tied else None)
 
 
 def noise_test(

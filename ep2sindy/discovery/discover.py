@@ -14,7 +14,8 @@ from ep2sindy.discovery.choice import NoiseTest, noise_test
 from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch, method_given
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import Relation, relations_of
+from ep2sindy.library.relations import Constraint, Relation, relations_of
+from ep2sindy.library.roles import Roles
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.ambiguity import Ambiguity
@@ -39,7 +40,8 @@ class Discovery:
     terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
     the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
     the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
-    trajectory search.
+    trajectory search. constraint: that the model's coefficients obey under relations or roles, to
+    be handed to `refine`; None without.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)
@@ -58,6 +60,7 @@ class Discovery:
     note: str = ""
     remarks: Sequence[str] = ()
     estimate: Estimate | None = field(default=None, repr=False)
+    constraint: Constraint | None = field(default=None, repr=False)
 
     @property
     def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
@@ -101,6 +104,7 @@ def discover(
     *,
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
+    roles: Roles | None = None,
     seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
     recipe: DiscoveryMethod | None = None,
@@ -114,16 +118,18 @@ def discover(
     TrajectorySearch(), the best method we know for noisy data. relations: between coefficients,
     such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search, in the selection and in
     the model. terms: for each state whose equation is known but for its coefficients, all terms of
-    that equation. progress: True shows bars; see `Progress`. recipe: the old name of method, for
-    one more version.
-    Raises ValueError for a relation or a term that the library or the states do not have, for runs
-    whose states or units differ, and for states or samples that come twice.
+    that equation. roles: of terms, for equations that conserve what states exchange (`Roles`); for
+    a `Regression` whose rule runs systems, such as FreeRunScore. progress: True shows bars; see
+    `Progress`. recipe: the old name of method, for one more version.
+    Raises ValueError for a relation, a term or a role that the library or the states do not have,
+    for roles that the method cannot keep, for runs whose states or units differ, and for states or
+    samples that come twice.
     """
     method = method_given(method, recipe) or TrajectorySearch()
     trajectories = trajectories_of(runs)
     library = polynomial(trajectories[0].names, degree=2) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
-    task = Task(trajectories, library, relations_of(relations), terms or {})
+    task = Task(trajectories, library, relations_of(relations), terms or {}, roles)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     found = method.identify(task, rng=rng, progress=watch)
     choice = found.choice
@@ -140,6 +146,7 @@ def discover(
         note=choice.note or test.misfit,
         remarks=found.remarks,
         estimate=found.estimate,
+        constraint=choice.constraint,
     )
 
 

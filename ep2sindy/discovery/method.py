@@ -20,9 +20,10 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import Choice, choose, choose_by_runs
+from ep2sindy.discovery.choice import Choice, choice_of, choose, choose_by_runs
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
+from ep2sindy.library.roles import Roles
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
 from ep2sindy.regression.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
 from ep2sindy.regression.front import Candidate, ParetoFront, pareto_front
@@ -132,8 +133,13 @@ class TrajectorySearch:
     ) -> IdentifiedEquations:
         """Estimate states and coefficients, and choose; the search is deterministic.
 
-        Ambiguities are terms whose values at the samples are alike.
+        Ambiguities are terms whose values at the samples are alike. Raises ValueError for roles.
         """
+        if task.roles is not None:
+            raise ValueError(
+                "roles are kept by a regression: TrajectorySearch() came with roles; take "
+                "Regression(selection=FreeRunScore())"
+            )
         found = self._estimate(task, progress)
         choice = self._choose(found, task, progress)
         return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
@@ -274,6 +280,8 @@ class Regression:
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> IdentifiedEquations:
         """Assemble rows, search them, and choose."""
+        if task.roles is not None:
+            return self._identify_under(task.roles, task, rng=rng, progress=progress)
         equations = self.search_equations(task, rng=rng, progress=progress)
         fronts = [equation.front for equation in equations]
         choice = self.choose(fronts, task, progress=progress)
@@ -283,6 +291,32 @@ class Regression:
             if not set(front.rows.equations) <= set(task.terms):
                 found += few_rows(front.rows)
             found += ambiguities(front.rows)
+        return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
+
+    def _identify_under(
+        self, roles: Roles, task: Task, *, rng: np.random.Generator, progress: Progress
+    ) -> IdentifiedEquations:
+        """Search all equations at once for systems that keep the roles, and let the rule decide.
+
+        The search is made once, on all training rows: bootstraps weigh one equation at a time.
+        """
+        # These load torch, only for a search under roles.
+        from ep2sindy.discovery.conserving import conserving_systems
+        from ep2sindy.selection.free_run import FreeRunScore
+        from ep2sindy.selection.refined import RefinedScore
+
+        if not isinstance(self.selection, FreeRunScore | RefinedScore):
+            raise ValueError(
+                "roles tie all equations together, so a rule must judge whole systems: selection "
+                f"must be FreeRunScore() or RefinedScore(), {self.selection!r} came"
+            )
+        with progress.stage(None, "", "rows of the regression"):
+            problems = self.formulation.assemble(task.runs, task.library, rng=rng)
+        systems = conserving_systems(problems, task, roles, self.search, depth=self.depth)
+        decision = self.selection.judge(systems, task.runs, progress=progress)
+        provenance = self.provenance | _labels(task)
+        choice = choice_of(systems.fronts, decision, task.runs, provenance=provenance)
+        found = [each for rows in problems for each in (*few_rows(rows), *ambiguities(rows))]
         return IdentifiedEquations(choice, tuple(dict.fromkeys(found)), _limits(task.runs))
 
     def search_equations(

@@ -16,7 +16,7 @@ from ep2sindy.model.comparison import FreeRunBounds, Verdict, compare_cycles, de
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.stability import limit_cycle
+from ep2sindy.model.stability import limit_cycle, share_reaching
 from ep2sindy.refinement.refine import refine_batch
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
@@ -34,10 +34,12 @@ from ep2sindy.selection.systems import (
     Fold,
     Records,
     Stretch,
+    Systems,
     TrialSystem,
     budget,
     folds_of,
     records_of,
+    signs_note,
     systems_of,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
@@ -52,6 +54,15 @@ GAIN = 0.95
 # Largest modulus of the Floquet multipliers, after the first, of an attracting cycle: a departure
 # halves within 14 periods. Data of a few periods cannot tell weaker attraction from none.
 PULL = 0.95
+
+# Share of starts from which a cycle counts as attracting everything around it, and their number.
+GLOBAL, N_REACHING = 0.9, 64
+
+# Free coefficients more than the smallest attracting system has, for one that attracts everything.
+DEARER = 1
+
+# Largest ratio of the waveform errors of two systems that count as equals.
+ALIKE = 1.25
 
 # Fewest periods of a record, so that its folds leave windows of two periods: six, less a margin
 # for noise.
@@ -81,6 +92,53 @@ class Trial:
     loss: float
 
 
+@dataclass(frozen=True, eq=False)
+class Confirmed:
+    """A system refined on all data, and its free run over the longest record.
+
+    number: among the systems. share: of starts around the cycle that reach it; zero if the model
+    does not live, or if departures from its cycle do not die out. broken: demanded signs that the
+    coefficients do not have.
+    """
+
+    number: int
+    trial: Trial
+    run: FreeRun
+    share: float
+    broken: Sequence[str]
+
+    @property
+    def is_global(self) -> bool:
+        return self.share >= GLOBAL
+
+    def outdoes(self, resting: Confirmed) -> bool:
+        """Whether an attracting system is preferred to one that is no larger, on a neutral cycle.
+
+        It is if it follows the windows better, or as an equal: of one size, and as close to the
+        waveform of the folds that neither was fitted to.
+        """
+        ours, theirs = self.trial, resting.trial
+        is_equal = ours.system.n_free <= theirs.system.n_free
+        is_close = ours.waveform <= ALIKE * theirs.waveform
+        return ours.loss < GAIN * theirs.loss or (is_equal and is_close)
+
+    def rank(self) -> tuple[bool, int, bool, bool, int, float]:
+        """Sorts the best first; the first of equals wins."""
+        verdict = list(Verdict).index(self.run.verdict)
+        size = self.trial.system.n_free
+        return bool(self.broken), verdict, not self.share, not self.is_global, size, -self.share
+
+    def text(self, n_living: int, n_systems: int) -> str:
+        """How the system was confirmed, in words."""
+        how = str(self.run.verdict)
+        if self.run.verdict is Verdict.LIVES and not self.share:
+            how = f"{how}, on a cycle that does not attract"
+        elif self.share and not self.run.model.inputs:
+            how = f"{how}, {100.0 * self.share:.0f} % of starts reach it"
+        found = f"{how}; {n_living or 'none'} of {n_systems} systems live where not fitted"
+        return signs_note(found, self.broken)
+
+
 @dataclass(frozen=True)
 class FreeRunScore:
     """Judge systems of equations by running them freely; the smallest system that lives wins.
@@ -93,11 +151,14 @@ class FreeRunScore:
     within `bounds` of the data's cycle in every run.
     Living systems within `margin` come first; among these the smallest, and among equals the one
     with the best waveform, is refined on windows of all data and run over the longest record. It
-    wins if it lives there too, on a cycle that attracts. A system on a neutral cycle wins only if
-    no larger system on an attracting cycle follows its windows better. If no system lives, the one
-    that deviates least wins, and the note says so. Neither R2 nor the loss of the windows decides
-    which systems live: they are blind to where a trajectory ends. Only if some systems follow the
-    samples to rounding, because the truth is in the library, these compete alone.
+    wins if it lives there too, on a cycle that nine of ten starts around it reach; if fewer do, one
+    that they reach wins with the same number of coefficients or one more, else that of least size
+    and most such starts. A system on a neutral cycle wins only if no equal or larger system on an
+    attracting cycle follows the data as well. Size is the number of free coefficients. If no system
+    lives, the one that deviates least wins, and the note says so. Neither R2 nor the loss of the
+    windows decides which systems live: they are blind to where a trajectory ends. Only if some
+    systems follow the samples to rounding, because the truth is in the library, these compete
+    alone.
 
     RefinedScore decides instead if a record has no period, holds fewer than six, or spirals outward
     or inward throughout: then there is no cycle to compare with.
@@ -154,20 +215,27 @@ class FreeRunScore:
         Raises ValueError for no runs, a state without a front, more than max_combinations, or
         relations that no combination has the terms for.
         """
+        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
+        systems = systems_of(fronts, places, library, runs, relations)
+        return self.judge(Systems(fronts, places, systems), runs, progress=progress)
+
+    def judge(
+        self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
+    ) -> Decision:
+        """Decide among given systems, as `decide` does among the combinations of candidates."""
+        fronts, places, systems = found.fronts, found.places, found.systems
         records = records_of(fronts, runs)
         cycles = cycles_of(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
             rule = RefinedScore(max_combinations=self.max_combinations)
-            found = rule.decide(fronts, library, runs, relations, progress=progress)
-            return replace(found, note=f"{cycles}: chosen by windows held out instead")
-        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
-        systems = systems_of(fronts, places, library, runs, relations)
+            decision = rule.judge(found, runs, progress=progress)
+            return replace(decision, note=f"{cycles}: chosen by windows held out instead")
         trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
         winner, model, note = self._winner(records, cycles, trials, progress)
         limit = max(1.0, float(errors[winner]))
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
-        return Decision(scores, model, note)
+        return Decision(scores, model, note, systems[winner].constraint)
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
         """Number of samples in a window."""
@@ -184,7 +252,7 @@ class FreeRunScore:
     ) -> list[Trial]:
         """Refine and run every system, fold by fold; one that lacks an equation cannot live."""
         whole = [k for k, system in enumerate(systems) if system.model.coef.any(axis=0).all()]
-        whole.sort(key=lambda k: systems[k].n_terms)  # systems in a batch then cost about the same
+        whole.sort(key=lambda k: systems[k].n_free)  # systems in a batch then cost about the same
         trials = [Trial(system, MAX_ERROR, np.inf, np.inf) for system in systems]
         if not whole:
             return trials
@@ -231,7 +299,10 @@ class FreeRunScore:
             for t, paths, cycle in paths_over(ensemble, fold.held, records, cycles, self.n_starts):
                 judged.append(self._judge(t, paths, cycle, first.states))
                 advance(len(paths))
-        return np.column_stack([np.max(judged, axis=0), refined.loss])
+        worst = np.column_stack([np.max(judged, axis=0), refined.loss])
+        pairs = zip(systems, refined.models, strict=True)
+        worst[[bool(system.broken_signs(model)) for system, model in pairs], 0] = MAX_ERROR
+        return worst
 
     def _judge(
         self,
@@ -267,9 +338,12 @@ class FreeRunScore:
         living.sort(key=lambda k: self._rank(trials[k]))
         by_error = sorted(range(len(trials)), key=lambda k: (trials[k].error, trials[k].loss))
         window = self._window(records, cycles)
-        found, resting = [], None
+        found: list[Confirmed] = []
         best = (living or by_error)[: self.n_confirmed]
-        for place, k in enumerate(count_pieces(progress, best, "system", "refined on all data")):
+        for k in count_pieces(progress, best, "system", "refined on all data"):
+            attracting = [each for each in found if each.share]
+            if attracting and trials[k].system.n_free > attracting[0].trial.system.n_free + DEARER:
+                break
             model = trials[k].system.refined_on_all(
                 records.runs,
                 window=window,
@@ -277,40 +351,48 @@ class FreeRunScore:
                 n_reweights=0,
                 seed=self.seed,
             )
-            run = self._confirm(model, records, cycles)
-            lives = run.verdict is Verdict.LIVES
-            attracts = lives and _attracts(run, cycles)
-            pulls = attracts and (resting is None or trials[k].loss < GAIN * resting)
-            if lives and not attracts and resting is None:
-                resting = trials[k].loss
-            found.append((not pulls, list(Verdict).index(run.verdict), place, k, run))
-            if pulls:
+            own = self._confirm(k, trials[k], model, records, cycles)
+            resting = [e for e in found if e.run.verdict is Verdict.LIVES and not e.share]
+            if own.share and resting and not own.outdoes(resting[0]):
+                own = replace(own, share=0.0)  # it attracts by chance
+            found.append(own)
+            if own.is_global and not own.broken:
                 break
-        rests, _, _, winner, run = min(found, key=lambda each: each[:3])
-        how = str(run.verdict)
-        if run.verdict is Verdict.LIVES and rests:
-            how = f"{how}, on a cycle that does not attract"
-        count = f"{len(living) or 'none'} of {len(trials)} systems live where not fitted"
-        return winner, run.model, f"{how}; {count}"
+        won = min(found, key=Confirmed.rank)
+        return won.number, won.run.model, won.text(len(living), len(trials))
 
     def _rank(self, trial: Trial) -> tuple[bool, int, float]:
-        return trial.error > self.margin, trial.system.n_terms, trial.waveform
+        return trial.error > self.margin, trial.system.n_free, trial.waveform
 
-    def _confirm(self, model: SparseModel, records: Records, cycles: Sequence[Cycle]) -> FreeRun:
-        """Free run over the longest record, from the start of its cycle."""
+    def _confirm(
+        self,
+        number: int,
+        trial: Trial,
+        model: SparseModel,
+        records: Records,
+        cycles: Sequence[Cycle],
+    ) -> Confirmed:
+        """Free run of a refined system over the longest record, from the start of its cycle."""
         pairs = zip(records.runs, cycles, strict=True)
-        run, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
+        longest, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
-        return free_run(model, run, initial=start, bounds=self.bounds, judged=self.judged)
+        run = free_run(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
+        share = _share_reaching(run, cycles) if run.verdict is Verdict.LIVES else 0.0
+        return Confirmed(number, trial, run, share, trial.system.broken_signs(model))
 
 
-def _attracts(run: FreeRun, cycles: Sequence[Cycle]) -> bool:
-    """True if departures from the model's cycle die out; always for models with inputs."""
+def _share_reaching(run: FreeRun, cycles: Sequence[Cycle]) -> float:
+    """Share of starts that reach the model's cycle; zero if departures from it do not die out.
+
+    A model with inputs is followed from its start alone: one.
+    """
     if run.model.inputs:
-        return True
+        return 1.0
     period_s = 1.0 / cycles[0].frequency_Hz
     cycle = limit_cycle(run.model, run.rollout.states[-1], period_s=period_s)
-    return cycle is not None and bool((np.abs(cycle.multipliers[1:]) <= PULL).all())
+    if cycle is None or (np.abs(cycle.multipliers[1:]) > PULL).any():
+        return 0.0
+    return max(share_reaching(run.model, cycle, n_starts=N_REACHING), 0.5 / N_REACHING)
 
 
 def cycles_of(records: Records, states: Sequence[str]) -> list[Cycle] | str:

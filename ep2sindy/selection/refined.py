@@ -28,7 +28,15 @@ from ep2sindy.selection.rule import (
     combinations,
     smallest,
 )
-from ep2sindy.selection.systems import Records, TrialSystem, budget, records_of, systems_of
+from ep2sindy.selection.systems import (
+    Records,
+    Systems,
+    TrialSystem,
+    budget,
+    records_of,
+    signs_note,
+    systems_of,
+)
 
 # Fewest pairs of windows to cut the records into if window_s is not set.
 MIN_PAIRS = 3
@@ -107,14 +115,30 @@ class RefinedScore:
         Also raises ValueError for relations that no combination has the terms for.
         """
         places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
-        records = records_of(fronts, runs)
         systems = systems_of(fronts, places, library, runs, relations)
-        errors, limit = self._judge(systems, records, progress)
-        winner = smallest(fronts, places, errors, limit=limit)
+        return self.judge(Systems(fronts, places, systems), runs, progress=progress)
+
+    def judge(
+        self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
+    ) -> Decision:
+        """Decide among given systems, as `decide` does among the combinations of candidates.
+
+        A winner whose refined coefficients do not have the signs demanded of them is passed over.
+        """
+        fronts, places, systems = found.fronts, found.places, found.systems
+        errors, limit = self._judge(systems, records_of(fronts, runs), progress)
+        broken: list[str] = []
+        for _ in systems:
+            winner = smallest(fronts, places, errors, limit=limit)
+            with progress.stage(None, "", "the best system refined on all data"):
+                model = systems[winner].refined_on_all(runs)
+            broken = systems[winner].broken_signs(model)
+            if not broken:
+                break
+            errors[winner] = np.inf
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
-        with progress.stage(None, "", "the best system refined on all data"):
-            found = systems[winner].refined_on_all(runs)
-        return Decision(scores, found, self.label)
+        note = signs_note(self.label, broken)
+        return Decision(scores, model, note, systems[winner].constraint)
 
     def _judge(
         self, systems: Sequence[TrialSystem], records: Records, progress: Progress

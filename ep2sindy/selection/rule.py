@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Relation, binding
+from ep2sindy.library.relations import Constraint, Relation, binding
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -44,12 +44,14 @@ class Decision:
     """Result of a rule that judges whole systems of equations and refines the coefficients.
 
     scores: for each front, one per candidate, the winner's the least. model: the winner refined,
-    with the covariance of its coefficients. note: how it was decided, in words.
+    with the covariance of its coefficients. note: how it was decided, in words. constraint: what
+    the winner's coefficients obey; None if the rule does not say.
     """
 
     scores: Sequence[Float[np.ndarray, " _candidates"]]
     model: SparseModel
     note: str
+    constraint: Constraint | None = None
 
 
 @runtime_checkable

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,14 +25,31 @@ BATCH_STEPS = 6000
 
 @dataclass(frozen=True, eq=False)
 class TrialSystem:
-    """A model of one candidate per equation, with the constraint that its coefficients obey."""
+    """A model of one candidate per equation, with the constraint that its coefficients obey.
+
+    signs: (state, term) -> 1 or -1, signs that are demanded of refined coefficients.
+    """
 
     model: SparseModel
     constraint: Constraint
+    signs: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     @property
     def n_terms(self) -> int:
         return int(np.count_nonzero(self.model.coef))
+
+    @property
+    def n_free(self) -> int:
+        """Number of coefficients that are fitted."""
+        return len(self.constraint.free)
+
+    def broken_signs(self, model: SparseModel) -> list[str]:
+        """The demanded signs that the coefficients of a refined model do not have."""
+        return [
+            f"{state}: {term} {'<' if sign < 0 else '>'} 0"
+            for (state, term), sign in self.signs.items()
+            if sign * model.terms(state).get(term, 0.0) <= 0.0
+        ]
 
     def refined_on_all(
         self,
@@ -61,6 +78,23 @@ class TrialSystem:
             rng=seed,
         )
         return found.model
+
+
+@dataclass(frozen=True, eq=False)
+class Systems:
+    """Systems to be judged, and for each the candidates of the fronts that its equations are.
+
+    places: index of the candidate in every front.
+    """
+
+    fronts: Sequence[ParetoFront]
+    places: Int[np.ndarray, "systems fronts"]
+    systems: Sequence[TrialSystem]
+
+
+def signs_note(note: str, broken: Sequence[str]) -> str:
+    """A rule's note, with the demanded signs that its winner does not have."""
+    return f"{note}; no system keeps the demanded signs: {', '.join(broken)}" if broken else note
 
 
 def systems_of(

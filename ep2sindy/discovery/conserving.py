@@ -1,0 +1,137 @@
+"""Search for systems of equations under roles: processes enter all of their equations or none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.coerce import Task
+from ep2sindy.data.numbers import column_norms
+from ep2sindy.library.relations import Constraint, constraint
+from ep2sindy.library.roles import Process, Roles, constraint_of
+from ep2sindy.model.model import SparseModel
+from ep2sindy.refinement.refine import with_coef
+from ep2sindy.regression.constrained import weighted_equations
+from ep2sindy.regression.front import ParetoFront, fit_supports
+from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.regression.searches import Search
+from ep2sindy.selection.systems import Systems, TrialSystem
+
+
+def conserving_systems(
+    problems: Sequence[RegressionRows], task: Task, roles: Roles, search: Search, *, depth: int
+) -> Systems:
+    """The systems that a search proposes for all equations at once, smallest first.
+
+    One regression over the training rows of all equations, each weighted by its residuals, has one
+    column per process; so a search proposes processes, and what they move is conserved exactly. The
+    `depth` best systems of every size are kept that give every state an equation.
+    Raises ValueError for roles that do not fit the task, or if no system has all equations.
+    """
+    processes = roles.processes(task.library, task.states)
+    columns, target = _joint_rows(problems, task, processes, roles.known_inflow)
+    norms = column_norms(columns)
+    unit = columns / norms
+    masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
+    found = []
+    for mask in _best(masks, unit, target, depth):
+        chosen = np.flatnonzero(mask)
+        values = np.linalg.lstsq(unit[:, chosen], target, rcond=None)[0] / norms[chosen]
+        system = _system(task, [processes[k] for k in chosen], values, roles)
+        if system is not None:
+            found.append(system)
+    if not found:
+        raise ValueError(
+            f"no system of up to {masks.sum(axis=1).max(initial=0)} processes has an equation for "
+            f"each of {list(task.states)} under these roles: raise the search's max_terms, or give "
+            "more roles"
+        )
+    return _with_fronts(found, problems, task)
+
+
+def _joint_rows(
+    problems: Sequence[RegressionRows],
+    task: Task,
+    processes: Sequence[Process],
+    known: Mapping[str, float],
+) -> tuple[Float[np.ndarray, "rows processes"], Float[np.ndarray, " rows"]]:
+    """Weighted rows of all equations, with one column per process; known inflows are subtracted."""
+    library = task.library
+    every = constraint(library, dict.fromkeys(task.states, library.names))
+    shares = np.array([[p.factors.get(at, 0.0) for p in processes] for at in every.coefficients])
+    fixed = np.array([known.get(s, 0.0) if term == "1" else 0.0 for s, term in every.coefficients])
+    columns, targets = [], []
+    for equation in weighted_equations(problems, every):
+        theta, target = equation.rows(equation.start)
+        columns.append(theta @ shares[equation.at])
+        targets.append(target - theta @ fixed[equation.at])
+    return np.concatenate(columns), np.concatenate(targets)
+
+
+def _best(
+    masks: Bool[np.ndarray, "supports processes"],
+    columns: Float[np.ndarray, "rows processes"],
+    target: Float[np.ndarray, " rows"],
+    depth: int,
+) -> list[Bool[np.ndarray, " processes"]]:
+    """The `depth` supports of least residual of every size, smallest sizes first."""
+    xx, xy = columns.T @ columns, columns.T @ target
+    ranked = []
+    for mask in masks[masks.any(axis=1)]:
+        own = np.flatnonzero(mask)
+        gain = xy[own] @ np.linalg.lstsq(xx[np.ix_(own, own)], xy[own], rcond=None)[0]
+        ranked.append((len(own), -gain, own.tolist(), mask))
+    ranked.sort(key=lambda each: each[:3])
+    sizes = [size for size, *_ in ranked]
+    return [each[-1] for k, each in enumerate(ranked) if k - sizes.index(each[0]) < depth]
+
+
+def _system(
+    task: Task,
+    processes: Sequence[Process],
+    values: Float[np.ndarray, " processes"],
+    roles: Roles,
+) -> TrialSystem | None:
+    """The system of these processes; None if a state lacks an equation, or they are all one."""
+    held = constraint_of(task.library, task.states, processes, roles.known_inflow)
+    if held is None or {state for state, _ in held.coefficients} != set(task.states):
+        return None
+    empty = np.zeros((len(task.library), len(task.states)))
+    model = SparseModel(task.library, task.states, empty, task.runs[0].units)
+    coef = held.coef(_free_values(held, processes, values))
+    present = set(held.coefficients)
+    signs = {at: sign for at, sign in roles.signed.items() if at in present}
+    return TrialSystem(with_coef(model, held, coef)[0], held, signs)
+
+
+def _free_values(
+    held: Constraint, processes: Sequence[Process], values: Float[np.ndarray, " processes"]
+) -> Float[np.ndarray, " free"]:
+    """The free coefficients of a system from the coefficients of its processes."""
+    places = [held.coefficients[k] for k in held.free]
+    return np.array([[p.factors.get(at, 0.0) for p in processes] for at in places]) @ values
+
+
+def _with_fronts(
+    systems: Sequence[TrialSystem], problems: Sequence[RegressionRows], task: Task
+) -> Systems:
+    """The systems with a front per equation, which holds each of their supports once."""
+    rows = {state: problem for problem in problems for state in problem.equations}
+    fronts, places = [], np.zeros((len(systems), len(task.states)), dtype=np.int64)
+    for column, state in enumerate(task.states):
+        masks = np.stack([_mask(system, state, task) for system in systems])
+        different, owner = np.unique(masks, axis=0, return_inverse=True)
+        order = np.argsort(different.sum(axis=1), kind="stable")
+        nothing = np.zeros((1, masks.shape[1]), dtype=np.bool_)
+        masks = np.concatenate([nothing, different[order]])
+        fronts.append(ParetoFront(state, fit_supports(rows[state], state, masks), rows[state]))
+        places[:, column] = 1 + np.argsort(order)[owner.ravel()]
+    return Systems(fronts, places, systems)
+
+
+def _mask(system: TrialSystem, state: str, task: Task) -> Bool[np.ndarray, " terms"]:
+    mask = np.zeros(len(task.library), dtype=np.bool_)
+    mask[[task.library.index(term) for s, term in system.constraint.coefficients if s == state]] = 1
+    return mask
