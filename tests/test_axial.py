@@ -164,8 +164,8 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
         (lambda run: ep.thruster.SoftStart(resistance=-1.0),
          r"SoftStart\.resistance must be .* positive"),
         (lambda run: ep.thruster.zone_balance(run, (0.03, 0.06)),
-         r"must hold cells and end before the la"),
-        (lambda run: ep.thruster.zone_balance(run[["n_i"]], ZONE), r"simulate with averaged=True"),
+         r"must end before the last cell"),
+        (lambda run: ep.thruster.zone_balance(run[["n_i"]], ZONE), r"this field lacks \['n_n'\]"),
     ],
 )  # fmt: skip
 def test_bad_input_says_the_way_out(run, make, message):

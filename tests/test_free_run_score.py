@@ -57,7 +57,7 @@ def test_the_truth_is_found_refined_and_handed_on(found):
         assert front.candidates[int(np.argmin(scores))].terms == chosen.terms
         low, high = found.model.intervals(state)[chosen.terms[0]]
         assert low < chosen.coef[0] < high
-    assert found.note.startswith("lives; ")
+    assert found.note.startswith("lives, ")
     assert found.note in repr(found)
     assert ep.free_run(found.model, record()).verdict is ep.Verdict.LIVES
 
@@ -93,7 +93,7 @@ def test_a_state_that_was_not_measured_need_not_keep_its_waveform(found):
 
 def test_starts_at_other_phases_refuse_what_lives_from_one(found):
     several = ep.discover(record(), LIBRARY, recipe(n_starts=4))
-    assert several.note.startswith("lives; ")
+    assert several.note.startswith("lives, ")
     for state in ("n_i", "n_n"):
         assert list(several.model.terms(state)) == list(found.model.terms(state))
         assert (several.scores[state] >= found.scores[state] - 1e-9).all()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.thruster.axial.balance import zone_balance
+from ep2sindy.thruster.balance import zone_balance
 from ep2sindy.thruster.axial.heavy_kernels import heavy_step
 from ep2sindy.thruster.axial.model import (
     build_model,

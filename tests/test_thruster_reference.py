@@ -11,7 +11,7 @@ from benchmarks.source import (
     lasting_swing,
     zone_coefficients,
 )
-from ep2sindy.thruster.axial.balance import zone_balance
+from ep2sindy.thruster.balance import zone_balance
 
 pytestmark = pytest.mark.slow
 BASE = "guessed start, N = 100"

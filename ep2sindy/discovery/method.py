@@ -301,7 +301,7 @@ class Regression:
         The search is made once, on all training rows: bootstraps weigh one equation at a time.
         """
         # These load torch, only for a search under roles.
-        from ep2sindy.discovery.conserving import conserving_systems
+        from ep2sindy.selection.conserving import conserving_systems
         from ep2sindy.selection.free_run import FreeRunScore
         from ep2sindy.selection.refined import RefinedScore
 

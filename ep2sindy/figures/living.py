@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from textwrap import wrap
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,7 @@ from ep2sindy.figures.style import (
     make_grid,
     make_panels,
 )
+from ep2sindy.library.units import Clock
 from ep2sindy.model.comparison import LONG
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
@@ -129,3 +131,28 @@ def _waveforms(run: Trajectory, rollout: Rollout) -> tuple[Cycle, Cycle] | None:
     late = rollout.states[half:, [rollout.state_names.index(name) for name in run.state_names]]
     model = find_cycle(rollout.t[half:], late, n_harmonics=len(data.harmonics))
     return None if model is None else (data, model)
+
+
+def balance_figure(
+    t: Float[np.ndarray, " samples"],
+    parts: Mapping[str, tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]],
+    *,
+    clock: Clock,
+) -> Figure:
+    """A panel per process: its rate in the record and by the model's terms, in m^-3/s."""
+    factor, unit = clock.scale(float(t[-1] - t[0]))
+    n_rows = -(-len(parts) // 2)
+    figure, axes = make_panels(n_rows, 2, (9.0, 2.2 * n_rows + 0.6), sharex=True)
+    for ax, (name, (recorded, modelled)) in zip(axes.flat, parts.items(), strict=False):
+        ax.plot(factor * (t - t[0]), recorded, color=GREY, lw=2.4, label="record")
+        ax.plot(factor * (t - t[0]), modelled, color=COLOURS[0], lw=1.1, label="model")
+        ax.set_title("\n".join(wrap(name, 44)), fontsize=9)
+        ax.set_ylim(bottom=min(0.0, 1.1 * float(min(recorded.min(), modelled.min()))))
+    for ax in list(axes.flat)[len(parts) :]:
+        ax.set_visible(False)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(axis_label("rate", "m^-3/s"))
+    for ax in axes[-1]:
+        ax.set_xlabel(f"time ({unit})")
+    legend_above(figure, axes[0, 0].lines[:2])
+    return figure

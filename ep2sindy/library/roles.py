@@ -19,7 +19,7 @@ from ep2sindy.library.names import VARIABLE
 from ep2sindy.library.relations import Constraint
 from ep2sindy.runtime.values import check_list
 
-KNOWN, FREE = "known", "free"
+KNOWN, FREE, EITHER = "known", "free", "known or free"
 _SIGN = re.compile(rf"\s*(?P<state>{VARIABLE})\s*:\s*(?P<term>\S.*?)\s*(?P<side>[<>])\s*0\s*")
 
 Place = tuple[str, str]  # (state, term)
@@ -45,8 +45,9 @@ class Roles:
     with the same coefficient, which may be negative. outflow: states that lose something to the
     outside, by terms of their own powers; or state -> the terms that may. inflow: state -> the
     constant that it is supplied with, in SI per second; "free" if it is to be found. An experiment
-    also takes "known", the inflow that the record itself gives. signs: demanded of coefficients,
-    such as "n_i: n_i < 0". A state without a role has an equation of free terms.
+    also takes "known", the inflow that the record itself gives, and "known or free". signs:
+    demanded of coefficients, such as "n_i: n_i < 0". A state without a role has an equation of free
+    terms.
     Raises ValueError for an exchange of a state with itself, or a sign that cannot be read.
 
     >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"])
@@ -69,12 +70,12 @@ class Roles:
         if not isinstance(self.outflow, Mapping):
             check_list("outflow", self.outflow)
         for state, value in self.inflow.items():
-            if isinstance(value, str) and value in (KNOWN, FREE):
+            if isinstance(value, str) and value in (KNOWN, FREE, EITHER):
                 continue
             if isinstance(value, str | bool) or not np.isfinite(value):
                 raise ValueError(
-                    f"the inflow of {state} must be a number in SI per second, {KNOWN!r} or "
-                    f"{FREE!r}: {value!r} came"
+                    f"the inflow of {state} must be a number in SI per second, {KNOWN!r}, {FREE!r} "
+                    f"or {EITHER!r}: {value!r} came"
                 )
         for text in self.signs:
             parse_sign(text)
@@ -110,6 +111,7 @@ class Roles:
                     f"{FREE!r}"
                 )
         own = {s: known[s] if value == KNOWN else value for s, value in self.inflow.items()}
+        own |= {s: known.get(s, FREE) for s, value in self.inflow.items() if value == EITHER}
         return Roles(self.exchange, self.outflow, own, self.signs)
 
     def processes(self, library: Library, states: Sequence[str]) -> list[Process]:
@@ -151,9 +153,9 @@ class Roles:
             raise ValueError(
                 f"roles must name states: {unknown} came, and the states are {list(states)}"
             )
-        if open_ := [s for s, value in self.inflow.items() if value == KNOWN]:
+        if open_ := [s for s, value in self.inflow.items() if value in (KNOWN, EITHER)]:
             raise ValueError(
-                f"the inflow of {open_} is 'known' only where a record gives it, as in the "
+                f"the inflow of {open_} is known only where a record gives it, as in the "
                 f"experiments on a simulated thruster: give a number in SI per second, or {FREE!r}"
             )
         if self.known_inflow or FREE in self.inflow.values():

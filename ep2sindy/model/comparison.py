@@ -28,6 +28,10 @@ REPEATS = 0.9  # least share of the variance that the waveform of a cycle explai
 SPECTRUM_WANDERS = 2.0
 
 
+# Depth below zero, in standard deviations of the data, from which a density counts as negative.
+BELOW_ZERO = 1e-3
+
+
 class Verdict(StrEnum):
     """Verdict on a free run, the best first."""
 
@@ -35,6 +39,7 @@ class Verdict(StrEnum):
     SLIPS = "slips"
     WRONG_CYCLE = "wrong cycle"
     DIES_OUT = "dies out"
+    NEGATIVE = "turns negative"
     LEAVES_DOMAIN = "leaves the domain"
     DIVERGES = "diverges"
 
@@ -107,11 +112,13 @@ class ComparedRecord:
     """A record that runs are compared with: samples, and their cycle.
 
     cycle: cycle of the samples, or of a longer record that contains them; None without a period.
+    densities: indices of the states that cannot be negative.
     """
 
     t: Float[np.ndarray, " samples"]
     states: Float[np.ndarray, "samples n_states"]
     cycle: Cycle | None
+    densities: Sequence[int] = ()
     std: Float[np.ndarray, " n_states"] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -134,6 +141,8 @@ class ComparedRecord:
         by_state["distribution"] = distribution_distances(self.states[half:], late)
         by_state["amplitude_ratio"] = late.std(axis=0) / self.std
         spectrum = spectrum_distance(self.t[half:], self.states[half:], late)
+        if turns_negative(late, self.densities, self.std):
+            return Comparison(Verdict.NEGATIVE, np.nan, spectrum, by_state)
         middle = len(states) // 2
         if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
             return Comparison(Verdict.DIES_OUT, np.nan, spectrum, by_state)
@@ -176,4 +185,20 @@ class ComparedRecord:
 def record_of(run: Trajectory, states: Sequence[str]) -> ComparedRecord:
     """Record of a trajectory, with its cycle, that runs are compared with."""
     values = run.columns(states)
-    return ComparedRecord(run.t, values, find_cycle(run.t, values))
+    return ComparedRecord(run.t, values, find_cycle(run.t, values), densities_of(run, states))
+
+
+def densities_of(run: Trajectory, states: Sequence[str]) -> list[int]:
+    """Indices of the states that cannot be negative: numbers per m^3, positive in the mean."""
+    mean = run.columns(states).mean(axis=0)
+    return [k for k, name in enumerate(states) if run.units[name] == "m^-3" and mean[k] > 0.0]
+
+
+def turns_negative(
+    path: Float[np.ndarray, "samples n_states"],
+    densities: Sequence[int],
+    std: Float[np.ndarray, " n_states"],
+) -> bool:
+    """True if a density on a path is negative by more than rounding and noise of its start."""
+    columns = list(densities)
+    return bool((path[:, columns] < -BELOW_ZERO * std[columns]).any())

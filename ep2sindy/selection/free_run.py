@@ -9,10 +9,18 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation
-from ep2sindy.model.comparison import FreeRunBounds, Verdict, compare_cycles, deviation
+from ep2sindy.model.comparison import (
+    FreeRunBounds,
+    Verdict,
+    compare_cycles,
+    densities_of,
+    deviation,
+    turns_negative,
+)
 from ep2sindy.model.free_run import FreeRun, columns_of, free_run
 from ep2sindy.model.many import DrivenWindows, Ensemble
 from ep2sindy.model.model import SparseModel
@@ -294,10 +302,10 @@ class FreeRunScore:
             )
         coef = np.stack([model.coef for model in refined.models], axis=2)
         ensemble = Ensemble(first.library, first.states, coef)
-        judged = []
+        judged, densities = [], densities_of(records.runs[0], first.states)
         with progress.stage(None, "run", "free runs over the fold") as advance:
             for t, paths, cycle in paths_over(ensemble, fold.held, records, cycles, self.n_starts):
-                judged.append(self._judge(t, paths, cycle, first.states))
+                judged.append(self._judge(t, paths, cycle, first.states, densities))
                 advance(len(paths))
         worst = np.column_stack([np.max(judged, axis=0), refined.loss])
         pairs = zip(systems, refined.models, strict=True)
@@ -310,13 +318,15 @@ class FreeRunScore:
         paths: Float[np.ndarray, "systems samples n_states"],
         cycle: Cycle,
         states: Sequence[str],
+        densities: Sequence[int],
     ) -> Float[np.ndarray, "systems 2"]:
         """Error and waveform of every system over one stretch, its first half left out."""
         half, columns = len(t) // 2, columns_of(states, self.judged)
+        std = zero_to_one(cycle.std)
         ours = replace(cycle, mean=cycle.mean[columns], harmonics=cycle.harmonics[:, columns])
         found = np.full((len(paths), 2), [MAX_ERROR, np.inf])
         for row, path in zip(found, paths, strict=True):
-            if np.isfinite(path).all():
+            if np.isfinite(path).all() and not turns_negative(path[half:], densities, std):
                 likeness = compare_cycles(ours, t[half:], path[half:, columns])
                 error = deviation(*likeness, self.bounds)
                 if not np.isnan(error):

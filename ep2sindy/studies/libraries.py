@@ -30,12 +30,12 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.balance import ModelBalance, inflow_of, model_balance
 from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import Source, data_summary, zone_length_m
+from ep2sindy.studies.source import Source, balance_of, data_summary
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
-from ep2sindy.studies.term_roles import Compared, term_roles
 from ep2sindy.studies.views import (
     INTEGRATED,
     PlotRange,
@@ -106,9 +106,8 @@ class Study:
     end. thesis: published equations by library: state -> term -> SI coefficient. They are fitted as
     well if the library has the terms and the data can tell them from others. living: how libraries
     without inputs are searched for a model that lives; None leaves that out. held_out: the last
-    share of the record, on which such a model is tested; None means a quarter. compared: the
-    quantities that its terms are compared to.
-    Raises ValueError for held_out or compared without living, as they would do nothing.
+    share of the record, on which such a model is tested; None means a quarter.
+    Raises ValueError for held_out without living, as it would do nothing.
     """
 
     source: Source
@@ -121,16 +120,12 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
-    compared: Compared | None = None
 
     def __post_init__(self) -> None:
-        idle = {"held_out": self.held_out, "compared": self.compared}
-        idle = {name: value for name, value in idle.items() if value is not None}
-        if self.living is None and idle:
-            leave = " ".join(f"{name}=null" for name in idle)
+        if self.living is None and self.held_out is not None:
             raise ValueError(
-                f"{' and '.join(idle)} would do nothing: they are for a model that lives, and "
-                f"living is null; give {leave} as well, or say in living how it is searched for"
+                "held_out would do nothing: it is for a model that lives, and living is null; give "
+                "held_out=null as well, or say in living how it is searched for"
             )
 
     def compute(self, run: Run) -> Outcome:
@@ -147,10 +142,10 @@ class Study:
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
-        length_m = zone_length_m(self.source, opened[0])
+        balance = balance_of(self.source, opened[0], run) if self.living is not None else None
         results = {
             name: self._result(
-                runs, name, library, methods[name], length_m, rng=rng, progress=run.watch
+                runs, name, library, methods[name], balance, rng=rng, progress=run.watch
             )
             for (name, library), rng in count_pieces(run.watch, pairs, "library")
         }
@@ -166,7 +161,7 @@ class Study:
         name: str,
         library: Library,
         method: AnyMethod,
-        length_m: float | None,
+        balance: xr.Dataset | None,
         *,
         rng: np.random.Generator,
         progress: Progress,
@@ -174,7 +169,8 @@ class Study:
         """Discovery of one library in all records; free runs of its model and the published one.
 
         Both run over the first record; the discovered model also runs over the other records. A
-        model that lives is searched for in the first record. length_m: length of the zone.
+        model that lives is searched for in the first record. balance: of its zone, by
+        `zone_balance`.
         """
         s = self.rollout_s
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
@@ -183,17 +179,11 @@ class Study:
         published = self.thesis.get(name, {})
         rows = Regression(self.formulation, bootstraps=self.bootstraps)
         refitted = refit(found, published, rows, runs, rng)
-        lives = roles = None
+        lives = beside = None
         if self.living is not None and not found.model.inputs:
-            parts = split_in_time(data, self.held_out or HELD_OUT)
-            lives = living_model(
-                *parts, library, rows, self.living, found.model, rng=rng, progress=progress
+            lives, beside = self._lives(
+                data, library, rows, found.model, balance, rng=rng, progress=progress
             )
-            if self.compared is not None:
-                roles = term_roles(
-                    lives.discovery, data, *parts, self.compared, self.living.bounds,
-                    length_m=length_m, progress=progress,
-                )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
                 method=method,
@@ -203,9 +193,33 @@ class Study:
                 refitted=refitted,
                 published=run_refitted(found, refitted, data, n_samples),
                 living=lives,
-                roles=roles,
+                balance=beside,
                 elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
             )
+
+    def _lives(
+        self,
+        data: Trajectory,
+        library: Library,
+        rows: Regression,
+        selected: SparseModel,
+        balance: xr.Dataset | None,
+        *,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> tuple[Living, ModelBalance]:
+        """A model that lives, and the balance of the zone beside it."""
+        assert self.living is not None
+        parts = split_in_time(data, self.held_out or HELD_OUT)
+        inflow = inflow_of(balance)
+        lives = living_model(
+            *parts, library, rows, self.living, selected, inflow=inflow, rng=rng, progress=progress
+        )
+        beside = model_balance(
+            lives.model, lives.discovery.constraint, data, *parts, balance, self.living.bounds,
+            period_s=None if lives.cycle is None else lives.cycle.period_s, progress=progress,
+        )  # fmt: skip
+        return lives, beside
 
 
 def alone(data: Trajectory) -> str | None:
@@ -286,8 +300,8 @@ class Outcome:
         published = {f"{name}_thesis_terms": each for name, each in self.published.items()}
         found |= rollout_tables(self.data, self.selected | published)
         for name, result in self.results.items():
-            if result.roles is not None:
-                found[f"roles_{name}"] = result.roles.table()
+            if result.balance is not None:
+                found |= result.balance.tables(name)
         found |= living_tables(self.living) | {"comparison": self.comparison.csv("model")}
         return found | ({"records": self.records.csv()} if len(self.files) > 1 else {})
 
@@ -320,6 +334,8 @@ class Outcome:
             drawn[f"front_{name}"] = Captioned(front, FRONT if has_rows else SCORED)
         for name, living in self.living.items():
             drawn |= living.figures(name)
+        for name, result in self.results.items():
+            drawn |= result.balance.figures(name) if result.balance is not None else {}
         return drawn
 
     def sections(self) -> list[Section]:
@@ -329,8 +345,8 @@ class Outcome:
         for name, result in self.results.items():
             if result.living is not None:
                 found.append(result.living.section(name))
-            if result.roles is not None:
-                found.append(result.roles.section(name))
+            if result.balance is not None:
+                found.append(result.balance.section(name))
         compared = Table(self.comparison.screen("model", by_state=True), title=INTEGRATED)
         found.append(Section("Run freely from the first sample", [compared, *pictures(FIGURES)]))
         if len(self.files) > 1:

@@ -25,8 +25,8 @@ from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.report.document import Block, Equation, Picture, Section, Table, Text, places
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts
 from ep2sindy.selection.rule import SystemSelection
+from ep2sindy.studies.balance import ModelBalance
 from ep2sindy.studies.living import Living
-from ep2sindy.studies.term_roles import Roles
 
 # What the columns of a front mean; RULES explains the labels of the selection rules.
 COLUMNS = (
@@ -60,8 +60,8 @@ class LibraryResult:
     """One library's discovery with its selected model, and the published terms fitted to our data.
 
     given: the published coefficients as printed, by state. living: a model that oscillates on its
-    own; None if none was asked for, or if the library has inputs. roles: of the terms of the living
-    model. elsewhere: free runs of the selected model over the records after the first.
+    own; None if none was asked for, or if the library has inputs. balance: of its zone, beside
+    the living model. elsewhere: free runs of the selected model over the records after the first.
     """
 
     method: AnyMethod
@@ -71,7 +71,7 @@ class LibraryResult:
     refitted: Mapping[str, Candidate]
     published: FreeRun | None
     living: Living | None = None
-    roles: Roles | None = None
+    balance: ModelBalance | None = None
     elsewhere: Sequence[FreeRun] = ()
 
     @property
@@ -131,7 +131,7 @@ class LibraryResult:
             "trajectory": facts(self.selected, TRAJECTORY),
             "thesis_terms": self.published and _published_summary(self.published, self.refitted),
             "living": self.living and self.living.summary(),
-            "roles": self.roles and self.roles.summary(),
+            "balance": self.balance and self.balance.summary(),
         } | ({"estimate": facts(estimate, ESTIMATE)} if estimate else {})
 
     def headline(self, name: str) -> dict[str, float]:

@@ -19,7 +19,8 @@ from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.figures import living as figures
 from ep2sindy.library.equations import equation_text
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.roles import Roles
 from ep2sindy.model.comparison import FreeRunBounds, Verdict
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
@@ -61,12 +62,16 @@ N_PERIODS = 12.0  # duration of a run from another start, in periods
 class LivingSearch:
     """How a library without inputs is searched for a model that lives.
 
-    depth: number of candidates per size and equation.
+    depth: number of candidates per size, and equation if there are no roles. roles: of terms, for
+    equations that conserve what states exchange; None leaves every term free. degree: of a library
+    of the states of its own; None takes the library that the equations were selected from.
     """
 
     search: Search
     depth: Count
     selection: SystemSelection
+    roles: Roles | None = None
+    degree: Count | None = None
 
     def found(
         self,
@@ -74,12 +79,18 @@ class LivingSearch:
         library: Library,
         rows: Regression,
         *,
+        inflow: Mapping[str, float],
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> Discovery:
-        """The discovery in a record, with the formulation and bootstraps of `rows`."""
+        """The discovery in a record, with the formulation and bootstraps of `rows`.
+
+        inflow: of states, as far as the record gives it.
+        """
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
-        return discover(train, library, own, seed=rng, progress=progress)
+        library = polynomial(train.state_names, degree=self.degree) if self.degree else library
+        roles = self.roles and self.roles.with_known(inflow)
+        return discover(train, library, own, roles=roles, seed=rng, progress=progress)
 
     @property
     def bounds(self) -> FreeRunBounds:
@@ -337,14 +348,16 @@ def living_model(
     settings: LivingSearch,
     selected: SparseModel,
     *,
+    inflow: Mapping[str, float],
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> Living:
     """Find a living model in one part of a record, and run it over the other.
 
-    selected: the model selected by derivatives, which is refined for comparison.
+    selected: the model selected by derivatives, which is refined for comparison. inflow: of states,
+    as far as the record gives it.
     """
-    found = settings.found(train, library, rows, rng=rng, progress=progress)
+    found = settings.found(train, library, rows, inflow=inflow, rng=rng, progress=progress)
     with progress.stage(None, "", "free run and limit cycle"):
         start = start_of(held, found.model)
         run = free_run(found.model, held, initial=start, bounds=settings.bounds)

@@ -33,6 +33,7 @@ from ep2sindy.studies.simulated import (
     say_simulation,
 )
 from ep2sindy.studies.study import Deferred
+from ep2sindy.thruster.balance import zone_balance
 
 Step = Callable[[xr.Dataset], xr.Dataset]
 WITHOUT_BREATHING = (  # attributes of a simulation
@@ -129,10 +130,22 @@ def zone_of(source: Source) -> Zone | None:
     return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
 
 
-def zone_length_m(source: Source, field: xr.Dataset) -> float | None:
-    """Length along z of the zone that is averaged over; None for the whole axis."""
-    z: Any = resolve_zone(zone_of(source), field).z
-    return None if z is None else float(z[1] - z[0])
+def balance_of(source: Source, field: xr.Dataset, run: Run) -> xr.Dataset | None:
+    """Balance of ions and neutrals in the zone that is averaged over; None if there is none.
+
+    A balance that cannot be made, as of a zone that reaches into the plume, is reported.
+    """
+    sampling = source.trajectory
+    if not isinstance(sampling, ZoneAverage) or not {"n_i", "n_n"} <= set(field.data_vars):
+        return None
+    zone = resolve_zone(sampling.zone, field)
+    if zone.r is not None:
+        return None
+    try:
+        return zone_balance(field, zone, axisymmetric=sampling.axisymmetric)
+    except ValueError as error:
+        run.say(f"the model has no balance of its zone beside it: {error}")
+        return None
 
 
 def say_field(run: Run, field: xr.Dataset) -> None:

@@ -13,7 +13,7 @@ from ep2sindy.thruster.axial.starts import ColdStart as ColdStart  # for configs
 from ep2sindy.thruster.axial.starts import GuessedStart as GuessedStart  # for configs
 from ep2sindy.thruster.axial.starts import Restart as Restart  # for configs
 from ep2sindy.thruster.axial.starts import SoftStart as SoftStart  # for configs
-from ep2sindy.thruster.axial.balance import zone_balance as zone_balance
+from ep2sindy.thruster.balance import zone_balance as zone_balance
 from ep2sindy.thruster.plane.simulate import simulate_2d as simulate_2d  # for configs
 from ep2sindy.thruster.plane.simulate import THRUSTER_2D as THRUSTER_2D
 from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D as OPERATING_POINT_2D

@@ -50,6 +50,7 @@ from ep2sindy.thruster.axial.state_kernels import (
     new_sums,
     new_work,
 )
+from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plume import Plume
@@ -138,6 +139,7 @@ def simulate_as(
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
         "parameters": parameters,
+        INFLOW: model.neutral_inflow,
         "initial": f"{start.label}, {beginning.note}" if beginning.note else start.label,
         **_attributes(field, record, model, point, thruster, settings.sample_s),
     }

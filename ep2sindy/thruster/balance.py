@@ -1,0 +1,155 @@
+"""Balance of ions and neutrals in a zone: what enters, leaves and is exchanged, at each sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.fields import grid_points
+from ep2sindy.data.zones import Zone, resolve_zone, zone_average, zone_slices
+
+DENSITIES = ("n_i", "n_n")
+AVERAGED = ("dn_i_dt", "dn_n_dt", "face_flux_i", "face_flux_n", "ionization", "wall_loss", "dz")
+CHARGES = ("", "2", "3")  # ends of the names of variables that every charge has
+INFLOW = "neutral_inflow"  # attribute of a simulation: neutrals that enter at the anode, m^-2/s
+
+Terms = dict[str, np.ndarray]
+
+
+def zone_balance(
+    field: xr.Dataset, zone: Zone | tuple[float, float], *, axisymmetric: bool = True
+) -> xr.Dataset:
+    """Terms of d<n>/dt, the changes of the zone averages of n_i and n_n; in m^-3/s, by time.
+
+    zone: a `Zone` without r, or (from, to) in m. Returned, as far as the field gives them:
+    change_i, change_n: of the averages. ionization: neutrals that become ions. exit_i, exit_n: what
+    leaves through the end away from the anode. returned: ions that become neutrals at the walls
+    and, if the zone begins at the first grid point, at the anode. supply: neutrals that then enter
+    there.
+
+    A run of `simulate` with averages gives them all exactly, for ions of all charges together, and
+    besides inflow_i and inflow_n (net, through both ends), wall_loss, and residual, which is zero
+    but for rounding: the change of ions and neutrals less their inflow. Other fields, with r or
+    without, give ionization by n_i n_n R_ion, exit_i by n_i u_iz in the zone's last cells, supply
+    by the attribute `neutral_inflow` (m^-2/s) of the (z, r) simulator; `returned` and exit_n are
+    then what is missing for the balance to close.
+    Raises ValueError for a field without both densities, a zone without cells, or one of a
+    simulation that holds the last cell.
+    """
+    if missing := [name for name in DENSITIES if name not in field]:
+        raise ValueError(
+            f"a zone's balance is that of the densities n_i and n_n: this field lacks {missing}; "
+            "name the file's variables so with data.rename"
+        )
+    zone = resolve_zone(zone if isinstance(zone, Zone) else Zone(z=zone), field)
+    exact = all(name in field for name in AVERAGED) and "r" not in field.dims
+    found = _averaged(field, zone) if exact else _estimated(field, zone, axisymmetric=axisymmetric)
+    data = {name: (("time",), values, {"units": "m^-3/s"}) for name, values in found.items()}
+    return xr.Dataset(data, coords={"time": field["time"]})
+
+
+def _averaged(field: xr.Dataset, zone: Zone) -> Terms:
+    """All terms from what a run with averages records."""
+    inside = np.arange(field.sizes["z"])[zone_slices(field, zone).get("z", slice(None))]
+    first, beyond = int(inside[0]), int(inside[-1]) + 1
+    if beyond >= field.sizes["z"]:
+        raise ValueError(
+            f"a zone must end before the last cell: {zone.z} came, the cells' centres reach from "
+            f"{float(field['z'][0]):g} to {float(field['z'][-1]):g} m"
+        )
+    dz = field["dz"].values[first:beyond].astype(float)
+    _check_in_channel(field, beyond)
+
+    def summed(name: str) -> np.ndarray:
+        """Sum over the charge states of the run."""
+        found = [field[each].values for k in CHARGES if (each := name + k) in field]
+        return np.sum(found, axis=0, dtype=float)
+
+    def mean(name: str) -> np.ndarray:
+        return summed(name)[:, first:beyond] @ dz / dz.sum()
+
+    (enter_i, exit_i), (enter_n, exit_n) = (
+        summed(name)[:, [first, beyond]].T / dz.sum() for name in ("face_flux_i", "face_flux_n")
+    )
+    terms = {
+        "change_i": mean("dn_i_dt"),
+        "change_n": mean("dn_n_dt"),
+        "inflow_i": enter_i - exit_i,
+        "inflow_n": enter_n - exit_n,
+        "ionization": mean("ionization"),
+        "wall_loss": mean("wall_loss"),
+        "exit_i": exit_i,
+        "exit_n": exit_n,
+    }
+    terms["returned"] = terms["wall_loss"] - (enter_i if first == 0 else 0.0)
+    if first == 0:
+        terms["supply"] = enter_n + enter_i  # ions that reach the anode come back as neutrals
+    terms["residual"] = (
+        terms["change_i"] + terms["change_n"] - terms["inflow_i"] - terms["inflow_n"]
+    )
+    return terms
+
+
+def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
+    """The terms that averages of the field's variables give, and what closes the balance."""
+    t = grid_points(field, "time")
+    inside = zone_average(field, zone, states=DENSITIES, axisymmetric=axisymmetric)
+
+    def over_time(values: np.ndarray, run: Any) -> np.ndarray:
+        """At all samples of the field; NaN where the average lacks one."""
+        return np.interp(t, run.t, values, left=np.nan, right=np.nan)
+
+    terms: Terms = {
+        f"change_{name[-1]}": over_time(np.gradient(values, inside.t), inside)
+        for name, values in zip(DENSITIES, inside.states.T, strict=True)
+    }
+    if "R_ion" in field:
+        products = ["n_i*n_n*R_ion"]
+        run = zone_average(
+            field, zone, states=DENSITIES, products=products, axisymmetric=axisymmetric
+        )
+        terms["ionization"] = over_time(run.inputs[:, 0], run)
+    if "z" not in field.dims:
+        return terms
+    slices = zone_slices(field, zone).get("z", slice(None))
+    inner = np.arange(field.sizes["z"])[slices]
+    length_m = _length_m(grid_points(field, "z"), zone, inner)
+    if "u_iz" in field:
+        last = field.isel(z=[inner[-1]])
+        run = zone_average(
+            last, None, states=DENSITIES, products=["n_i*u_iz"], axisymmetric=axisymmetric
+        )
+        terms["exit_i"] = over_time(run.inputs[:, 0], run) / length_m
+    if inner[0] == 0 and INFLOW in field.attrs:
+        terms["supply"] = np.full(len(t), float(field.attrs[INFLOW]) / length_m)
+    return _closed(terms)
+
+
+def _length_m(z: np.ndarray, zone: Zone, inner: np.ndarray) -> float:
+    """Length of a zone: between its ends, or over its cells if it is the whole axis."""
+    if zone.z is not None:
+        return float(zone.z[1]) - float(zone.z[0])
+    return float(z[inner[-1]] - z[inner[0]]) * len(inner) / max(len(inner) - 1, 1)
+
+
+def _closed(terms: Mapping[str, np.ndarray]) -> Terms:
+    """The terms with those that the others leave: what the walls return, and neutrals that exit."""
+    found = dict(terms)
+    if {"ionization", "exit_i"} <= set(found):
+        found["returned"] = found["ionization"] - found["exit_i"] - found["change_i"]
+    if {"supply", "exit_i"} <= set(found):
+        changes = found["change_i"] + found["change_n"]
+        found["exit_n"] = found["supply"] - found["exit_i"] - changes
+    return found
+
+
+def _check_in_channel(field: xr.Dataset, beyond: int) -> None:
+    """Raise ValueError if the plasma's cross-section changes within a zone's cells."""
+    if "area" in field and bool((field["area"][:, : beyond + 1] != 1.0).any()):
+        raise ValueError(
+            "a zone's balance holds where the cross-section is that of the channel: this zone "
+            f"reaches to {float(field['z'][beyond - 1]):g} m, into the plume; end it at the exit"
+        )
