@@ -1,8 +1,10 @@
 """Models selected by free run on the package's own source: `python -m benchmarks.living`.
 
-Over draws of windows and splits of the record, over operating points, zones of the channel and
-seeds, in noise; every model called living is run again by another solver, ten times as long.
-Prints the tables of docs/living.md; name some of them to print those alone.
+Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
+finds them: over operating points, splits of the record and seeds, on the default source and on the
+former one; beside free terms, in other zones, in noise, and from the (z, r) simulator. Every model
+called living is run again by another solver, ten times as long; its processes are compared with the
+balance of the zone. Prints the tables of docs/living.md; name some to print those alone.
 """
 
 from __future__ import annotations
@@ -11,36 +13,65 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
-from ep2sindy.studies.living import start_of
+from ep2sindy.studies.balance import compared_processes, inflow_of
+from ep2sindy.studies.living import cycle_of, start_of
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 BREATHING = "300V_5mgs"
-ZONES_MM = ((0, 10), (5, 15), (10, 20), (15, 25), (20, 30))
-DOWNSTREAM_MM = (15, 25)
+CHANNEL, DOWNSTREAM = "channel", "downstream"
+ZONES = (CHANNEL, DOWNSTREAM, (0.0, 0.010), (0.005, 0.015), (0.010, 0.020), (0.020, 0.030))
 SPLITS = {"last": (0.0, 0.75), "first": (0.25, 1.0), "second half": (0.0, 0.5)}  # what is fitted
-N_DRAWS, N_SEEDS = 8, 3
+DRAWS = [("last", seed) for seed in range(4)] + [("first", 0), ("second half", 0)]
+MORE_DRAWS = [(split, seed) for split in SPLITS for seed in range(3)]
+N_SEEDS = 3
 NOISES = ((0.2, 6.0), (0.4, 50.0))  # share of each state's RMS, periods
-N_NOISE_DRAWS = 5
+N_NOISE_DRAWS = 3
 LONGER = 10.0  # times the held-out part, for the other solver
+STATES = ("n_i", "n_n")
+CACHE = Path(".cache/simulations")
+
+# The source until version 0.2, conf/thruster/pulses.yaml: sharp pulses.
+FORMER = ep.thruster.Thruster(
+    transport=ep.thruster.AnomalousTransport(c_channel=1 / 300, c_plume=1 / 145, transition=3e-3),
+    wall=ep.thruster.SheathWall(),
+    conduction_factor=4.66,
+    series_resistance=1.0,
+)
+FORMER_SPEED = {"300V_2mgs": 190.0}  # m/s; 280 at the other points
+SETS = {"default": ep.thruster.Thruster(), "former": FORMER}
+
+
+@dataclass(frozen=True)
+class Record:
+    """Averages over a zone, and the balance of that zone."""
+
+    run: ep.Trajectory
+    balance: xr.Dataset
 
 
 @dataclass(frozen=True)
 class Case:
-    """One selection: the model on held-out time, what it cost, and what another solver says."""
+    """One selection: the model on held-out time, what it cost, and what another solver says.
+
+    share: of starts around the cycle that reach it. processes: name -> ratio to the record and R2.
+    """
 
     run: ep.FreeRun
-    n_terms: int
+    n_free: int
     multiplier: float
+    share: float
     cpu_s: float
     confirmed: bool
+    processes: dict[str, tuple[float, float]]
 
     @property
     def structure(self) -> str:
@@ -60,42 +91,72 @@ class Case:
 
 
 @cache
-def record(label: str, zone_mm: tuple[int, int]) -> ep.Trajectory:
-    """Zone averages of the default simulation."""
-    field = ep.thruster.simulate(
-        ep.thruster.Thruster(), POINTS[label], cache=Path(".cache/simulations"), progress=False
+def field(label: str, name: str = "default") -> xr.Dataset:
+    """The simulation of one operating point by one set of parameters."""
+    point = POINTS[label]
+    if name == "former":
+        point = replace(point, neutral_speed=FORMER_SPEED.get(label, 280.0))
+    return ep.thruster.simulate(SETS[name], point, cache=CACHE, progress=False)
+
+
+@cache
+def record(label: str, z: str | tuple[float, float] = CHANNEL, name: str = "default") -> Record:
+    """Zone averages of a simulation."""
+    zone = ep.Zone(z=z)
+    run = ep.zone_average(field(label, name), zone, states=STATES, label=label)
+    return Record(run, ep.thruster.zone_balance(field(label, name), zone))
+
+
+def conserving(
+    fitted: ep.Trajectory, balance: xr.Dataset, *, seed: int, weak: bool
+) -> ep.Discovery:
+    """Under the roles of `+exp=breathing`: up to six free coefficients of degree 3."""
+    roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow=inflow_of(balance))
+    method = ep.Regression(
+        ep.WeightedWeak() if weak else ep.Differential(),
+        ep.BestSubset(max_terms=6, n_best=200),
+        ep.FreeRunScore(seed=seed),
+        depth=16,
     )
-    zone = ep.Zone(z=(1e-3 * zone_mm[0], 1e-3 * zone_mm[1]))
-    return ep.zone_average(field, zone, states=["n_i", "n_n"], label=label)
+    library = ep.polynomial(STATES, degree=3)
+    return ep.discover([fitted], library, method, roles=roles, seed=seed)
 
 
-def selected(fitted: ep.Trajectory, *, seed: int, weak: bool = False) -> ep.Discovery:
-    """By free runs, from the library of degree 2, up to 4 + 4 terms."""
+def free(fitted: ep.Trajectory, balance: xr.Dataset, *, seed: int, weak: bool) -> ep.Discovery:
+    """Every term free in its own equation, degree 2, up to 4 + 4 terms."""
     method = ep.Regression(
         ep.WeightedWeak() if weak else ep.Differential(),
         ep.BestSubset(max_terms=4, n_best=2),
         ep.FreeRunScore(seed=seed),
-        ep.Bootstraps(n=0),
         depth=2,
     )
-    library = ep.polynomial(["n_i", "n_n"], degree=2)
-    return ep.discover([fitted], library, method, seed=seed)
+    return ep.discover([fitted], ep.polynomial(STATES, degree=2), method, seed=seed)
 
 
-def case(fitted: ep.Trajectory, judged: ep.Trajectory, *, seed: int, weak: bool = False) -> Case:
+def case(
+    fitted: ep.Trajectory,
+    judged: ep.Trajectory,
+    whole: Record,
+    *,
+    seed: int,
+    weak: bool = False,
+    search: Callable[..., ep.Discovery] = conserving,
+) -> Case:
     """Select on one record, run freely over another from its first sample."""
     begun = time.process_time()
-    model = selected(fitted, seed=seed, weak=weak).model
-    cpu_s = time.process_time() - begun
+    found = search(fitted, whole.balance, seed=seed, weak=weak)
+    cpu_s, model = time.process_time() - begun, found.model
     run = ep.free_run(model, judged, initial=start_of(judged, model))
-    multiplier = float("nan")
-    if run.verdict is ep.Verdict.LIVES:
-        period_s = 1.0 / max(run.frequency_Hz.values())
-        cycle = ep.limit_cycle(model, run.rollout.states[-1], period_s=period_s)
-        if cycle is not None:
-            multiplier = float(np.abs(cycle.multipliers[1]))
+    multiplier = share = float("nan")
+    if run.verdict is ep.Verdict.LIVES and (cycle := cycle_of(run)) is not None:
+        multiplier = float(np.abs(cycle.multipliers[1]))
+        share = ep.share_reaching(model, cycle)
     confirmed = run.verdict is not ep.Verdict.LIVES or lives_on(model, judged)
-    return Case(run, int(np.count_nonzero(model.coef)), multiplier, cpu_s, confirmed)
+    held = found.constraint
+    n_free = int(np.count_nonzero(model.coef)) if held is None else len(held.free)
+    compared = compared_processes(model, whole.run, whole.balance)
+    processes = {each.name: (each.ratio, each.r2) for each in compared}
+    return Case(run, n_free, multiplier, share, cpu_s, confirmed, processes)
 
 
 def lives_on(model: ep.SparseModel, run: ep.Trajectory) -> bool:
@@ -129,53 +190,66 @@ def line(name: str, cases: Sequence[Case]) -> str:
     if not living:
         return f"{name:24s} 0 of {len(cases)} live: {[c.run.text for c in cases][:3]}"
     figures = (
-        (100.0 * abs(c.run.f_error), 100.0 * c.amplitude, c.waveform, c.n_terms, c.multiplier)
+        (100.0 * abs(c.run.f_error), 100.0 * c.amplitude, c.waveform, c.n_free, c.multiplier)
         for c in living
     )
-    f, amplitude, waveform, n_terms, multiplier = (
-        f"{np.median(v):.3g} / {np.max(v):.3g}" for v in zip(*figures, strict=True)
+    f, amplitude, waveform, n_free, multiplier = (
+        f"{np.nanmedian(v):.3g} / {np.nanmax(v):.3g}" for v in zip(*figures, strict=True)
     )
+    shares = [c.share for c in living]
     cpu_s = np.median([c.cpu_s for c in cases])
-    found = Counter(each.structure for each in living) if len(cases) <= N_DRAWS else {}
+    lost = Counter(each.run.text for each in cases if each.run.verdict is not ep.Verdict.LIVES)
     return (
         f"{name:24s} {len(living)} of {len(cases)} live ({wrong} refuted); f {f} %; "
-        f"amplitude {amplitude} %; waveform {waveform}; terms {n_terms}; multiplier {multiplier}; "
-        f"{cpu_s:.1f} CPU-s"
-    ) + "".join(f"\n    {n} x {terms}" for terms, n in found.items())
+        f"amplitude {amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier "
+        f"{multiplier}; starts that reach it {np.nanmin(shares):.2f} to {np.nanmax(shares):.2f}; "
+        f"{cpu_s:.1f} CPU-s{f'; {dict(lost)}' if lost else ''}"
+    )
 
 
-def print_draws() -> None:
-    """The breathing job: draws of windows and splits."""
-    print("300 V, 5 mg/s, by what is held out: median / worst of the draws of windows")
-    run = record(BREATHING, DOWNSTREAM_MM)
-    for split in SPLITS:
-        fitted, held = parts(run, split)
-        cases = [case(fitted, held, seed=seed) for seed in range(N_DRAWS)]
-        print(line(split, cases), flush=True)
+def balances(cases: Sequence[Case]) -> str:
+    """For every process, the ratio to the record and R2, medians over the cases that live."""
+    living = [each.processes for each in cases if each.run.verdict is ep.Verdict.LIVES]
+    names = dict.fromkeys(name for each in living for name in each)
+    rows = []
+    for name in names:
+        ratio, score = np.nanmedian([each[name] for each in living if name in each], axis=0)
+        rows.append(f"    {name}: ratio {ratio:.2f}, R2 {score:.3f}")
+    return "\n".join(rows)
 
 
-def print_points() -> None:
-    """Six operating points, the downstream zone."""
-    print("\nthe downstream zone, the last quarter held out: median / worst of three seeds")
+def structures(cases: Sequence[Case]) -> str:
+    found = Counter(each.structure for each in cases)
+    return "\n".join(f"    {n} x {terms}" for terms, n in found.most_common())
+
+
+def print_points(
+    name: str = "default", draws: Sequence[tuple[str, int]] = DRAWS, search: Callable = conserving
+) -> None:
+    """Six operating points, the whole channel."""
+    words = "equations that conserve" if search is conserving else "free terms"
+    print(f"\n{name} source, whole channel, {words}: median / worst of {len(draws)} draws")
+    everything = []
     for label in POINTS:
-        fitted, held = parts(record(label, DOWNSTREAM_MM), "last")
-        print(line(label, [case(fitted, held, seed=s) for s in range(N_SEEDS)]), flush=True)
+        whole = record(label, CHANNEL, name)
+        cases = [case(*parts(whole.run, s), whole, seed=seed, search=search) for s, seed in draws]
+        everything += cases
+        print("\n".join([line(label, cases), balances(cases), structures(cases)]), flush=True)
+    print(line("all", everything))
 
 
 def print_zones() -> None:
-    """Six operating points, five zones, three seeds."""
-    print("\nsix points, by zone: median / worst of the points and three seeds")
-    for zone_mm in ZONES_MM:
-        cases = []
-        for label in POINTS:
-            fitted, held = parts(record(label, zone_mm), "last")
-            cases += [case(fitted, held, seed=seed) for seed in range(N_SEEDS)]
-        lost = [
-            f"{label} {each.run.text}"
-            for label, each in zip(np.repeat(list(POINTS), N_SEEDS), cases, strict=True)
-            if each.run.verdict is not ep.Verdict.LIVES
+    """Six operating points, other zones: free terms, since no inflow is known."""
+    print(f"\nsix points, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
+    for z in ZONES:
+        wholes = [record(label, z) for label in POINTS]
+        cases = [
+            case(*parts(whole.run, "last"), whole, seed=seed, search=free)
+            for whole in wholes
+            for seed in range(N_SEEDS)
         ]
-        print(line(f"{zone_mm[0]} to {zone_mm[1]} mm", cases), lost or "", flush=True)
+        name = z if isinstance(z, str) else f"{1e3 * z[0]:g} to {1e3 * z[1]:g} mm"
+        print(line(name, cases), flush=True)
 
 
 def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> ep.Trajectory:
@@ -194,23 +268,42 @@ def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> e
 def print_noise() -> None:
     """White noise on both densities; judged on the clean record behind it."""
     for share, n_periods in NOISES:
-        print(f"\n{100 * share:.0f} % noise, {n_periods:.0f} periods: five draws; noise of n_n")
+        print(f"\n{100 * share:.0f} % noise, {n_periods:.0f} periods: {N_NOISE_DRAWS} draws")
         for label in POINTS:
-            run = record(label, DOWNSTREAM_MM)
-            clean = run.window(round(0.75 * run.n_samples), run.n_samples)
+            whole = record(label)
+            clean = whole.run.window(round(0.75 * whole.run.n_samples), whole.run.n_samples)
             cases = [
-                case(noisy(run, share, n_periods, seed=seed), clean, seed=seed, weak=True)
-                for seed in range(N_NOISE_DRAWS)
+                case(noisy(whole.run, share, n_periods, seed=k), clean, whole, seed=k, weak=True)
+                for k in range(N_NOISE_DRAWS)
             ]
-            spread = share * np.sqrt(np.square(run.states).mean(axis=0)) / run.states.std(axis=0)
-            print(line(f"{label}, {spread[1]:.1f} std", cases), flush=True)
+            print(line(label, cases), flush=True)
+
+
+def print_plane() -> None:
+    """The (z, r) simulator: averages over the channel's volume, and their balance."""
+    print("\n(z, r) simulator, whole channel, by what is held out")
+    run = ep.thruster.simulate_2d(duration_s=12e-3, cache=CACHE, progress=False)
+    zone = ep.Zone(z=CHANNEL)
+    whole = Record(
+        ep.zone_average(run, zone, states=STATES, label="plane"),
+        ep.thruster.zone_balance(run, zone),
+    )
+    for split in SPLITS:
+        cases = [case(*parts(whole.run, split), whole, seed=seed) for seed in range(N_SEEDS)]
+        print("\n".join([line(split, cases), balances(cases), structures(cases)]), flush=True)
 
 
 def main() -> None:
-    """Print every table, or those that are named: draws, points, zones, noise."""
+    """Print every table, or those that are named."""
     tables: dict[str, Callable[[], None]] = {
-        "draws": print_draws, "points": print_points, "zones": print_zones, "noise": print_noise,
-    }  # fmt: skip
+        "points": print_points,
+        "former": lambda: print_points("former"),
+        "splits": lambda: print_points(draws=MORE_DRAWS),
+        "free": lambda: print_points(search=free),
+        "zones": print_zones,
+        "noise": print_noise,
+        "plane": print_plane,
+    }
     for name in sys.argv[1:] or tables:
         begun = time.process_time()
         tables[name]()

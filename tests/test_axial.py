@@ -163,7 +163,7 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
         (lambda run: simulate(cfl=1.5), r"cfl must be above 0 and at most 1, got 1\.5"),
         (lambda run: ep.thruster.SoftStart(resistance=-1.0),
          r"SoftStart\.resistance must be .* positive"),
-        (lambda run: ep.thruster.zone_balance(run, (0.03, 0.06)),
+        (lambda run: ep.thruster.zone_balance(run, (0.03, 0.0498)),
          r"must end before the last cell"),
         (lambda run: ep.thruster.zone_balance(run[["n_i"]], ZONE), r"this field lacks \['n_n'\]"),
     ],

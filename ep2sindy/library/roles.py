@@ -39,7 +39,9 @@ class Process:
 
 @dataclass(frozen=True)
 class Roles:
-    """Roles that terms may have, for a search that conserves what states exchange.
+    """Roles that terms have, for a search that conserves what states exchange.
+
+    Every role is played by a term or more.
 
     exchange: pairs (from, to); a term in this role leaves the first equation and enters the second
     with the same coefficient, which may be negative. outflow: states that lose something to the

@@ -26,9 +26,9 @@ def conserving_systems(
     """The systems that a search proposes for all equations at once, smallest first.
 
     One regression over the training rows of all equations, each weighted by its residuals, has one
-    column per process; so a search proposes processes, and what they move is conserved exactly. The
-    `depth` best systems of every size are kept that give every state an equation.
-    Raises ValueError for roles that do not fit the task, or if no system has all equations.
+    column per process; so a search proposes processes, and what they move is conserved exactly. Of
+    every size, the `depth` best systems are kept in which every role is played by a process.
+    Raises ValueError for roles that do not fit the task, or if no system plays them all.
     """
     processes = roles.processes(task.library, task.states)
     columns, target = _joint_rows(problems, task, processes, roles.known_inflow)
@@ -36,7 +36,7 @@ def conserving_systems(
     unit = columns / norms
     masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
     found = []
-    for mask in _best(masks, unit, target, depth):
+    for mask in _best(_complete(masks, processes), unit, target, depth):
         chosen = np.flatnonzero(mask)
         values = np.linalg.lstsq(unit[:, chosen], target, rcond=None)[0] / norms[chosen]
         system = _system(task, [processes[k] for k in chosen], values, roles)
@@ -44,9 +44,9 @@ def conserving_systems(
             found.append(system)
     if not found:
         raise ValueError(
-            f"no system of up to {masks.sum(axis=1).max(initial=0)} processes has an equation for "
-            f"each of {list(task.states)} under these roles: raise the search's max_terms, or give "
-            "more roles"
+            f"no system of up to {masks.sum(axis=1).max(initial=0)} terms plays all of the roles "
+            f"{list(dict.fromkeys(process.role for process in processes))}: raise the search's "
+            "max_terms or n_best, or give fewer roles"
         )
     return _with_fronts(found, problems, task)
 
@@ -70,6 +70,15 @@ def _joint_rows(
     return np.concatenate(columns), np.concatenate(targets)
 
 
+def _complete(
+    masks: Bool[np.ndarray, "supports processes"], processes: Sequence[Process]
+) -> Bool[np.ndarray, "_ processes"]:
+    """The supports in which every role is played by a process or more."""
+    roles = {process.role for process in processes}
+    played = [np.any(masks[:, [p.role == role for p in processes]], axis=1) for role in roles]
+    return masks[np.all(played, axis=0)]
+
+
 def _best(
     masks: Bool[np.ndarray, "supports processes"],
     columns: Float[np.ndarray, "rows processes"],
@@ -79,7 +88,7 @@ def _best(
     """The `depth` supports of least residual of every size, smallest sizes first."""
     xx, xy = columns.T @ columns, columns.T @ target
     ranked = []
-    for mask in masks[masks.any(axis=1)]:
+    for mask in masks:
         own = np.flatnonzero(mask)
         gain = xy[own] @ np.linalg.lstsq(xx[np.ix_(own, own)], xy[own], rcond=None)[0]
         ranked.append((len(own), -gain, own.tolist(), mask))
@@ -94,9 +103,9 @@ def _system(
     values: Float[np.ndarray, " processes"],
     roles: Roles,
 ) -> TrialSystem | None:
-    """The system of these processes; None if a state lacks an equation, or they are all one."""
+    """The system of these processes; None if its coefficients do not tell them apart."""
     held = constraint_of(task.library, task.states, processes, roles.known_inflow)
-    if held is None or {state for state, _ in held.coefficients} != set(task.states):
+    if held is None:
         return None
     empty = np.zeros((len(task.library), len(task.states)))
     model = SparseModel(task.library, task.states, empty, task.runs[0].units)

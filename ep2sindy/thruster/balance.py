@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.fields import grid_points
+from ep2sindy.data.fields import cell_sizes, grid_points
 from ep2sindy.data.zones import Zone, resolve_zone, zone_average, zone_slices
 
 DENSITIES = ("n_i", "n_n")
@@ -116,7 +116,7 @@ def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
         return terms
     slices = zone_slices(field, zone).get("z", slice(None))
     inner = np.arange(field.sizes["z"])[slices]
-    length_m = _length_m(grid_points(field, "z"), zone, inner)
+    length_m = float(cell_sizes(field, "z", axisymmetric=axisymmetric)[slices].sum())
     if "u_iz" in field:
         last = field.isel(z=[inner[-1]])
         run = zone_average(
@@ -126,13 +126,6 @@ def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
     if inner[0] == 0 and INFLOW in field.attrs:
         terms["supply"] = np.full(len(t), float(field.attrs[INFLOW]) / length_m)
     return _closed(terms)
-
-
-def _length_m(z: np.ndarray, zone: Zone, inner: np.ndarray) -> float:
-    """Length of a zone: between its ends, or over its cells if it is the whole axis."""
-    if zone.z is not None:
-        return float(zone.z[1]) - float(zone.z[0])
-    return float(z[inner[-1]] - z[inner[0]]) * len(inner) / max(len(inner) - 1, 1)
 
 
 def _closed(terms: Mapping[str, np.ndarray]) -> Terms:

@@ -1,0 +1,134 @@
+"""Balance of a zone: exact from averages, estimated from fields, and beside a model."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.studies.balance import compared_processes, inflow_of, model_balance
+from ep2sindy.studies.fits import split_in_time
+
+STATES = ["n_i", "n_n"]
+CHANNEL = ep.Zone(z="channel")
+
+
+@pytest.fixture(scope="module")
+def field() -> xr.Dataset:
+    return ep.thruster.simulate(
+        ep.thruster.Thruster(), ep.thruster.OperatingPoint(300.0, 5.0), n_cells=40,
+        duration_s=6e-4, warm_up_s=2e-4, progress=False,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def exact(field: xr.Dataset) -> xr.Dataset:
+    return ep.thruster.zone_balance(field, CHANNEL)
+
+
+def test_the_balance_of_the_whole_channel_closes_term_by_term(exact: xr.Dataset) -> None:
+    ions = exact["change_i"] - exact["ionization"] + exact["exit_i"] + exact["returned"]
+    neutrals = (
+        exact["change_n"] + exact["ionization"] + exact["exit_n"] - exact["returned"]
+        - exact["supply"]
+    )  # fmt: skip
+    largest = float(np.abs(exact["ionization"]).max())
+    assert float(np.abs(ions).max()) < 1e-6 * largest  # float32 fields
+    assert float(np.abs(neutrals).max()) < 1e-6 * largest
+
+
+def test_the_supply_is_the_mass_flow(field: xr.Dataset, exact: xr.Dataset) -> None:
+    thruster = ep.thruster.Thruster()
+    particles = 1e-6 * 5.0 / (thruster.propellant.mass * thruster.area)
+    assert field.attrs["neutral_inflow"] == pytest.approx(particles)
+    length_m = float(field["dz"].values[field["z"].values <= 0.025].sum())
+    assert exact["supply"].values == pytest.approx(particles / length_m, rel=1e-5)
+    assert inflow_of(exact) == {"n_n": pytest.approx(particles / length_m, rel=1e-5)}
+
+
+def test_a_field_without_averages_gives_nearly_the_same(field: xr.Dataset, exact: xr.Dataset):
+    plain = field[["n_i", "n_n", "R_ion", "u_iz"]]
+    found = ep.thruster.zone_balance(plain, CHANNEL)
+    assert set(found) == {"change_i", "change_n", "ionization", "exit_i", "returned", "exit_n",
+                          "supply"}  # fmt: skip
+    for name, share in (("ionization", 0.02), ("supply", 0.01), ("exit_i", 0.05)):
+        assert float(found[name].mean()) == pytest.approx(float(exact[name].mean()), rel=share)
+
+
+def test_a_file_gives_what_it_can(field: xr.Dataset) -> None:
+    plain = field[["n_i", "n_n"]].assign_attrs(neutral_inflow=0.0)
+    del plain.attrs["neutral_inflow"]
+    assert set(ep.thruster.zone_balance(plain, CHANNEL)) == {"change_i", "change_n"}
+    flat = plain.mean("z")
+    flat = flat.assign({name: flat[name].assign_attrs(plain[name].attrs) for name in STATES})
+    assert set(ep.thruster.zone_balance(flat, ep.Zone())) == {"change_i", "change_n"}
+    downstream = ep.thruster.zone_balance(field, ep.Zone(z="downstream"))
+    assert "supply" not in downstream  # what enters through an inner face is not known beforehand
+    assert inflow_of(downstream) == {}
+
+
+@pytest.fixture(scope="module")
+def data(field: xr.Dataset) -> ep.Trajectory:
+    return ep.zone_average(field, CHANNEL, states=STATES)
+
+
+def model_of(ions: dict[str, float], neutrals: dict[str, float]) -> ep.SparseModel:
+    library = ep.polynomial(STATES, degree=2)
+    coef = np.zeros((len(library), 2))
+    for column, terms in enumerate((ions, neutrals)):
+        for term, value in terms.items():
+            coef[library.index(term), column] = value
+    return ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
+
+
+def test_processes_of_a_conserving_model(data: ep.Trajectory, exact: xr.Dataset) -> None:
+    model = model_of(
+        {"n_i": -5e5, "n_n": 200.0, "n_i*n_n": 4e-14},
+        {"1": 2e23, "n_i": 1e5, "n_n": -1200.0, "n_i*n_n": -4e-14},
+    )
+    n_i, n_n = data.states.T
+    found = {each.name.split(",")[0]: each for each in compared_processes(model, data, exact)}
+    exchanged = found["neutrals that become ions"]
+    np.testing.assert_allclose(exchanged.modelled, 4e-14 * n_i * n_n + 200.0 * n_n - 1e5 * n_i)
+    np.testing.assert_allclose(exchanged.recorded, exact["ionization"] - exact["returned"])
+    np.testing.assert_allclose(found["ions that leave"].modelled, 4e5 * n_i)
+    np.testing.assert_allclose(found["neutrals that leave"].modelled, 1000.0 * n_n)
+    enter = found["neutrals that enter"]
+    assert enter.ratio == pytest.approx(2e23 / float(exact["supply"].mean()))
+    assert np.isnan(enter.r2)  # a constant has none
+    left = exact["exit_i"].values
+    off = np.square(left - 4e5 * n_i).sum() / np.square(left - left.mean()).sum()
+    assert found["ions that leave"].r2 == pytest.approx(1.0 - off)
+
+
+def test_equations_that_disagree_are_both_compared(data: ep.Trajectory, exact: xr.Dataset) -> None:
+    model = model_of({"n_i": -5e5, "n_i*n_n": 5e-14}, {"1": 2e23, "n_i*n_n": -4e-14})
+    found = compared_processes(model, data, exact)
+    both = [each for each in found if each.name.startswith("neutrals that become")]
+    assert [each.name.split(", in ")[1] for each in both] == ["n_i'", "n_n'"]
+    assert both[0].ratio == pytest.approx(1.25 * both[1].ratio)
+
+
+def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exact: xr.Dataset):
+    library = ep.polynomial(STATES, degree=2)
+    support = {"n_i": ["n_i", "n_i*n_n"], "n_n": ["1", "n_n", "n_i*n_n"]}
+    tie = ["n_i: n_i*n_n == -1 * n_n: n_i*n_n", "n_n: 1 == 2.3e23"]
+    held_to = ep.constraint(library, support, tie)
+    model = model_of({"n_i": -5e5, "n_i*n_n": 5e-14}, {"1": 2.3e23, "n_n": -3e3, "n_i*n_n": -5e-14})
+    parts = split_in_time(data, 0.25)
+    beside = model_balance(model, held_to, data, *parts, exact, ep.FreeRunBounds(), period_s=5e-5)
+    roles = {(each.state, each.term): each for each in beside.terms}
+    assert roles["n_n", "1"].without is None  # known: it is not left out
+    assert roles["n_n", "1"].alone == pytest.approx(float(exact["supply"].mean()))
+    n_i, n_n = data.states.T
+    mean = float(exact["ionization"].mean()) / (n_i * n_n).mean()
+    assert roles["n_i", "n_i*n_n"].alone == pytest.approx(mean)
+    assert roles["n_n", "n_i*n_n"].alone == pytest.approx(-mean)
+    assert roles["n_i", "n_i*n_n"].process == "ionization"
+    without = roles["n_n", "n_n"].without
+    if without is not None:
+        assert list(without.model.terms("n_n")) == ["1", "n_i*n_n"]
+        assert without.model.terms("n_n")["1"] == 2.3e23
+    assert set(beside.tables("simple")) == {"terms_simple", "balance_simple"}
+    figure = beside.figures("simple")["balance_simple"].draw()
+    drawn = [ax for ax in figure.axes if ax.get_visible()]
+    assert len(drawn) == len([each for each in beside.processes if each.recorded is not None])

@@ -1,0 +1,173 @@
+"""Roles of terms: exact constraints, a search that conserves, signs, inflows, and bad input."""
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.library.roles import constraint_of
+
+STATES = ["n_i", "n_n"]
+LIBRARY = ep.polynomial(STATES, degree=2)
+ROLES = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": 0.3})
+# n_i' = r n_i n_n - a n_i + s n_n, n_n' = M - r n_i n_n - s n_n - b n_n: a focus.
+R, A, S, B, M = 1.0, 1.0, 0.02, 0.05, 0.3
+
+
+def balance(t: np.ndarray, noise: float = 0.0, seed: int = 0) -> ep.Trajectory:
+    """A run of two states that exchange, leave and are supplied, in units of m^-3."""
+    rate = R * np.array([[0, 0, 0, 0, 1.0, 0], [0, 0, 0, 0, -1.0, 0]])
+    rate[0, 1], rate[0, 2], rate[1, 2], rate[1, 0] = -A, S, -S - B, M
+    model = ep.SparseModel(LIBRARY, STATES, rate.T, {name: "m^-3" for name in STATES})
+    path = model.simulate(t, np.array([0.2, 1.2])).states
+    path = path + noise * np.random.default_rng(seed).normal(size=path.shape) * path.std(axis=0)
+    return ep.Trajectory(t, path, STATES, units=model.units)
+
+
+def processes(*chosen: tuple[str, str]) -> list:
+    every = ROLES.processes(LIBRARY, STATES)
+    return [p for pair in chosen for p in every if (p.role, p.term) == pair]
+
+
+def test_every_role_has_its_terms_and_no_other():
+    found = [(p.role, p.term, dict(p.factors)) for p in ROLES.processes(LIBRARY, STATES)]
+    moved = [each for each in found if each[0] == "n_n to n_i"]
+    assert [term for _, term, _ in moved] == ["n_i", "n_n", "n_i^2", "n_i*n_n", "n_n^2"]
+    assert moved[3][2] == {("n_n", "n_i*n_n"): -1.0, ("n_i", "n_i*n_n"): 1.0}
+    out = [each[1:] for each in found if each[0] == "n_i out"]
+    assert out == [("n_i", {("n_i", "n_i"): -1.0}), ("n_i^2", {("n_i", "n_i^2"): -1.0})]
+    free = ep.Roles(inflow={"n_n": "free"}).processes(LIBRARY, STATES)
+    assert [(p.role, p.term) for p in free if p.role.startswith("n_n")] == [("n_n in", "1")]
+    assert [p.term for p in free if p.role == "n_i free"] == list(LIBRARY.names)
+    named = ep.Roles(outflow={"n_n": ["n_n*n_i"]}).processes(LIBRARY, STATES)
+    assert [p.term for p in named if p.role == "n_n out"] == ["n_i*n_n"]
+
+
+def test_the_constraint_is_that_of_the_processes():
+    chosen = processes(("n_n to n_i", "n_i*n_n"), ("n_n to n_i", "n_i"), ("n_i out", "n_i"))
+    held = constraint_of(LIBRARY, STATES, chosen, {"n_n": 7.0})
+    assert held.coefficients == (
+        ("n_i", "n_i"), ("n_i", "n_i*n_n"), ("n_n", "1"), ("n_n", "n_i"), ("n_n", "n_i*n_n"),
+    )  # fmt: skip
+    z = np.array([-3.0, 2.0, 1.5])  # of n_i: n_i, n_i: n_i n_n, and what n_i gives back to n_n
+    assert held.coef(z).tolist() == [-3.0, 2.0, 7.0, 1.5, -2.0]
+    assert set(held.C.ravel()) <= {-1.0, 0.0, 1.0}
+
+
+def test_processes_that_no_coefficients_tell_apart_make_no_system():
+    twice = processes(("n_n to n_i", "n_i"), ("n_i out", "n_i"))
+    spare = ep.Roles(outflow={"n_n": ["n_i"]}).processes(LIBRARY, STATES)[:1]
+    assert constraint_of(LIBRARY, STATES, twice, {}) is not None
+    assert constraint_of(LIBRARY, STATES, [*twice, *spare], {}) is None
+
+
+@pytest.fixture(scope="module")
+def record() -> ep.Trajectory:
+    return balance(np.linspace(0.0, 40.0, 2001))
+
+
+def recipe(**changes) -> ep.Regression:
+    search = ep.BestSubset(max_terms=4, n_best=60)
+    return ep.Regression(ep.Differential(), search, ep.FreeRunScore(), depth=6, **changes)
+
+
+def test_a_search_under_roles_finds_the_truth_and_conserves(record):
+    found = ep.discover(record, LIBRARY, ep.Regression(
+        search=ep.BestSubset(max_terms=4, n_best=60), selection=ep.RefinedScore(), depth=6
+    ), roles=ROLES)  # fmt: skip
+    assert found.model.terms("n_i") == pytest.approx({"n_i": -A, "n_n": S, "n_i*n_n": R}, rel=1e-3)
+    neutrals = {"1": M, "n_n": -S - B, "n_i*n_n": -R}
+    assert found.model.terms("n_n") == pytest.approx(neutrals, rel=1e-3)
+    assert found.model.terms("n_n")["1"] == M  # known: exact
+    assert found.model.terms("n_n")["n_i*n_n"] == -found.model.terms("n_i")["n_i*n_n"]
+    assert len(found.constraint.free) == 4
+    for state in STATES:
+        assert tuple(found.model.terms(state)) == found.chosen[state].terms
+        low, high = found.model.intervals(state)["n_i*n_n"]
+        assert low < found.model.terms(state)["n_i*n_n"] < high
+    again = ep.refine(found.model, [record], constraint=found.constraint, rng=0)
+    assert again.model.terms("n_n")["n_i*n_n"] == -again.model.terms("n_i")["n_i*n_n"]
+
+
+def test_an_inflow_may_be_found(record):
+    roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "free"})
+    method = ep.Regression(
+        search=ep.BestSubset(max_terms=5, n_best=60), selection=ep.RefinedScore(), depth=6
+    )
+    found = ep.discover(record, LIBRARY, method, roles=roles)
+    assert found.model.terms("n_n")["1"] == pytest.approx(M, rel=1e-3)
+
+
+def test_a_demanded_sign_is_kept(record):
+    asked = ep.Roles(
+        exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": M}, signs=["n_i: n_n > 0"]
+    )
+    method = ep.Regression(
+        search=ep.BestSubset(max_terms=4, n_best=60), selection=ep.RefinedScore(), depth=6
+    )
+    assert ep.discover(record, LIBRARY, method, roles=asked).model.terms("n_i")["n_n"] > 0.0
+    other = ep.Roles(
+        exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": M}, signs=["n_i: n_n < 0"]
+    )
+    found = ep.discover(record, LIBRARY, method, roles=other)
+    assert not found.model.terms("n_i").get("n_n", -1.0) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ep.Roles(exchange=[("x", "x")]), "joins two states"),
+        (lambda: ep.Roles(exchange=["xy"]), "joins two states"),
+        (lambda: ep.Roles(inflow={"x": "some"}), "a number in SI per second, 'known', 'free'"),
+        (lambda: ep.Roles(signs=["x < 0"]), "demanded as 'state: term < 0'"),
+        (lambda: ep.Roles(inflow={"x": "known"}).with_known({}), "not known of this record"),
+        (lambda: ep.Roles(outflow=["z"]).processes(LIBRARY, STATES), r"\['z'\] came"),
+        (
+            lambda: ep.Roles(inflow={"n_n": "known"}).processes(LIBRARY, STATES),
+            "known only where a record gives it",
+        ),
+        (lambda: ep.Roles(outflow={"n_n": ["q"]}).processes(LIBRARY, STATES), "'q'"),
+    ],
+)
+def test_bad_roles_say_what_must_hold(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": ep.TrajectorySearch()}, "roles are kept by a regression"),
+        ({"method": ep.Regression()}, "a rule must judge whole systems"),
+        ({"method": recipe(), "relations": ["n_n: 1 == 2"]}, "give roles alone"),
+        ({"method": recipe(), "roles": "n_n to n_i"}, "Roles"),
+        (
+            {"method": ep.Regression(
+                search=ep.BestSubset(max_terms=1), selection=ep.RefinedScore()
+            )},
+            "plays all of the roles",
+        ),
+    ],
+)  # fmt: skip
+def test_roles_that_cannot_be_kept_are_refused(record, options, message):
+    with pytest.raises(ValueError, match=message):
+        ep.discover(record, LIBRARY, **{"roles": ROLES, **options})
+
+
+def test_known_or_free_takes_what_there_is():
+    either = ep.Roles(inflow={"n_n": "known or free"})
+    assert either.with_known({"n_n": 2.0}).inflow == {"n_n": 2.0}
+    assert either.with_known({}).inflow == {"n_n": "free"}
+
+
+def test_three_states_exchange_in_pairs():
+    names = ["x", "y", "z"]
+    library = ep.polynomial(names, degree=1)
+    roles = ep.Roles(exchange=[("x", "y"), ("y", "z")], outflow=["z"])
+    chosen = [
+        p for p in roles.processes(library, names)
+        if (p.role, p.term) in {("x to y", "x"), ("y to z", "y"), ("z out", "z")}
+    ]  # fmt: skip
+    held = constraint_of(library, names, chosen, {})
+    coef = dict(zip(held.coefficients, held.coef(np.array([-2.0, -3.0, -5.0])), strict=True))
+    assert coef == {("x", "x"): -2.0, ("y", "x"): 2.0, ("y", "y"): -3.0, ("z", "y"): 3.0,
+                    ("z", "z"): -5.0}  # fmt: skip
