@@ -208,13 +208,15 @@ def line(name: str, cases: Sequence[Case]) -> str:
 
 
 def balances(cases: Sequence[Case]) -> str:
-    """For every process, the ratio to the record and R2, medians over the cases that live."""
+    """For every process, the ratio to the record and R2: medians over the cases that live."""
     living = [each.processes for each in cases if each.run.verdict is ep.Verdict.LIVES]
     names = dict.fromkeys(name for each in living for name in each)
     rows = []
     for name in names:
-        ratio, score = np.nanmedian([each[name] for each in living if name in each], axis=0)
-        rows.append(f"    {name}: ratio {ratio:.2f}, R2 {score:.3f}")
+        ratios, scores = np.transpose([each[name] for each in living if name in each])
+        text = f"ratio {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
+        score = "" if np.isnan(scores).all() else f", R2 {np.median(scores):.3f}"
+        rows.append(f"    {name}: {text}{score}")
     return "\n".join(rows)
 
 

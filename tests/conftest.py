@@ -64,7 +64,7 @@ def predator_prey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     field = xr.Dataset(
         {name: (("time", "z"), v, {"units": unit}) for name, (v, unit) in data.items()},
-        coords={"time": time, "z": np.linspace(0.012, 0.028, 5)},
+        coords={"time": time, "z": np.linspace(0.003, 0.027, 5)},
         attrs={"channel_m": 0.025},
     )
     from ep2sindy.data.open import write_field

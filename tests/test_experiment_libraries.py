@@ -24,7 +24,7 @@ from ep2sindy.systems.systems import lotka_volterra
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
 
-NO_LIVING = ("living=null", "held_out=null", "compared=null")
+NO_LIVING = ("living=null", "held_out=null")
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -37,7 +37,11 @@ def breathing(path: Path, output: Path) -> list[str]:
         "data.variables.u_iz.name=u_iz",
         f"output={output}",
         "bootstraps.n=4",
+        "living.roles=null",  # predator and prey conserve nothing
+        "living.degree=null",
         "living.search.max_terms=2",  # as many as the truth has
+        "living.search.n_best=2",
+        "living.depth=2",
         "+living.selection.n_windows=6",
         "+living.selection.n_folds=2",
         "rollout_s=1.0e-3",
@@ -84,20 +88,20 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert ions["ci95"][0] < ions["value"] < ions["ci95"][1]
     assert living["by_derivatives"]["verdict"] == "lives"  # the same terms here
     assert found["velocity"]["living"] is None  # it has inputs
-    roles = {(r["state"], r["term"]): r for r in found["simple"]["roles"]["terms"]}
-    assert len(roles) == 4
-    assert roles["n_i", "n_i*n_n"]["balance"] == "mean R_ion"
-    assert roles["n_i", "n_i*n_n"]["balance_value"] == -roles["n_n", "n_i*n_n"]["balance_value"]
-    assert roles["n_n", "n_n"]["balance_value"] is None  # the file says nothing of neutrals' speed
-    assert all(role["without_verdict"] != "lives" for role in roles.values())
-    shared = found["simple"]["roles"]["shared_ionization"]
-    assert shared["verdict"] == "lives"
+    terms = {(r["state"], r["term"]): r for r in found["simple"]["balance"]["terms"]}
+    assert len(terms) == 4
+    assert terms["n_i", "n_i*n_n"]["process"] == "ionization"
+    assert terms["n_i", "n_i*n_n"]["alone"] == -terms["n_n", "n_i*n_n"]["alone"]
+    assert terms["n_n", "n_n"]["alone"] is None  # the file does not say what enters and leaves
+    assert all(each["without_verdict"] != "lives" for each in terms.values())
+    processes = {each["process"]: each for each in found["simple"]["balance"]["processes"]}
+    assert processes["neutrals that leave"]["recorded"] is None
     page = (breathing_run / "report.html").read_text()
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
         assert f'id="figure-{figure}"' in page
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
     names = {path.name for path in (breathing_run / "tables").iterdir()}
-    assert {"living.csv", "coefficients_living.csv", "roles_simple.csv"} <= names
+    assert {"living.csv", "coefficients_living.csv", "terms_simple.csv", "balance_simple.csv"} <= names
     assert "simple: a model that lives" in (breathing_run / "run.log").read_text()
 
 
@@ -145,7 +149,7 @@ def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px
     found = seen(page, width_px, questions=questions)
     assert [url for url in found.asked if not url.startswith("data:")] == [page.as_uri()]
     assert found.console == []
-    assert (found.figures, found.empty) == (11, 0)
+    assert (found.figures, found.empty) == (12, 0)
     assert found.scroll_px <= width_px  # what is wider scrolls in itself
     assert found.answers["hovers"] > 20
     assert found.answers["first"].startswith("n_i' of 0 terms: none\n1 - R2 = ")
@@ -398,8 +402,7 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+libraries.simple.degre=3"], "libraries.simple may have"),
         (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
-        (["living=null"], "held_out and compared would do nothing: they are for a model that"),
-        (["living=null", "held_out=null"], "compared would do nothing"),
+        (["living=null"], "held_out would do nothing: it is for a model that lives"),
         (["+seeds=1"], "unknown keys ['seeds']; there are "),
         (["seed=abc"], "seed must be a whole number"),
         (["depth=0"], "depth must be a whole number, one or more: 0 came"),

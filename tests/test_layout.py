@@ -46,6 +46,7 @@ HEAVY = {
         "selection.refined",
         "selection.free_run",
         "selection.systems",
+        "selection.conserving",
         "operating.choice",
         "operating.fit",
         "operating.point_fits",

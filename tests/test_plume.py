@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.thruster.balance import zone_balance
 from ep2sindy.thruster.axial.heavy_kernels import heavy_step
 from ep2sindy.thruster.axial.model import (
     build_model,
@@ -19,6 +18,7 @@ from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.axial.simulate import simulate
 from ep2sindy.thruster.axial.starts import GuessedStart
 from ep2sindy.thruster.axial.state_kernels import CELL_SUMS, new_sums, new_work
+from ep2sindy.thruster.balance import zone_balance
 from ep2sindy.thruster.constants import E_CHARGE, M_XENON
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.plume import ConicalPlume, Plume, ThermalPlume

@@ -17,7 +17,7 @@ def balance(t: np.ndarray, noise: float = 0.0, seed: int = 0) -> ep.Trajectory:
     """A run of two states that exchange, leave and are supplied, in units of m^-3."""
     rate = R * np.array([[0, 0, 0, 0, 1.0, 0], [0, 0, 0, 0, -1.0, 0]])
     rate[0, 1], rate[0, 2], rate[1, 2], rate[1, 0] = -A, S, -S - B, M
-    model = ep.SparseModel(LIBRARY, STATES, rate.T, {name: "m^-3" for name in STATES})
+    model = ep.SparseModel(LIBRARY, STATES, rate.T, dict.fromkeys(STATES, "m^-3"))
     path = model.simulate(t, np.array([0.2, 1.2])).states
     path = path + noise * np.random.default_rng(seed).normal(size=path.shape) * path.std(axis=0)
     return ep.Trajectory(t, path, STATES, units=model.units)

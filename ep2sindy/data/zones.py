@@ -364,7 +364,7 @@ def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
             raise ValueError(
                 f"a zone must hold grid points and stay on the grid: {axis} from {bounds[0]:g} to "
                 f"{bounds[1]:g} m came, the grid has {len(points)} points from {points[0]:g} to "
-                f"{points[-1]:g} m"
+                f"{points[-1]:g} m; take a zone on the grid ('trajectory.zone.{axis}=[FROM,TO]')"
             )
         slices[axis] = slice(start, stop)
     return slices

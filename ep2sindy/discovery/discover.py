@@ -119,11 +119,10 @@ def discover(
     such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search, in the selection and in
     the model. terms: for each state whose equation is known but for its coefficients, all terms of
     that equation. roles: of terms, for equations that conserve what states exchange (`Roles`); for
-    a `Regression` whose rule runs systems, such as FreeRunScore. progress: True shows bars; see
-    `Progress`. recipe: the old name of method, for one more version.
-    Raises ValueError for a relation, a term or a role that the library or the states do not have,
-    for roles that the method cannot keep, for runs whose states or units differ, and for states or
-    samples that come twice.
+    a `Regression` by FreeRunScore or RefinedScore. progress: True shows bars. recipe: the old name
+    of method, for one more version.
+    Raises ValueError for a relation, term or role that the library or the states do not have, roles
+    that the method cannot keep, runs whose states or units differ, states or samples that repeat.
     """
     method = method_given(method, recipe) or TrajectorySearch()
     trajectories = trajectories_of(runs)

@@ -70,7 +70,7 @@ GLOBAL, N_REACHING = 0.9, 64
 DEARER = 1
 
 # Largest ratio of the waveform errors of two systems that count as equals.
-ALIKE = 1.25
+ALIKE = 1.5
 
 # Fewest periods of a record, so that its folds leave windows of two periods: six, less a margin
 # for noise.
