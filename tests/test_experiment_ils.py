@@ -30,6 +30,7 @@ def ils(path: Path, output: Path, *overrides: str) -> DictConfig:
         f"output={output}",
         "n_windows=6",
         "windows=[60]",
+        "living=free",  # predator and prey conserve nothing
         "living.search.max_terms=2",  # as many as the truth has
         "+living.selection.n_windows=6",
         "+living.selection.n_folds=2",

@@ -37,11 +37,8 @@ def breathing(path: Path, output: Path) -> list[str]:
         "data.variables.u_iz.name=u_iz",
         f"output={output}",
         "bootstraps.n=4",
-        "living.roles=null",  # predator and prey conserve nothing
-        "living.degree=null",
+        "living=free",  # predator and prey conserve nothing
         "living.search.max_terms=2",  # as many as the truth has
-        "living.search.n_best=2",
-        "living.depth=2",
         "+living.selection.n_windows=6",
         "+living.selection.n_folds=2",
         "rollout_s=1.0e-3",
@@ -101,7 +98,12 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
         assert f'id="figure-{figure}"' in page
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
     names = {path.name for path in (breathing_run / "tables").iterdir()}
-    assert {"living.csv", "coefficients_living.csv", "terms_simple.csv", "balance_simple.csv"} <= names
+    assert {
+        "living.csv",
+        "coefficients_living.csv",
+        "terms_simple.csv",
+        "balance_simple.csv",
+    } <= names
     assert "simple: a model that lives" in (breathing_run / "run.log").read_text()
 
 

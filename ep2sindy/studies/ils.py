@@ -29,6 +29,7 @@ from ep2sindy.report.document import Captioned, Section, Table
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.studies.balance import inflow_of
 from ep2sindy.studies.fits import (
     COMPARED,
     Evaluation,
@@ -43,7 +44,7 @@ from ep2sindy.studies.fits import (
     terms_of,
 )
 from ep2sindy.studies.living import LivingSearch, two_periods
-from ep2sindy.studies.source import Source
+from ep2sindy.studies.source import Source, balance_of
 from ep2sindy.studies.study import Count, Counts, Share
 from ep2sindy.studies.views import PlotRange
 
@@ -71,7 +72,8 @@ CAPTION = (
 class Study:
     """Base, weak and constrained least squares, and refinements of the base and constrained models.
 
-    Beside them stands the living model from the library of degree 2, refined in the same way.
+    Beside them stands the living model, by default from a library of degree 2, refined in the same
+    way.
     model: the terms of every state. relations: those of the constrained fits. living: settings of
     the search for the living model. window: samples in each window; None takes two periods.
     windows: lengths for the plot of loss against window length. n_draws: number of draws of
@@ -111,8 +113,8 @@ class Study:
             name: fit_and_evaluate(train, held, library, each, form, rng=next(streams))
             for name, each, form in count_pieces(run.watch, fits, "fit")
         }
-        lives = self._living(train, rng=next(streams), progress=run.watch)
-        own = constraint(lives.library, {state: list(lives.terms(state)) for state in lives.states})
+        inflow = inflow_of(balance_of(self.source, field, run))
+        lives, own = self._living(train, inflow, rng=next(streams), progress=run.watch)
         starts = {
             "ils": (judged["base"].model, free),
             "ils_constrained": (judged["constrained"].model, tied),
@@ -142,12 +144,20 @@ class Study:
         return self._outcome(train, held, judged, by_window, draws)
 
     def _living(
-        self, train: Trajectory, *, rng: np.random.Generator, progress: Progress
-    ) -> SparseModel:
-        """The model that oscillates on its own, in the library of degree 2."""
+        self,
+        train: Trajectory,
+        inflow: Mapping[str, float],
+        *,
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> tuple[SparseModel, Constraint]:
+        """The model that oscillates on its own, and what its coefficients obey."""
         rows = Regression(self.formulation)
         library = polynomial(train.state_names, degree=2)
-        return self.living.found(train, library, rows, rng=rng, progress=progress).model
+        found = self.living.found(train, library, rows, inflow=inflow, rng=rng, progress=progress)
+        model = found.model
+        support = {state: list(model.terms(state)) for state in model.states}
+        return model, found.constraint or constraint(model.library, support)
 
     def _check_windows(self, train: Trajectory) -> None:
         """Raise ValueError for windows that are longer than the fitted part of the data."""
