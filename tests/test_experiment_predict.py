@@ -120,7 +120,8 @@ def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
         (["models.free.terms.n_n=[]"], "models.free.terms must list the terms of every state"),
         (
             ["+models.inflow.known.n_n.1={flow: 4.58e22}"],
-            "the known coefficient n_n: 1 must be a sum of functions of ['V_D_V', 'mdot_mg_s']",
+            "models.inflow cannot hold: the known coefficient n_n: 1 must be a sum of functions of "
+            "['V_D_V', 'mdot_mg_s']",
         ),
         (
             ["+models.free.relations=['n_i: n_i*n_n == -1 * n_n: n_n']"],
@@ -193,6 +194,17 @@ def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) 
     assert "3 of 3 live, diverging: 0." in log
     assert "f (mHz)" in log
     assert "also: other cycles" not in log
+
+
+def test_of_models_that_are_named_one_is_chosen(tmp_path: Path) -> None:
+    held = "+models.held={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}, known: {n_i: {n_i: {a: 1}}}}"
+    found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), held))
+    assert found.log.count("<- chosen") == 1
+    assert "held  <- chosen" in found.log
+    assert "exact at every point: n_i: n_i == 1.0 * a" in found.log
+    table = found.outcome.tables()["structures"]
+    assert table["model"].tolist() == ["own", "held"]
+    assert table["numbers"].tolist() == [8, 6]
 
 
 def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(tmp_path: Path) -> None:

@@ -131,9 +131,9 @@ class OperatingFit:
         start: a law close to the result, which shortens the refinement. None starts from the
         weighted law, with all stages.
         """
-        near = self._weighted(functions)
-        if start is not None:  # further functions stand in known coefficients alone
-            near = start.coef[self.relations.common.free, : len(functions)]
+        free = self.relations.common.free
+        # Functions beyond these stand in known coefficients alone.
+        near = self._weighted(functions) if start is None else start.coef[free, : len(functions)]
         settings = in_samples(self.settings, self.records)
         if start is not None and settings.window is not None:
             method = settings.method or MultipleShooting()

@@ -159,14 +159,14 @@ def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]
         return trial is branch.choice
 
     def marked(trial: StructureTrial) -> str:
-        return _terms_text(trial) + ("  <- chosen" if is_chosen(trial) else "")
+        text = trial.case.name or _terms_text(trial)
+        return text + ("  <- chosen" if is_chosen(trial) else "")
 
-    named = View.SHOWN if branch.choice.case.name else View.FILES
     return [
         Metric("branch", lambda trial: name),
-        Metric("model", lambda trial: trial.case.name, named),
+        Metric("model", lambda trial: trial.case.name),
         Metric("terms", _terms_text),
-        Metric("terms", marked, View.SCREEN),
+        Metric("model" if branch.choice.case.name else "terms", marked, View.SCREEN),
         Metric("degree", lambda trial: trial.degree, View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
         Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),

@@ -125,7 +125,12 @@ class LawModel:
                 f"a law's model runs freely, on its states {list(states)} alone: {inputs} came in "
                 f"{key}"
             )
-        law_constraint(library, structure, self.relations, self.known, parameters=parameters)
+        try:
+            law_constraint(library, structure, self.relations, self.known, parameters=parameters)
+        except ValueError as error:
+            raise ValueError(
+                f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
+            ) from error
         return StructureCase(library, structure, self.relations, self.known, name)
 
 
