@@ -24,7 +24,7 @@ from ep2sindy.systems.systems import lotka_volterra
 from tests.browser import seen
 from tests.programs import EXPERIMENTS, ROOT, Computed, composed, computed
 
-NO_LIVING = ("living=null", "held_out=null")
+NO_LIVING = ("living=none", "held_out=null")
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -404,7 +404,7 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+libraries.simple.degre=3"], "libraries.simple may have"),
         (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
-        (["living=null"], "held_out would do nothing: it is for a model that lives"),
+        (["living=none"], "held_out would do nothing: it is for a model that lives"),
         (["+seeds=1"], "unknown keys ['seeds']; there are "),
         (["seed=abc"], "seed must be a whole number"),
         (["depth=0"], "depth must be a whole number, one or more: 0 came"),

@@ -30,7 +30,8 @@ def toy(output: Path) -> list[str]:
     return [
         f"output={output}", f"data.cache={output / 'cache'}", "data.duration_s=2.0e-3",
         "data.warm_up_s=1.0e-3", "data.n_cells=30", "parallel=serial", "degrees=[1]",
-        "windows.n_windows=4", "windows.periods=1.0", "map_points=2",
+        "windows.n_windows=4", "windows.periods=1.0", "map_points=2", "~models.free",
+        "~models.inflow", "~models.leaving",
     ]  # fmt: skip
 
 
@@ -43,17 +44,20 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())
     (name,) = summary["branches"]
     branch = summary["branches"][name]
-    assert branch["structure"] == {"n_i": ["n_i", "n_n", "n_i*n_n"], "n_n": ["1", "n_i", "n_n"]}
+    assert branch["model"] == "conserving"
+    assert branch["structure"]["n_i"] == ["n_i", "n_n", "n_i*n_n", "n_i^2*n_n"]
+    assert branch["exact"][0] == "n_i: n_n == -1 * n_n: n_n"
+    assert branch["exact"][3] == "n_n: 1 == 4.58e+22 * mdot_mg_s"
     assert branch["degree"] == 1
     assert branch["left_out"]["n"] == 4
     quiet = [p for p in summary["points"] if p["status"] != "oscillating"]
     assert [(p["V_D_V"], p["mdot_mg_s"]) for p in quiet] == [(150.0, 2.0)]
     assert summary["oscillating_or_not"]["points"] == 5
     tables = {path.stem: pd.read_csv(path) for path in (folder / "tables").glob("*.csv")}
-    assert len(tables["laws"]) == 18
+    assert len(tables["laws"]) == 27
     assert len(tables["left_out"]) == 4
     assert len(tables["map"]) == 4
-    assert len(tables["coefficients"]) == 24
+    assert len(tables["coefficients"]) == 36
     assert {p.stem for p in (folder / "figures").glob("*.png")} == {
         "left_out", f"laws_{name}", f"map_{name}",
     }  # fmt: skip
@@ -63,13 +67,14 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     assert "amplitude n_i" in log
     page = (folder / "report.html").read_text()
     assert "Points left out" in page
-    assert "6 coefficients of 3 functions each, 18 numbers, from 4 records" in page
+    assert "9 coefficients of 3 functions each, 15 numbers, from 4 records" in page
+    assert "exact at every point: n_n: 1 == 4.58e+22 * mdot_mg_s" in page
 
 
 def test_the_numbers_of_a_law_reach_to_the_digit_of_their_error(folder: Path) -> None:
     log = (folder / "run.log").read_text()
     shown = re.findall(r"(-?[\d.]+(?:e[+-]\d+)?) ±([\d.]+(?:e[+-]\d+)?)", log)
-    assert len(shown) == 18
+    assert len(shown) == 24  # the mass flow is known
     for value, error in shown:
         assert Decimal(value).as_tuple().exponent <= Decimal(error).adjusted(), (value, error)
 
@@ -79,7 +84,9 @@ def test_the_law_of_a_run_gives_models_in_python(folder: Path) -> None:
     law = OperatingLaw.load(path)
     assert law.parameters == ("V_D_V", "mdot_mg_s")
     model = law.model_at({"V_D_V": 310.0, "mdot_mg_s": 5.2})
-    assert set(model.terms("n_i")) == {"n_i", "n_n", "n_i*n_n"}
+    n_i, n_n = model.terms("n_i"), model.terms("n_n")
+    assert [n_n[term] for term in n_i if term != "n_i"] == [-n_i[t] for t in n_i if t != "n_i"]
+    assert n_n["1"] == 4.58e22 * 5.2
     with pytest.raises(ValueError, match="outside the points"):
         law.model_at({"V_D_V": 150.0, "mdot_mg_s": 2.0})
 
@@ -106,8 +113,20 @@ def test_a_map_encloses_the_points_and_has_two_parameters_at_most() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["model.n_i=[n_i,u_iz]"], "a law's model runs freely, on its states ['n_i', 'n_n'] alone"),
-        (["model.n_n=[]"], "model must list the terms of every state"),
+        (
+            ["models.free.terms.n_i=[n_i,u_iz]"],
+            "a law's model runs freely, on its states ['n_i', 'n_n'] alone",
+        ),
+        (["models.free.terms.n_n=[]"], "models.free.terms must list the terms of every state"),
+        (
+            ["+models.inflow.known.n_n.1={flow: 4.58e22}"],
+            "models.inflow cannot hold: the known coefficient n_n: 1 must be a sum of functions of "
+            "['V_D_V', 'mdot_mg_s']",
+        ),
+        (
+            ["+models.free.relations=['n_i: n_i*n_n == -1 * n_n: n_n']"],
+            "'n_n' is not in the support of 'n_n', ['1', 'n_i*n_n']",
+        ),
         (["points=[{V_D_V: [250, 300]}]"], "a point must have ['V_D_V', 'mdot_mg_s']"),
         (
             ["points=[{V_D_V: 300, mdot_mg_s: [4, 5, 6, 7]}]"],
@@ -153,7 +172,8 @@ def own_records(folder: Path, *values: float) -> list[str]:
         f"output={folder}", "data=file", "data.path=null", "data.z.name=null",
         "trajectory.zone.z=null", "data.variables.n_i.name=p", "data.variables.n_n.name=q",
         "~parameters.V_D_V", "~parameters.mdot_mg_s", "+parameters.a=null",
-        f"points=[{','.join(points)}]", "model.n_i=[n_i,n_n,'n_i^3']", "model.n_n=[n_i]",
+        f"points=[{','.join(points)}]", "~models",
+        "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}",
         "degrees=[1]", "windows.n_windows=4", "map_points=2", "parallel=serial",
     ]  # fmt: skip
 
@@ -176,13 +196,24 @@ def test_own_records_over_one_parameter_make_a_law_and_its_line(tmp_path: Path) 
     assert "also: other cycles" not in log
 
 
+def test_of_models_that_are_named_one_is_chosen(tmp_path: Path) -> None:
+    held = "+models.held={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}, known: {n_i: {n_i: {a: 1}}}}"
+    found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), held))
+    assert found.log.count("<- chosen") == 1
+    assert "held  <- chosen" in found.log
+    assert "exact at every point: n_i: n_i == 1.0 * a" in found.log
+    table = found.outcome.tables()["structures"]
+    assert table["model"].tolist() == ["own", "held"]
+    assert table["numbers"].tolist() == [8, 6]
+
+
 def test_without_a_model_the_structure_is_chosen_among_all_that_were_tried(tmp_path: Path) -> None:
-    settings = ["model=null", "structures.degree=3", "structures.max_terms=3", "map_points=1"]
+    settings = ["models=null", "structures.degree=3", "structures.max_terms=3", "map_points=1"]
     records = own_records(tmp_path, 0.6, 0.9, 1.2)
     found = programs.computed(composed(*records, *settings))
     (branch,) = found.outcome.branches.values()
     assert len(branch.trials) == 4
-    assert {each.fit.n_coefs for each in branch.trials} == {4, 5, 6}
+    assert {each.fit.n_free for each in branch.trials} == {4, 5, 6}
     table = found.outcome.tables()["structures"]
     assert table["chosen"].sum() == 1
     assert found.summary["branches"]["all"]["structure"]["n_i"] == ["n_i", "n_n", "n_i^3"]

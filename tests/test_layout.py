@@ -50,6 +50,7 @@ HEAVY = {
         "operating.choice",
         "operating.fit",
         "operating.point_fits",
+        "studies.law_tables",
         "studies.predict",
         "studies.parametric",
     ),
@@ -62,8 +63,8 @@ HEAVY = {
     "xarray": (*TABLES, "trust.checksum"),
 }
 
-# Experiments whose settings, tables and views make one file.
-LONGER = {"studies.parametric": 600, "studies.predict": 660}
+# An experiment whose settings, tables and views make one file.
+LONGER = {"studies.parametric": 600}
 
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 
 from ep2sindy.library.library import polynomial
-from ep2sindy.operating.choice import StructureTrial, candidate_structures, choose, try_structures
+from ep2sindy.operating.choice import (
+    StructureCase,
+    StructureTrial,
+    candidate_structures,
+    choose,
+    try_structures,
+)
 from ep2sindy.operating.fit import SETTINGS
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import Fate, eigenvalues, fixed_point, law_map
+from ep2sindy.operating.records import OperatingRecord
 from tests.models import model_of
 from tests.test_operating_law import LIBRARY, STATES, STRUCTURE, recorded, records
 from tests.test_stability import HOPF
@@ -20,11 +27,18 @@ SHORT = replace(SETTINGS, n_windows=3, periods=1.0)
 
 
 @cache
+def line() -> tuple[OperatingRecord, ...]:
+    """Records of the known family along one parameter."""
+    values = (0.5, 0.75, 1.0, 1.25, 1.5)
+    return tuple(replace(recorded(a, 0.0), parameters={"a": a}) for a in values)
+
+
+@cache
 def tries() -> list[StructureTrial]:
-    """Three structures, the true one first, along one parameter of the known family."""
-    line = [replace(recorded(a, 0.0), parameters={"a": a}) for a in (0.5, 0.75, 1.0, 1.25, 1.5)]
+    """Three structures, the true one first."""
     structures = [STRUCTURE, {**STRUCTURE, "y": ["x", "y"]}, {**STRUCTURE, "x": ["x", "y"]}]
-    return try_structures(line, LIBRARY, structures, [1, 2], settings=SHORT)
+    cases = [StructureCase(LIBRARY, structure) for structure in structures]
+    return try_structures(line(), cases, [1, 2], settings=SHORT)
 
 
 def hopf() -> OperatingLaw:
@@ -86,16 +100,26 @@ def test_the_structure_and_degree_of_a_known_family_are_chosen() -> None:
 def test_candidates_are_the_best_supports_of_every_size() -> None:
     found = candidate_structures(records(), polynomial(STATES, degree=3), max_terms=3)
     assert len(found) == 4
-    assert {len(each["x"]) for each in found} == {2, 3}
-    assert any(set(each["x"]) == {"x", "y", "x^3"} for each in found)
+    assert {len(each.structure["x"]) for each in found} == {2, 3}
+    assert any(set(each.structure["x"]) == {"x", "y", "x^3"} for each in found)
 
 
 def test_too_few_points_for_every_degree_are_refused() -> None:
     few = [records()[k] for k in (0, 1, 4)]
     with pytest.raises(ValueError, match="3 operating points suffice for no law of degree 1"):
-        try_structures(few, LIBRARY, [STRUCTURE], [1, 2], settings=SHORT)
+        try_structures(few, [StructureCase(LIBRARY, STRUCTURE)], [1, 2], settings=SHORT)
+
+
+def test_relations_that_hold_save_numbers_and_others_cost_error() -> None:
+    known = {"x": {"x": {"1": 0.8, "a": 0.3}}}
+    held = StructureCase(LIBRARY, STRUCTURE, ["x: y == -1"], known, "held")
+    wrong = StructureCase(LIBRARY, STRUCTURE, ["x: y == -1 * y: x"], name="wrong")
+    found = try_structures(line(), [held, wrong], [1], settings=SHORT)
+    assert [trial.n_numbers for trial in found] == [4, 6]
+    assert found[0].errors.mean() < found[1].errors.mean()
+    assert choose([*tries(), *found]).case.name == "held"
 
 
 def test_of_equals_the_one_of_fewest_numbers_is_chosen() -> None:
     first, second = tries()[:2]
-    assert choose([StructureTrial(second.fit, 2, first.found), first]).degree == 1
+    assert choose([replace(first, fit=second.fit, degree=2), first]).degree == 1

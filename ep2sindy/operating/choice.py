@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 
@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import Library
+from ep2sindy.operating.constraint import Known
 from ep2sindy.operating.fit import (
     LeaveOneOut,
     OperatingFit,
@@ -41,6 +42,20 @@ CLOSE = 0.05  # deviation, as a share of its bound, that does not justify anothe
 
 
 @dataclass(frozen=True, eq=False)
+class StructureCase:
+    """Terms of every state, with relations and known coefficients as `operating_fit` takes them.
+
+    name: by which results call it; empty for a structure that a search has found.
+    """
+
+    library: Library
+    structure: Structure
+    relations: Sequence[str] = ()
+    known: Known = field(default_factory=dict)
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
 class StructureTrial:
     """A structure with weighted laws of one degree, tested by leaving out each point in turn.
 
@@ -48,13 +63,15 @@ class StructureTrial:
     and at least a twentieth: smaller deviations do not justify another term.
     """
 
+    case: StructureCase
     fit: OperatingFit
     degree: int
     found: Sequence[LeaveOneOut]
 
     @property
     def n_numbers(self) -> int:
-        return self.fit.n_coefs * len(self.fit.functions(self.degree))
+        """Number of fitted numbers: those of the law of the free coefficients."""
+        return self.fit.n_free * len(self.fit.functions(self.degree))
 
     @property
     def errors(self) -> np.ndarray:
@@ -67,7 +84,7 @@ def candidate_structures(
     *,
     max_terms: int,
     progress: Progress = SILENT,
-) -> list[Structure]:
+) -> list[StructureCase]:
     """All combinations of the best supports, of each size from two terms on, of every equation.
 
     One search over all records finds the supports: a term is in or out everywhere. The rows are
@@ -80,13 +97,15 @@ def candidate_structures(
         state: [support for support in front.supports if len(support) >= 2]
         for state, front in found.fronts.items()
     }
-    return [dict(zip(sizes, chosen, strict=True)) for chosen in product(*sizes.values())]
+    return [
+        StructureCase(library, dict(zip(sizes, chosen, strict=True)))
+        for chosen in product(*sizes.values())
+    ]
 
 
 def try_structures(
     records: Sequence[OperatingRecord],
-    library: Library,
-    structures: Sequence[Structure],
+    cases: Sequence[StructureCase],
     degrees: Sequence[int],
     *,
     settings: RefinementSettings,
@@ -98,16 +117,9 @@ def try_structures(
 
     Raises ValueError if they suffice for none.
     """
-    one = partial(
-        _try_structure,
-        records=records,
-        library=library,
-        degrees=degrees,
-        settings=settings,
-        seed=seed,
-    )
-    stage = progress.stage(len(structures), "structure", "laws at points left out")
-    by_structure = collect(workers or Serial(), one, structures, stage)
+    one = partial(_try_structure, records=records, degrees=degrees, settings=settings, seed=seed)
+    stage = progress.stage(len(cases), "structure", "laws at points left out")
+    by_structure = collect(workers or Serial(), one, cases, stage)
     found = [trial for trials in by_structure for trial in trials]
     if not found:
         n = len(records)
@@ -134,21 +146,29 @@ def choose(found: Sequence[StructureTrial]) -> StructureTrial:
 
 
 def _try_structure(
-    structure: Structure,
+    case: StructureCase,
     *,
     records: Sequence[OperatingRecord],
-    library: Library,
     degrees: Sequence[int],
     settings: RefinementSettings,
     seed: int,
 ) -> list[StructureTrial]:
-    fit = operating_fit(records, library, structure, settings=settings, seed=seed)
+    fit = operating_fit(
+        records,
+        case.library,
+        case.structure,
+        relations=case.relations,
+        known=case.known,
+        settings=settings,
+        seed=seed,
+    )
     found = []
     for degree in degrees:
         try:
-            found.append(StructureTrial(fit, degree, leave_one_out(fit, fit.functions(degree))))
+            left_out = leave_one_out(fit, fit.functions(degree))
         except ValueError:
             continue  # too few points for this degree
+        found.append(StructureTrial(case, fit, degree, left_out))
     return found
 
 
@@ -156,12 +176,13 @@ def _try_structure(
 class BranchSettings:
     """Settings for finding the law of a branch.
 
-    structure: None tries supports of two to `max_terms` terms in each equation. degrees: of the
-    polynomials, tried in turn. n_map: points of the map along each parameter.
+    cases: structures to choose from; if there is none, supports of two to `max_terms` terms of the
+    library in each equation. degrees: of the polynomials, tried in turn. n_map: points of the map
+    along each parameter.
     """
 
     library: Library
-    structure: Structure | None
+    cases: Sequence[StructureCase]
     max_terms: int
     degrees: Sequence[int]
     settings: RefinementSettings
@@ -220,16 +241,12 @@ def find_branch(
     Raises ValueError if the records do not suffice for a law.
     """
     check_records(records)
-    if how.structure is None:
-        structures = candidate_structures(
-            records, how.library, max_terms=how.max_terms, progress=progress
-        )
-    else:
-        structures = [how.structure]
+    cases = how.cases or candidate_structures(
+        records, how.library, max_terms=how.max_terms, progress=progress
+    )
     trials = try_structures(
         records,
-        how.library,
-        structures,
+        cases,
         how.degrees,
         settings=how.settings,
         seed=how.seed,

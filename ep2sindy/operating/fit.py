@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.library.library import Library, polynomial
-from ep2sindy.library.relations import constraint
+from ep2sindy.library.relations import Constraint, Relation
 from ep2sindy.model.comparison import FreeRunBounds, Verdict, deviation
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
+from ep2sindy.operating.constraint import NOTHING, Known, LawConstraint, law_constraint
 from ep2sindy.operating.law import OperatingLaw, in_hull, law_basis
 from ep2sindy.operating.records import (
     OperatingRecord,
@@ -61,30 +62,35 @@ def in_samples(
 class OperatingFit:
     """Records of one branch, each refined on its own with the same terms, as input for laws.
 
-    structure: state -> terms. fits: one per record.
+    structure: state -> terms. relations: those of the coefficients, and known coefficients. fits:
+    one per record.
     """
 
     records: Sequence[OperatingRecord]
     structure: Structure
+    relations: LawConstraint
     fits: Sequence[Refinement]
     settings: RefinementSettings
     seed: int
 
     @property
-    def n_coefs(self) -> int:
-        return sum(len(terms) for terms in self.structure.values())
+    def n_free(self) -> int:
+        """Number of coefficients that the relations leave free."""
+        return self.relations.n_free
 
     @cached_property
-    def coefficients(self) -> Float[np.ndarray, "records coefs"]:
-        return np.array([_values(fit.model) for fit in self.fits])
+    def coefficients(self) -> Float[np.ndarray, "records free"]:
+        """The free coefficients of each record."""
+        return np.array([_values(fit.model) for fit in self.fits])[:, self.relations.common.free]
 
     @cached_property
-    def information(self) -> Float[np.ndarray, "records coefs coefs"]:
-        """Information matrix of each record's coefficients; zero if its refinement failed."""
-        nothing = np.zeros((self.n_coefs, self.n_coefs))
+    def information(self) -> Float[np.ndarray, "records free free"]:
+        """Information matrix of each record's free coefficients; zero if its refinement failed."""
+        nothing = np.zeros((self.n_free, self.n_free))
+        free = np.ix_(self.relations.common.free, self.relations.common.free)
         return np.stack(
             [
-                nothing if f.covariance_naive is None else information_of(f.covariance_naive)
+                nothing if f.covariance_naive is None else information_of(f.covariance_naive[free])
                 for f in self.fits
             ]
         )
@@ -108,8 +114,10 @@ class OperatingFit:
 
     def weighted(self, functions: Library) -> OperatingLaw:
         """The law fitted to the separate refinements, each weighted by its information."""
-        law = weighted_law(self.coefficients, self.information, self.basis(functions))
-        return self._law(functions, law, None, "weighted")
+        return self._law(functions, self._weighted(functions), None, "weighted")
+
+    def _weighted(self, functions: Library) -> Float[np.ndarray, "free functions"]:
+        return weighted_law(self.coefficients, self.information, self.basis(functions))
 
     def tied(
         self,
@@ -123,7 +131,9 @@ class OperatingFit:
         start: a law close to the result, which shortens the refinement. None starts from the
         weighted law, with all stages.
         """
-        near = self.weighted(functions) if start is None else start
+        free = self.relations.common.free
+        # Functions beyond these stand in known coefficients alone.
+        near = self._weighted(functions) if start is None else start.coef[free, : len(functions)]
         settings = in_samples(self.settings, self.records)
         if start is not None and settings.window is not None:
             method = settings.method or MultipleShooting()
@@ -135,7 +145,8 @@ class OperatingFit:
             [[record.run] for record in self.records],
             self.basis(functions),
             settings,
-            start=near.coef,
+            constraints=self.relations.at(values_of(self.records)),
+            start=near,
             rng=self.seed,
             progress=progress,
         )
@@ -144,21 +155,25 @@ class OperatingFit:
     def _law(
         self,
         functions: Library,
-        law: Float[np.ndarray, "coefs functions"],
+        free: Float[np.ndarray, "free functions"],
         covariance: Float[np.ndarray, "_ _"] | None,
         how: str,
     ) -> OperatingLaw:
         model = self.fits[0].model
+        functions, law, covariance = self.relations.law(functions, free, covariance)
+        provenance = {"law": f"{how}, {len(self.records)} points"}
+        if self.relations.texts:
+            provenance["exact"] = "; ".join(self.relations.texts)
         return OperatingLaw(
             functions=functions,
             library=model.library,
             states=tuple(model.states),
-            coefficients=tuple((s, term) for s in model.states for term in model.terms(s)),
+            coefficients=self.relations.common.coefficients,
             coef=law,
             points=values_of(self.records),
             covariance=covariance,
             units=model.units,
-            provenance={"law": f"{how}, {len(self.records)} points"},
+            provenance=provenance,
         )
 
 
@@ -167,41 +182,63 @@ def operating_fit(
     library: Library,
     structure: Structure,
     *,
+    relations: Sequence[Relation | str] = (),
+    known: Known = NOTHING,
     settings: RefinementSettings = SETTINGS,
     seed: int = 0,
     progress: Progress | bool = False,
 ) -> OperatingFit:
     """Refine every record on its own with the same terms, from least squares of the derivative.
 
+    relations: between the coefficients, as texts such as `n_i: n_i*n_n == -1 * n_n: n_i*n_n`.
+    known: coefficients that are known functions of the parameters, in SI, such as
+    `{"n_n": {"1": {"mdot_mg_s": 4.6e22}}}`. Both hold exactly in every fit and in every law.
     settings: of these refinements and of the law's; windows have the same length in all records.
     Raises ValueError for records whose parameters do not vary or whose states differ, for an
-    unknown state or term, or for settings with a constraint.
+    unknown state or term, for relations that contradict each other or leave nothing free, or for
+    settings with a constraint.
     """
     check_records(records)
     if settings.constraint is not None:
         raise ValueError(
             "laws of the operating point take no constraint: the structure says which terms an "
-            "equation has; leave `constraint` out of the settings, or refine models with it one "
-            "by one (ep.refine) or under a law (ep.refine_law)"
+            "equation has; leave `constraint` out of the settings, and give relations=[...] or "
+            "known={...} to operating_fit"
         )
     states = list(records[0].run.state_names)
     if set(structure) != set(states):
         raise ValueError(f"a structure must have terms for each of {states}: {structure} came")
-    held = constraint(library, {state: structure[state] for state in states})
+    whole = {state: list(structure[state]) for state in states}
+    held = law_constraint(library, whole, relations, known, parameters=list(records[0].parameters))
+    at = held.at(values_of(records))
     rows = Differential(split=RandomSplit(test_fraction=0.0))
     starts = []
-    for record in records:
+    for record, own in zip(records, at, strict=True):
         problems = rows.assemble([record.run], library, rng=np.random.default_rng(seed))
-        starts.append(constrained_fit(problems, held, units=record.run.units))
-    fits = refine(
-        starts,
-        [[record.run] for record in records],
-        in_samples(settings, records),
-        rng=seed,
-        progress=progress,
-    )
-    whole = {state: list(structure[state]) for state in states}
-    return OperatingFit(records, whole, fits, settings, seed)
+        starts.append(constrained_fit(problems, own, units=record.run.units))
+    fits = _refine_each(starts, records, at, in_samples(settings, records), seed, progress)
+    return OperatingFit(records, whole, held, fits, settings, seed)
+
+
+def _refine_each(
+    models: Sequence[SparseModel],
+    records: Sequence[OperatingRecord],
+    relations: Sequence[Constraint],
+    settings: RefinementSettings,
+    seed: int,
+    progress: Progress | bool,
+) -> list[Refinement]:
+    """Refine every record with its own relations, all in one batch where these are the same."""
+    runs = [[record.run] for record in records]
+    if not any(own.d.any() for own in relations):
+        common = replace(settings, constraint=relations[0])
+        return refine(models, runs, common, rng=seed, progress=progress)
+    rng = np.random.default_rng(seed)
+    each = zip(models, runs, relations, strict=True)
+    return [
+        refine(model, run, replace(settings, constraint=own), rng=rng, progress=progress)
+        for model, run, own in each
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -154,13 +154,18 @@ class OperatingLaw:
         }
 
     def text(self, *, digits: int = 3) -> str:
-        """One line per coefficient: `n_i: n_n = 4.83e+03 + 12.1 V_d`."""
+        """One line per coefficient: `n_i: n_n = 4.83e+03 + 12.1 V_d`.
+
+        The relations that the coefficients obey follow, each in full: `exact: n_n: 1 == 2.0 * V_d`.
+        """
         numbers = self.numbers
         lines = []
         for state, term in self.coefficients:
-            right = equation_text("c", numbers[state][term], digits=digits).partition("= ")[2]
+            factors = {name: value for name, value in numbers[state][term].items() if value != 0.0}
+            right = equation_text("c", factors, digits=digits).partition("= ")[2]
             lines.append(f"{state}: {term} = {right}")
-        return "\n".join(lines)
+        exact = self.provenance.get("exact", "")
+        return "\n".join([*lines, *(f"exact: {each}" for each in exact.split("; ") if each)])
 
     def __repr__(self) -> str:
         head = (

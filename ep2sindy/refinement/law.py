@@ -65,6 +65,7 @@ def refine_law(
     basis: Float[np.ndarray, "points terms"],
     settings: RefinementSettings = SETTINGS,
     *,
+    constraints: Sequence[Constraint] | None = None,
     start: Float[np.ndarray, "free terms"] | None = None,
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
@@ -78,13 +79,17 @@ def refine_law(
     the law only in the directions that its data determine.
     models: one per point, all with the same terms, refined or discovered; they set the scales of
     the coefficients. settings: as for `refine`, with MultipleShooting only. n_windows is the
-    number at every point; the default is 20 windows without reweighting. start: initial law; None
-    takes one through the coefficients of the models.
-    Raises ValueError for models with different terms, a basis whose terms the points cannot tell
-    apart, a window that fits no trajectory, or points with different numbers of windows.
+    number at every point; the default is 20 windows without reweighting. constraints: one per
+    point, of the same relations, in which known coefficients have the point's own values; None
+    takes that of the settings for all. start: initial law; None takes one through the coefficients
+    of the models.
+    Raises ValueError for models with different terms, constraints with different ones, a basis
+    whose terms the points cannot tell apart, a window that fits no trajectory, or points with
+    different numbers of windows.
     """
     known = Basis(basis)
-    relations = _one_structure(models, settings.constraint, len(basis), len(trajectories))
+    _check_structure(models, len(basis), len(trajectories))
+    relations = _one_for_each(models, settings.constraint, constraints)
     method = _multiple_shooting(settings)
     batches = settings.cut(models, trajectories, np.random.default_rng(rng))
     _check_counts(batches)
@@ -93,7 +98,7 @@ def refine_law(
         problem = RefinementProblem.of(
             models,
             batches,
-            [relations] * len(models),
+            relations,
             free_start=settings.free_start,
             n_reweights=settings.n_reweights,
             observe=observe,
@@ -121,10 +126,7 @@ def _check_counts(batches: Sequence[WindowBatch]) -> None:
         )
 
 
-def _one_structure(
-    models: Sequence[SparseModel], constraint: Constraint | None, n_basis: int, n_runs: int
-) -> Constraint:
-    """Relations common to all models; ValueError unless the models have the same terms."""
+def _check_structure(models: Sequence[SparseModel], n_basis: int, n_runs: int) -> None:
     if not len(models) == n_basis == n_runs or not models:
         raise ValueError(
             "models, trajectories and rows of the basis must be one per point: "
@@ -137,12 +139,33 @@ def _one_structure(
         raise ValueError(
             f"models that a law ties must have the same terms: {len(structures)} structures came"
         )
-    return unconstrained(models[0]) if constraint is None else constraint
+
+
+def _one_for_each(
+    models: Sequence[SparseModel], common: Constraint | None, own: Sequence[Constraint] | None
+) -> list[Constraint]:
+    """The relations at every point; ValueError unless they differ in known values alone."""
+    if own is None:
+        return [unconstrained(models[0]) if common is None else common] * len(models)
+    if common is not None:
+        raise ValueError(
+            "constraints came for every point, and one for all in the settings: leave out one"
+        )
+    same = all(
+        each.coefficients == own[0].coefficients and np.array_equal(each.C, own[0].C)
+        for each in own
+    )
+    if len(own) != len(models) or not same:
+        raise ValueError(
+            f"a law needs one constraint for each of its {len(models)} points, alike but for the "
+            f"values of known coefficients: {len(own)} came{'' if same else ', not alike'}"
+        )
+    return list(own)
 
 
 def _result(
     models: Sequence[SparseModel],
-    relations: Constraint,
+    relations: Sequence[Constraint],
     law_map: LawMap,
     fit: RefinementFit,
     verdict: RefinementVerdict,
@@ -159,15 +182,15 @@ def _result(
         for covariance in (verdict.covariance, verdict.covariance_naive)
     )
     refined = []
-    for model, row in zip(models, basis.values, strict=True):
-        at_point, order = with_coef(model, relations, relations.coef(law @ row))
+    for model, own, row in zip(models, relations, basis.values, strict=True):
+        at_point, order = with_coef(model, own, own.coef(law @ row))
         if robust is not None:
-            spread = (relations.C @ np.kron(np.eye(n_free), row))[order]
+            spread = (own.C @ np.kron(np.eye(n_free), row))[order]
             at_point = replace(at_point, covariance=spread @ robust @ spread.T)
         refined.append(at_point)
     loss = verdict.window_loss.reshape(len(models), -1).mean(axis=1)
     return LawRefinement(
-        coefficients=tuple(relations.coefficients[int(k)] for k in relations.free),
+        coefficients=tuple(relations[0].coefficients[int(k)] for k in relations[0].free),
         law=law,
         covariance=robust,
         covariance_naive=naive,

@@ -37,7 +37,8 @@ RUNS = {
     ),
     "weak": (*SIMULATED, "n_windows=500", "n_points=[10,50]"),
     "breathing": (
-        *SIMULATED, "bootstraps.n=4", "~libraries.velocity", "living=free", "living.search.max_terms=3",
+        *SIMULATED, "bootstraps.n=4", "~libraries.velocity", "living=free",
+        "living.search.max_terms=3",
         "living.search.n_best=1", "living.depth=1",
     ),
     "parametric": (

@@ -1,0 +1,228 @@
+"""Tables of `+exp=predict`: points, laws, structures tried, points left out, and maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtri
+
+from ep2sindy.figures.operating import frequency_scale
+from ep2sindy.operating.choice import Branch, StructureTrial
+from ep2sindy.operating.fit import LeaveOneOut
+from ep2sindy.operating.map import Fate, MapPoint
+from ep2sindy.operating.records import OperatingRecord, point_label
+from ep2sindy.report.document import places
+from ep2sindy.report.results import Metric, ResultTable, View, percent
+from ep2sindy.signals.oscillation import Oscillation
+
+Parameters = Mapping[str, float]
+
+
+def points_table(
+    points: Sequence[Parameters],
+    statuses: Mapping[str, str],
+    records: Sequence[OperatingRecord],
+    members: Mapping[str, Sequence[Parameters]],
+) -> pd.DataFrame:
+    """One row per operating point: status of its record, and its cycle."""
+    known = {record.label: record for record in records}
+    cycle = {point_label(p): name for name, group in members.items() for p in group}
+    rows = []
+    for point in points:
+        label = point_label(point)
+        record = known.get(label)
+        rows.append(
+            {
+                **point,
+                "status": statuses[label],
+                "branch": cycle.get(label, ""),
+                "f_kHz": 1e-3 * record.cycle.frequency_Hz if record else np.nan,
+                "relative_amplitude": record.relative_amplitude if record else np.nan,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def laws_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
+    """One row per coefficient of a law, with its 95 % interval."""
+    rows = []
+    for name, branch in branches.items():
+        law = branch.law
+        reach = np.full(law.coef.shape, np.nan)
+        if law.covariance is not None:
+            std = np.sqrt(np.maximum(np.diag(law.covariance), 0.0)).reshape(law.coef.shape)
+            reach = ndtri(0.975) * std
+        for (state, term), row, half in zip(law.coefficients, law.coef, reach, strict=True):
+            for function, value, r in zip(law.functions.names, row, half, strict=True):
+                rows.append((name, state, term, function, value, value - r, value + r))
+    columns = ["branch", "state", "term", "function", "value", "low", "high"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def coefficients_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
+    """Coefficients at every point, refined alone and from the law, each with 95 % intervals."""
+    rows = []
+    for name, branch in branches.items():
+        pairs = zip(branch.fit.records, branch.fit.fits, branch.tied.models, strict=True)
+        for record, alone, tied in pairs:
+            for state in tied.states:
+                for term, value in tied.terms(state).items():
+                    row = {**record.parameters, "branch": name, "state": state, "term": term}
+                    row |= {"alone": alone.model.terms(state)[term], "law": value}
+                    for kind, model in (("alone", alone.model), ("law", tied)):
+                        if model.covariance is not None:
+                            low, high = model.intervals(state)[term]
+                            row |= {f"{kind}_low": low, f"{kind}_high": high}
+                    rows.append(row)
+    return pd.DataFrame(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOutPoint:
+    """Prediction at one point by the law of the other points.
+
+    also: other cycles whose law oscillates there.
+    """
+
+    branch: str
+    result: LeaveOneOut
+    also: str
+
+    @property
+    def record(self) -> OperatingRecord:
+        return self.result.record
+
+    @property
+    def f_kHz(self) -> float:
+        return 1e-3 * self.record.cycle.frequency_Hz
+
+
+def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint]]:
+    """Metrics of points left out; their cycle is shown if there are several."""
+    several = View.SHOWN if len({point.branch for point in points}) > 1 else View.FILES
+    factor, unit = frequency_scale(pd.Series([point.f_kHz for point in points]))
+    relative = percent(2, sign=True)
+    return [
+        Metric("branch", lambda p: p.branch, several, "cycle"),
+        *(_parameter(name) for name in points[0].record.parameters),
+        Metric("enclosed", lambda p: p.result.inside, View.SHOWN, format=_yes_or_no),
+        Metric(
+            "f_kHz",
+            lambda p: p.f_kHz,
+            View.SHOWN,
+            f"f ({unit})",
+            lambda f_kHz: places(factor * f_kHz, 2),
+        ),
+        Metric("f_model_kHz", lambda p: p.f_kHz * (1.0 + p.result.run.f_error)),
+        Metric("f_error", lambda p: p.result.run.f_error, View.SHOWN, format=relative),
+        Metric(
+            "amplitude",
+            lambda p: p.result.run.amplitude_ratio,
+            View.SHOWN,
+            "amplitude {}",
+            lambda ratio: relative(ratio - 1.0),
+        ),
+        Metric(
+            "waveform",
+            lambda p: p.result.run.waveform_error,
+            View.SHOWN,
+            "waveform {}",
+            lambda error: places(error, 3),
+        ),
+        Metric("verdict", lambda p: str(p.result.run.verdict), View.SHOWN),
+        Metric("also", lambda p: p.also, several),
+    ]
+
+
+def _parameter(name: str) -> Metric[LeftOutPoint]:
+    return Metric(name, lambda p: p.record.parameters[name], View.SHOWN, name, "{:g}")
+
+
+def _yes_or_no(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def structures_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
+    """One row per structure and degree tried, with the weighted laws' errors at points left out."""
+    tables = [
+        ResultTable(branch.trials, structure_metrics(name, branch)).csv()
+        for name, branch in branches.items()
+    ]
+    return pd.concat(tables, ignore_index=True)
+
+
+def structure_metrics(name: str, branch: Branch) -> list[Metric[StructureTrial]]:
+    def is_chosen(trial: StructureTrial) -> bool:
+        return trial is branch.choice
+
+    def marked(trial: StructureTrial) -> str:
+        text = trial.case.name or _terms_text(trial)
+        return text + ("  <- chosen" if is_chosen(trial) else "")
+
+    return [
+        Metric("branch", lambda trial: name),
+        Metric("model", lambda trial: trial.case.name),
+        Metric("terms", _terms_text),
+        Metric("model" if branch.choice.case.name else "terms", marked, View.SCREEN),
+        Metric("degree", lambda trial: trial.degree, View.SHOWN),
+        Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
+        Metric("error", lambda trial: float(trial.errors.mean()), View.SHOWN),
+        Metric("f_error", _median_f_error, View.SHOWN, format=percent(2)),
+        Metric(
+            "diverging",
+            lambda trial: sum(point.run.rollout.diverged for point in trial.found),
+            View.SHOWN,
+        ),
+        Metric("chosen", is_chosen),
+    ]
+
+
+def _terms_text(trial: StructureTrial) -> str:
+    return "; ".join(f"{s}: {', '.join(terms)}" for s, terms in trial.fit.structure.items())
+
+
+def _median_f_error(trial: StructureTrial) -> float:
+    """Median over the points left out; a run without a frequency counts as infinitely far off."""
+    errors = np.array([abs(point.run.f_error) for point in trial.found])
+    return float(np.median(np.where(np.isnan(errors), np.inf, errors)))
+
+
+def map_table(branches: Mapping[str, Branch], which: str) -> pd.DataFrame:
+    """The law's models over the map, or at the points of the study (`at_points`)."""
+    rows = []
+    for name, branch in branches.items():
+        points: Sequence[MapPoint] = branch.map if which == "map" else branch.at_points
+        for point in points:
+            rows.append(
+                {
+                    "branch": name,
+                    **point.parameters,
+                    "inside": point.inside,
+                    "fate": str(point.fate),
+                    "f_kHz": 1e-3 * point.frequency_Hz,
+                    "relative_amplitude": point.relative_amplitude,
+                    "growth_per_s": point.growth_per_s,
+                    "second_multiplier": point.second,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def agreement(
+    branches: Mapping[str, Branch], statuses: Mapping[str, str]
+) -> tuple[int, int, int, int]:
+    """How often laws predict rightly whether a point oscillates, over all points and quiet ones.
+
+    Returns (right, all points, right among the quiet points, quiet points).
+    """
+    says = dict.fromkeys(statuses, False)
+    for branch in branches.values():
+        for point in branch.at_points:
+            label = point_label(point.parameters)
+            says[label] = says[label] or point.fate is Fate.OSCILLATES
+    quiet = [label for label, status in statuses.items() if status != Oscillation.OSCILLATING]
+    right = [says[label] == (statuses[label] == Oscillation.OSCILLATING) for label in statuses]
+    return sum(right), len(right), sum(not says[label] for label in quiet), len(quiet)
