@@ -45,6 +45,12 @@ def breathing(path: Path, output: Path) -> list[str]:
     ]
 
 
+def plain(path: Path, output: Path) -> list[str]:
+    """The same without a model that lives."""
+    kept = [text for text in breathing(path, output) if "living" not in text]
+    return [*kept, *NO_LIVING]
+
+
 @pytest.fixture(scope="module")
 def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of one breathing experiment on known data."""
@@ -174,10 +180,10 @@ def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) 
 
 
 def test_a_fixed_seed_gives_the_same_summary(predator_prey: Path, tmp_path: Path) -> None:
-    small = ["~libraries.ionization", "~libraries.velocity", *NO_LIVING]
+    small = ["~libraries.ionization", "~libraries.velocity"]
     texts = []
     for seed in (0, 0, 1):
-        given = [*breathing(predator_prey, tmp_path), *small, f"seed={seed}"]
+        given = [*plain(predator_prey, tmp_path), *small, f"seed={seed}"]
         write_json(tmp_path / "summary.json", computed(composed(*given)).summary)
         texts.append((tmp_path / "summary.json").read_text())
     assert texts[0] == texts[1] != texts[2]
@@ -350,13 +356,12 @@ def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
 ) -> None:
     result = computed(
         composed(
-            *breathing(predator_prey, tmp_path),
+            *plain(predator_prey, tmp_path),
             "formulation=weak",
             "selection=ebic",
             "depth=2",
             "~libraries.ionization",
             "~libraries.velocity",
-            *NO_LIVING,
         )
     )
     found = result.summary["models"]["simple"]["equations"]
@@ -404,7 +409,6 @@ def test_the_project_simulates_its_own_data(tmp_path: Path) -> None:
         (["selection.n_norm=libary"], "n_norm must be 'library' or 'max_terms'"),
         (["+libraries.simple.degre=3"], "libraries.simple may have"),
         (["libraries.simple.degree=-1"], "degree must be a whole number, zero or more: -1"),
-        (["living=none"], "held_out would do nothing: it is for a model that lives"),
         (["+seeds=1"], "unknown keys ['seeds']; there are "),
         (["seed=abc"], "seed must be a whole number"),
         (["depth=0"], "depth must be a whole number, one or more: 0 came"),
@@ -429,6 +433,12 @@ def test_settings_that_cannot_work_are_refused(
     with pytest.raises((ValueError, OSError, OmegaConfBaseException)) as caught:
         run_config(config)
     assert message in str(caught.value)
+
+
+def test_a_share_for_no_model_is_refused(predator_prey: Path, tmp_path: Path) -> None:
+    config = composed(*plain(predator_prey, tmp_path)[:-1])
+    with pytest.raises(ValueError, match="held_out would do nothing: it is for a model that lives"):
+        run_config(config)
 
 
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:
