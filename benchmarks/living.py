@@ -208,8 +208,8 @@ def line(name: str, cases: Sequence[Case]) -> str:
 
 
 def balances(cases: Sequence[Case]) -> str:
-    """For every process, the ratio to the record and R2: medians over the cases that live."""
-    living = [each.processes for each in cases if each.run.verdict is ep.Verdict.LIVES]
+    """For every process, the ratio to the record and R2: medians over the cases."""
+    living = [each.processes for each in cases]
     names = dict.fromkeys(name for each in living for name in each)
     rows = []
     for name in names:
@@ -283,7 +283,7 @@ def print_noise() -> None:
 
 def print_plane() -> None:
     """The (z, r) simulator: averages over the channel's volume, and their balance."""
-    print("\n(z, r) simulator, whole channel, by what is held out")
+    print("\n(z, r) simulator, whole channel, by what is held out; ends of free runs if not alive")
     run = ep.thruster.simulate_2d(duration_s=12e-3, cache=CACHE, progress=False)
     zone = ep.Zone(z=CHANNEL)
     whole = Record(

@@ -147,7 +147,8 @@ def balance_figure(
         ax.plot(factor * (t - t[0]), recorded, color=GREY, lw=2.4, label="record")
         ax.plot(factor * (t - t[0]), modelled, color=COLOURS[0], lw=1.1, label="model")
         ax.set_title("\n".join(wrap(name, 44)), fontsize=9)
-        ax.set_ylim(bottom=min(0.0, 1.1 * float(min(recorded.min(), modelled.min()))))
+        both = np.concatenate([recorded, modelled, [0.0]])
+        ax.set_ylim(1.1 * both.min(), 1.1 * both.max())
     for ax in list(axes.flat)[len(parts) :]:
         ax.set_visible(False)
     for ax in axes[:, 0]:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster import closures as axial
 from ep2sindy.thruster.axial.settings import Settings, to_json
+from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.closures import TABLE_STEP_EV, closure_table
 from ep2sindy.thruster.constants import E_CHARGE, K_BOLTZMANN, M_ELECTRON
@@ -125,6 +126,7 @@ def simulate_as(
         "title": "2-D (z, r) Hall-thruster fluid model",
         "note": "electrons are quasi-one-dimensional: T_e_eV, R_ion and E_z depend on z alone",
         "parameters": to_json(parameters),
+        INFLOW: model.neutral_inflow,
         **diagnose(field, operating_point, model.ion_mass, diverged=len(rows.series) < n_samples),
     }
     return field
