@@ -182,3 +182,12 @@ def test_every_experiment_on_files_is_known_to_an_inspection() -> None:
     for name in ("breathing", "parametric", "pointwise"):
         text = str(composed(f"+exp={name}"))
         assert all(variable in text for variable in NEEDS[name])
+
+
+def test_a_channel_of_unknown_length_is_looked_for_at_the_magnetic_fields_peak() -> None:
+    shape = np.exp(-(((GRID["z"].values - GRID["z"].values[2]) / 5e-3) ** 2))
+    field = GRID.assign(B_r=(("z",), 0.02 * shape, {"units": "T"}))
+    field.attrs = {k: v for k, v in field.attrs.items() if k not in ("channel_m", "parameters")}
+    place = f"{float(GRID['z'][2]):.4g}"
+    with pytest.raises(ValueError, match=rf"data.channel_m=LENGTH in m \(B_r is .* at {place} m"):
+        ep.zone_average(field, ep.Zone(z="channel"), states=["n_i"])

@@ -306,11 +306,24 @@ def resolve_zone(zone: Zone | None, field: xr.Dataset) -> Zone:
         points = grid_points(field, "z")
         raise ValueError(
             f"an average over {_part_text(zone.z)} needs the channel's length, which the file does "
-            f"not say: give data.channel_m=LENGTH in m, or a zone of your own, "
+            f"not say: give data.channel_m=LENGTH in m{_at_peak(field)}, or a zone of your own, "
             f"'trajectory.zone.z=[FROM,TO]' in m (null: all of it); its z runs from "
             f"{points[0]:.4g} to {points[-1]:.4g} m"
         )
     return replace(zone, z=((1.0 - PARTS[zone.z]) * length_m, length_m))
+
+
+def _at_peak(field: xr.Dataset) -> str:
+    """Where a field's magnetic field, in T, is strongest: near the exit; empty if there is none."""
+    for name, variable in field.data_vars.items():
+        if variable.attrs.get("units") == "T" and "z" in variable.dims:
+            others = [axis for axis in variable.dims if axis != "z"]
+            strength = np.abs(variable.values.astype(float)).mean(
+                axis=tuple(variable.dims.index(axis) for axis in others)
+            )
+            peak_m = grid_points(field, "z")[int(np.nanargmax(strength))]
+            return f" ({name} is strongest at {peak_m:.4g} m, where most thrusters have their exit)"
+    return ""
 
 
 def _part_text(name: str) -> str:
