@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
+from ep2sindy.selection.free_run import Confirmed, Trial
 from ep2sindy.selection.systems import folds_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
@@ -256,3 +258,35 @@ def test_supports_are_completed_by_what_relations_ask():
     assert binding(shared, {"x": ("x",), "y": ("y",)}) == ()
     assert binding(shared, {"x": ("x*y",), "y": ("x*y",)}) == tuple(shared)
     assert binding([parse_relation("x: 1 == 2")], {"x": ("x",)}) is None
+
+
+def confirmed(number, *, share, n_free=4, waveform=0.05, loss=1.0, broken=(), lives=True):
+    """A system as the rule has confirmed it, with these figures."""
+    held = SimpleNamespace(n_free=n_free)
+    verdict = ep.Verdict.LIVES if lives else ep.Verdict.DIES_OUT
+    run = SimpleNamespace(verdict=verdict, model=SimpleNamespace(inputs=()))
+    return Confirmed(number, Trial(held, 0.3, waveform, loss), run, share, broken)
+
+
+@pytest.mark.parametrize(
+    ("others", "best"),
+    [
+        ([confirmed(0, share=0.6), confirmed(1, share=0.95, n_free=5)], 1),  # global attraction
+        ([confirmed(0, share=0.6), confirmed(1, share=0.8)], 1),  # most starts of equals
+        ([confirmed(0, share=0.6), confirmed(1, share=0.8, n_free=5)], 0),  # size
+        ([confirmed(0, share=0.92), confirmed(1, share=1.0)], 0),  # both global: the first
+        ([confirmed(0, share=0.0), confirmed(1, share=0.3, n_free=6)], 1),  # it attracts
+        ([confirmed(0, share=1.0, broken=["x: y < 0"]), confirmed(1, share=0.1)], 1),
+        ([confirmed(0, share=0.0, lives=False), confirmed(1, share=0.0)], 1),
+    ],
+)
+def test_what_attracts_most_starts_is_preferred(others, best):
+    assert min(others, key=Confirmed.rank).number == best
+
+
+def test_what_attracts_outdoes_a_neutral_cycle_as_an_equal_or_by_its_fit():
+    resting = confirmed(0, share=0.0)
+    assert confirmed(1, share=1.0, waveform=0.07, loss=2.0).outdoes(resting)
+    assert not confirmed(1, share=1.0, waveform=0.08, loss=2.0).outdoes(resting)
+    assert not confirmed(1, share=1.0, n_free=5, loss=0.96).outdoes(resting)
+    assert confirmed(1, share=1.0, n_free=5, loss=0.94).outdoes(resting)

@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms
-from ep2sindy.library.relations import Constraint, constraint
+from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import Process, Roles, constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import with_coef
-from ep2sindy.regression.constrained import weighted_equations
+from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
@@ -57,16 +57,25 @@ def _joint_rows(
     processes: Sequence[Process],
     known: Mapping[str, float],
 ) -> tuple[Float[np.ndarray, "rows processes"], Float[np.ndarray, " rows"]]:
-    """Weighted rows of all equations, with one column per process; known inflows are subtracted."""
-    library = task.library
-    every = constraint(library, dict.fromkeys(task.states, library.names))
-    shares = np.array([[p.factors.get(at, 0.0) for p in processes] for at in every.coefficients])
-    fixed = np.array([known.get(s, 0.0) if term == "1" else 0.0 for s, term in every.coefficients])
-    columns, targets = [], []
-    for equation in weighted_equations(problems, every):
-        theta, target = equation.rows(equation.start)
-        columns.append(theta @ shares[equation.at])
-        targets.append(target - theta @ fixed[equation.at])
+    """Rows of all equations, with one column per process; known inflows are subtracted.
+
+    An equation's rows are divided by what a fit of the whole library leaves of its target, so that
+    no equation counts for its units.
+    """
+    library, columns, targets = task.library, [], []
+    for problem in problems:
+        for k, state in enumerate(problem.equations):
+            shares = np.array(
+                [[p.factors.get((state, term), 0.0) for p in processes] for term in library.names]
+            )
+            fixed = np.where(np.array(library.names) == "1", known.get(state, 0.0), 0.0)
+            target = problem.train_target(k)
+            theta = problem.train_theta
+            left = target - theta @ np.linalg.lstsq(theta, target, rcond=None)[0]
+            std = max(float(left.std()), MIN_RESIDUAL * float(np.sqrt(np.square(target).mean())))
+            theta = theta / problem.coef_scale(k) / std
+            columns.append(theta @ shares)
+            targets.append(target / std - theta @ fixed)
     return np.concatenate(columns), np.concatenate(targets)
 
 

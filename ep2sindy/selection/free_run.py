@@ -134,7 +134,14 @@ class Confirmed:
         """Sorts the best first; the first of equals wins."""
         verdict = list(Verdict).index(self.run.verdict)
         size = self.trial.system.n_free
-        return bool(self.broken), verdict, not self.share, not self.is_global, size, -self.share
+        return (
+            bool(self.broken),
+            verdict,
+            not self.share,
+            not self.is_global,
+            size,
+            -min(self.share, GLOBAL),
+        )
 
     def text(self, n_living: int, n_systems: int) -> str:
         """How the system was confirmed, in words."""
