@@ -72,8 +72,8 @@ CAPTION = (
 class Study:
     """Base, weak and constrained least squares, and refinements of the base and constrained models.
 
-    Beside them stands the living model, by default from a library of degree 2, refined in the same
-    way.
+    Beside them stands the living model, from a library of the degree of `living`, or of 2, refined
+    in the same way.
     model: the terms of every state. relations: those of the constrained fits. living: settings of
     the search for the living model. window: samples in each window; None takes two periods.
     windows: lengths for the plot of loss against window length. n_draws: number of draws of
