@@ -29,12 +29,13 @@ Place = tuple[str, str]  # (state, term)
 class Process:
     """One term in one role: its coefficient enters the equations with these factors.
 
-    factors: (state, term) -> 1 or -1.
+    factors: (state, term) -> 1 or -1. one_sign: True if its coefficient must be positive.
     """
 
     role: str
     term: str
     factors: Mapping[Place, float]
+    one_sign: bool = False
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,13 @@ class Roles:
     """Roles that terms have, for a search that conserves what states exchange.
 
     Every role is played by a term or more.
-
     exchange: pairs (from, to); a term in this role leaves the first equation and enters the second
     with the same coefficient, which may be negative. outflow: states that lose something to the
-    outside, by terms of their own powers; or state -> the terms that may. inflow: state -> the
-    constant that it is supplied with, in SI per second; "free" if it is to be found. An experiment
-    also takes "known", the inflow that the record itself gives, and "known or free". signs:
-    demanded of coefficients, such as "n_i: n_i < 0". A state without a role has an equation of free
-    terms.
+    outside, by terms of their own powers, each of which takes away; or state -> the terms that may.
+    inflow: state -> the constant that it is supplied with, in SI per second; "free" if it is to be
+    found. An experiment also takes "known", the inflow that the record itself gives, and "known or
+    free". signs: demanded of coefficients, such as "n_i: n_i < 0". A state without a role has an
+    equation of free terms.
     Raises ValueError for an exchange of a state with itself, or a sign that cannot be read.
 
     >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"])
@@ -132,7 +132,9 @@ class Roles:
         for state in self.outflow:
             for term in self._leaving(state, library):
                 factors = {(state, term): -1.0}
-                found.append(Process(f"{state} out", term, MappingProxyType(factors)))
+                found.append(
+                    Process(f"{state} out", term, MappingProxyType(factors), one_sign=True)
+                )
         for state in [s for s, value in self.inflow.items() if value == FREE]:
             found.append(Process(f"{state} in", "1", MappingProxyType({(state, "1"): 1.0})))
         roles = {state for pair in self.exchange for state in pair} | {*self.outflow, *self.inflow}

@@ -17,7 +17,7 @@ from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
-from ep2sindy.selection.systems import Systems, TrialSystem
+from ep2sindy.selection.systems import Demand, Systems, TrialSystem
 
 
 def conserving_systems(
@@ -118,18 +118,30 @@ def _system(
         return None
     empty = np.zeros((len(task.library), len(task.states)))
     model = SparseModel(task.library, task.states, empty, task.runs[0].units)
-    coef = held.coef(_free_values(held, processes, values))
-    present = set(held.coefficients)
-    signs = {at: sign for at, sign in roles.signed.items() if at in present}
-    return TrialSystem(with_coef(model, held, coef)[0], held, signs)
+    coef = held.coef(_shares(held, processes) @ values)
+    return TrialSystem(with_coef(model, held, coef)[0], held, _demands(held, processes, roles))
 
 
-def _free_values(
-    held: Constraint, processes: Sequence[Process], values: Float[np.ndarray, " processes"]
-) -> Float[np.ndarray, " free"]:
-    """The free coefficients of a system from the coefficients of its processes."""
+def _shares(held: Constraint, processes: Sequence[Process]) -> Float[np.ndarray, "free processes"]:
+    """What the processes, with coefficients of one, make of the free coefficients."""
     places = [held.coefficients[k] for k in held.free]
-    return np.array([[p.factors.get(at, 0.0) for p in processes] for at in places]) @ values
+    return np.array([[p.factors.get(at, 0.0) for p in processes] for at in places])
+
+
+def _demands(held: Constraint, processes: Sequence[Process], roles: Roles) -> list[Demand]:
+    """What an outflow takes away is positive, and coefficients have the signs asked for."""
+    found = []
+    for process, row in zip(processes, np.linalg.inv(_shares(held, processes)), strict=True):
+        if process.one_sign:
+            weights = np.zeros(len(held.coefficients))
+            weights[held.free] = row
+            found.append(Demand(f"{process.role} by {process.term} > 0", weights))
+    for (state, term), sign in roles.signed.items():
+        if (state, term) in held.coefficients:
+            weights = np.zeros(len(held.coefficients))
+            weights[held.coefficients.index((state, term))] = sign
+            found.append(Demand(f"{state}: {term} {'<' if sign < 0 else '>'} 0", weights))
+    return found
 
 
 def _with_fronts(

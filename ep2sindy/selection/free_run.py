@@ -45,9 +45,9 @@ from ep2sindy.selection.systems import (
     Systems,
     TrialSystem,
     budget,
+    demands_note,
     folds_of,
     records_of,
-    signs_note,
     systems_of,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
@@ -105,8 +105,8 @@ class Confirmed:
     """A system refined on all data, and its free run over the longest record.
 
     number: among the systems. share: of starts around the cycle that reach it; zero if the model
-    does not live, or if departures from its cycle do not die out. broken: demanded signs that the
-    coefficients do not have.
+    does not live, or if departures from its cycle do not die out. broken: demands that the
+    coefficients do not meet.
     """
 
     number: int
@@ -151,7 +151,7 @@ class Confirmed:
         elif self.share and not self.run.model.inputs:
             how = f"{how}, {100.0 * self.share:.0f} % of starts reach it"
         found = f"{how}; {n_living or 'none'} of {n_systems} systems live where not fitted"
-        return signs_note(found, self.broken)
+        return demands_note(found, self.broken)
 
 
 @dataclass(frozen=True)
@@ -316,7 +316,7 @@ class FreeRunScore:
                 advance(len(paths))
         worst = np.column_stack([np.max(judged, axis=0), refined.loss])
         pairs = zip(systems, refined.models, strict=True)
-        worst[[bool(system.broken_signs(model)) for system, model in pairs], 0] = MAX_ERROR
+        worst[[bool(system.broken(model)) for system, model in pairs], 0] = MAX_ERROR
         return worst
 
     def _judge(
@@ -395,7 +395,7 @@ class FreeRunScore:
         start = cycle.waveform(cycle.phase[:1])[0]
         run = free_run(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
         share = _share_reaching(run, cycles) if run.verdict is Verdict.LIVES else 0.0
-        return Confirmed(number, trial, run, share, trial.system.broken_signs(model))
+        return Confirmed(number, trial, run, share, trial.system.broken(model))
 
 
 def _share_reaching(run: FreeRun, cycles: Sequence[Cycle]) -> float:

@@ -33,8 +33,8 @@ from ep2sindy.selection.systems import (
     Systems,
     TrialSystem,
     budget,
+    demands_note,
     records_of,
-    signs_note,
     systems_of,
 )
 
@@ -123,7 +123,7 @@ class RefinedScore:
     ) -> Decision:
         """Decide among given systems, as `decide` does among the combinations of candidates.
 
-        A winner whose refined coefficients do not have the signs demanded of them is passed over.
+        A winner whose refined coefficients do not meet the demands on them is passed over.
         """
         fronts, places, systems = found.fronts, found.places, found.systems
         errors, limit = self._judge(systems, records_of(fronts, runs), progress)
@@ -132,12 +132,12 @@ class RefinedScore:
             winner = smallest(fronts, places, errors, limit=limit)
             with progress.stage(None, "", "the best system refined on all data"):
                 model = systems[winner].refined_on_all(runs)
-            broken = systems[winner].broken_signs(model)
+            broken = systems[winner].broken(model)
             if not broken:
                 break
             errors[winner] = np.inf
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
-        note = signs_note(self.label, broken)
+        note = demands_note(self.label, broken)
         return Decision(scores, model, note, systems[winner].constraint)
 
     def _judge(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -24,15 +24,23 @@ BATCH_STEPS = 6000
 
 
 @dataclass(frozen=True, eq=False)
+class Demand:
+    """What must be positive: a weighted sum of coefficients (coefs,), in words."""
+
+    words: str
+    weights: Float[np.ndarray, " coefs"]
+
+
+@dataclass(frozen=True, eq=False)
 class TrialSystem:
     """A model of one candidate per equation, with the constraint that its coefficients obey.
 
-    signs: (state, term) -> 1 or -1, signs that are demanded of refined coefficients.
+    demands: of refined coefficients, with weights in the order of the constraint's coefficients.
     """
 
     model: SparseModel
     constraint: Constraint
-    signs: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    demands: Sequence[Demand] = ()
 
     @property
     def n_terms(self) -> int:
@@ -43,13 +51,11 @@ class TrialSystem:
         """Number of coefficients that are fitted."""
         return len(self.constraint.free)
 
-    def broken_signs(self, model: SparseModel) -> list[str]:
-        """The demanded signs that the coefficients of a refined model do not have."""
-        return [
-            f"{state}: {term} {'<' if sign < 0 else '>'} 0"
-            for (state, term), sign in self.signs.items()
-            if sign * model.terms(state).get(term, 0.0) <= 0.0
-        ]
+    def broken(self, model: SparseModel) -> list[str]:
+        """The demands that the coefficients of a refined model do not meet."""
+        terms = {state: model.terms(state) for state in model.states}
+        coef = np.array([terms[s].get(term, 0.0) for s, term in self.constraint.coefficients])
+        return [each.words for each in self.demands if each.weights @ coef <= 0.0]
 
     def refined_on_all(
         self,
@@ -92,9 +98,9 @@ class Systems:
     systems: Sequence[TrialSystem]
 
 
-def signs_note(note: str, broken: Sequence[str]) -> str:
-    """A rule's note, with the demanded signs that its winner does not have."""
-    return f"{note}; no system keeps the demanded signs: {', '.join(broken)}" if broken else note
+def demands_note(note: str, broken: Sequence[str]) -> str:
+    """A rule's note, with the demands that its winner does not meet."""
+    return f"{note}; no system meets all demands: {', '.join(broken)}" if broken else note
 
 
 def systems_of(

@@ -34,15 +34,17 @@ NOTE = (
     "Rates are means over the record; the model's are its terms at the record's densities. R2: of "
     "the model's rate against the record's, sample by sample."
 )
-# Term's equation, whether it holds ions and neutrals -> sign and terms of the zone's balance.
-PLACES: Mapping[tuple[str, bool, bool], tuple[float, tuple[str, ...], str]] = {
-    (IONS, True, True): (1.0, ("ionization",), "ionization"),
-    (IONS, False, True): (1.0, ("ionization",), "ionization"),
-    (IONS, True, False): (-1.0, ("exit_i", "returned"), "exit, walls and anode"),
-    (NEUTRALS, True, True): (-1.0, ("ionization",), "ionization"),
-    (NEUTRALS, True, False): (1.0, ("returned",), "back from walls and anode"),
-    (NEUTRALS, False, True): (-1.0, ("exit_n",), "exit"),
-    (NEUTRALS, False, False): (1.0, ("supply",), "mass flow"),
+# Term's equation, its kind and sign -> terms of the zone's balance, and what they are.
+PLACES: Mapping[tuple[str, str, bool], tuple[tuple[str, ...], str]] = {
+    (IONS, "mixed", True): (("ionization",), "ionization"),
+    (IONS, "neutrals", True): (("ionization",), "ionization"),
+    (IONS, "ions", True): (("ionization",), "ionization"),
+    (IONS, "ions", False): (("exit_i", "returned"), "exit, walls and anode"),
+    (NEUTRALS, "mixed", False): (("ionization",), "ionization"),
+    (NEUTRALS, "ions", False): (("ionization",), "ionization"),
+    (NEUTRALS, "ions", True): (("returned",), "back from walls and anode"),
+    (NEUTRALS, "neutrals", False): (("exit_n",), "exit"),
+    (NEUTRALS, "constant", True): (("supply",), "mass flow"),
 }
 
 
@@ -132,7 +134,7 @@ def compared_processes(
     ):  # fmt: skip
         leaving = -_sum(own(state), len(theta)) - _sum(other, len(theta))
         words = "ions that leave" if state == IONS else "neutrals that leave"
-        terms = [*_named(state, own(state)), *_named(_other(state), other)]
+        terms = [*_named(state, _less_of(own(state), other))]
         found.append(ComparedProcess(words, known.get(key), leaving, terms))
     supply = _sum(_part(rates, NEUTRALS, kind="constant"), len(theta))
     inflow = ComparedProcess(
@@ -141,8 +143,15 @@ def compared_processes(
     return [each for each in (inflow, *found) if each.modelled.any() or each.recorded is not None]
 
 
-def _other(state: str) -> str:
-    return NEUTRALS if state == IONS else IONS
+def _less_of(
+    own: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The terms that take away more than the other equation gains by them."""
+    return {
+        term: rate
+        for term, rate in own.items()
+        if term not in other or not np.allclose(rate, -other[term], rtol=1e-6)
+    }
 
 
 def _kind(term: str) -> str:
@@ -314,16 +323,13 @@ def _alone(
     model: SparseModel, data: Trajectory, state: str, term: str, known: Mapping[str, np.ndarray]
 ) -> tuple[str, float]:
     """A term's process in words, and the coefficient that would exchange as much alone."""
-    kind = _kind(term)
-    place = PLACES.get((state, kind in ("mixed", "ions"), kind in ("mixed", "neutrals")))
-    if place is None:
-        return "", np.nan
-    sign, names, words = place
-    if not set(names) <= set(known):
+    coef = model.terms(state).get(term, 0.0)
+    names, words = PLACES.get((state, _kind(term), coef > 0.0), ((), ""))
+    if not names or not set(names) <= set(known):
         return words, np.nan
     column = model.library.evaluate(data.columns(model.library.variables))
     mean = float(column[:, model.library.index(term)].mean())
-    return words, sign * float(sum(known[name].mean() for name in names)) / mean
+    return words, np.copysign(sum(float(known[name].mean()) for name in names) / mean, coef)
 
 
 def _without(

@@ -26,9 +26,9 @@ def zone_balance(
 
     zone: a `Zone` without r, or (from, to) in m. Returned, as far as the field gives them:
     change_i, change_n: of the averages. ionization: neutrals that become ions. exit_i, exit_n: what
-    leaves through the end away from the anode. returned: ions that become neutrals at the walls
-    and, if the zone begins at the first grid point, at the anode. supply: neutrals that then enter
-    there.
+    leaves through the end away from the anode, less what enters through the other end if this is
+    not the anode. returned: ions that become neutrals at the walls and, in a zone that begins at
+    the first grid point, at the anode. supply: neutrals that then enter there.
 
     A run of `simulate` with averages gives them all exactly, for ions of all charges together, and
     besides inflow_i and inflow_n (net, through both ends), wall_loss, and residual, which is zero
@@ -83,10 +83,14 @@ def _averaged(field: xr.Dataset, zone: Zone) -> Terms:
         "wall_loss": mean("wall_loss"),
         "exit_i": exit_i,
         "exit_n": exit_n,
+        "returned": mean("wall_loss"),
     }
-    terms["returned"] = terms["wall_loss"] - (enter_i if first == 0 else 0.0)
-    if first == 0:
-        terms["supply"] = enter_n + enter_i  # ions that reach the anode come back as neutrals
+    if first == 0:  # ions that reach the anode come back as neutrals
+        terms["returned"] = terms["returned"] - enter_i
+        terms["supply"] = enter_n + enter_i
+    else:
+        terms["exit_i"] = exit_i - enter_i
+        terms["exit_n"] = exit_n - enter_n
     terms["residual"] = (
         terms["change_i"] + terms["change_n"] - terms["inflow_i"] - terms["inflow_n"]
     )
@@ -118,11 +122,15 @@ def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
     inner = np.arange(field.sizes["z"])[slices]
     length_m = float(cell_sizes(field, "z", axisymmetric=axisymmetric)[slices].sum())
     if "u_iz" in field:
-        last = field.isel(z=[inner[-1]])
-        run = zone_average(
-            last, None, states=DENSITIES, products=["n_i*u_iz"], axisymmetric=axisymmetric
-        )
-        terms["exit_i"] = over_time(run.inputs[:, 0], run) / length_m
+
+        def flux(cell: int) -> np.ndarray:
+            run = zone_average(
+                field.isel(z=[cell]), None, states=DENSITIES, products=["n_i*u_iz"],
+                axisymmetric=axisymmetric,
+            )  # fmt: skip
+            return over_time(run.inputs[:, 0], run) / length_m
+
+        terms["exit_i"] = flux(inner[-1]) - (flux(inner[0] - 1) if inner[0] else 0.0)
     if inner[0] == 0 and INFLOW in field.attrs:
         terms["supply"] = np.full(len(t), float(field.attrs[INFLOW]) / length_m)
     return _closed(terms)
