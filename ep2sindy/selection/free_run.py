@@ -26,9 +26,9 @@ from ep2sindy.selection.rule import (
     FLOOR,
     MAX_ERROR,
     Decision,
-    admissible,
     combination_scores,
     combinations,
+    left_out,
 )
 from ep2sindy.selection.systems import (
     Fold,
@@ -108,7 +108,8 @@ class FreeRunScore:
     judged: states whose cycle counts, for example the one that was measured if the others are
     derived from it; None takes all. n_starts: number of runs over every held-out part for models
     without inputs, at phases spread over the period; all must end on the cycle.
-    max_combinations: more are refused. n_confirmed: most systems to refine on all data. seed: of
+    max_combinations: of more, the most promising are tried, those whose candidates rank best in
+    their own fronts; the note says so. n_confirmed: most systems to refine on all data. seed: of
     the random windows.
     """
 
@@ -151,22 +152,24 @@ class FreeRunScore:
     ) -> Decision:
         """Score the candidates, and refine the winning system on all data.
 
-        Raises ValueError for no runs, a state without a front, more than max_combinations, or
-        relations that no combination has the terms for.
+        Raises ValueError for no runs, a state without a front, or relations that no combination
+        has the terms for.
         """
         records = records_of(fronts, runs)
         cycles = cycles_of(records, [front.equation for front in fronts])
         if isinstance(cycles, str):
             rule = RefinedScore(max_combinations=self.max_combinations)
             found = rule.decide(fronts, library, runs, relations, progress=progress)
-            return replace(found, note=f"{cycles}: chosen by windows held out instead")
-        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
+            rest = found.note.removeprefix(rule.label)
+            return replace(found, note=f"{cycles}: chosen by windows held out instead{rest}")
+        places = combinations(fronts, self.max_combinations, relations)
         systems = systems_of(fronts, places, library, runs, relations)
         trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
         winner, model, note = self._winner(records, cycles, trials, progress)
         limit = max(1.0, float(errors[winner]))
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
+        note += left_out(fronts, len(places), self.max_combinations)
         return Decision(scores, model, note)
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:

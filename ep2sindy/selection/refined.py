@@ -23,9 +23,9 @@ from ep2sindy.selection.rule import (
     FLOOR,
     MAX_ERROR,
     Decision,
-    admissible,
     combination_scores,
     combinations,
+    left_out,
     smallest,
 )
 from ep2sindy.selection.systems import Records, TrialSystem, budget, records_of, systems_of
@@ -64,8 +64,8 @@ class RefinedScore:
     score = the least error of all combinations with the candidate, no less than that limit; the
     winner's candidates score marginally below it.
     window_s: None for one and a half dominant periods, or less if needed to leave three pairs of
-    windows. n_windows: most windows to judge on, over all records. max_combinations: more are
-    refused.
+    windows. n_windows: most windows to judge on, over all records. max_combinations: of more,
+    the most promising are judged, those whose candidates rank best in their own fronts.
     """
 
     window_s: float | None = None
@@ -85,8 +85,8 @@ class RefinedScore:
     ) -> list[Float[np.ndarray, " _candidates"]]:
         """Scores of every candidate by the errors of its combinations.
 
-        Raises ValueError for no runs, a state without a front, more than max_combinations, or
-        records too short for two windows.
+        Raises ValueError for no runs, a state without a front, or records too short for two
+        windows.
         """
         places = combinations(fronts, self.max_combinations)
         systems = systems_of(fronts, places, library, runs)
@@ -106,7 +106,7 @@ class RefinedScore:
 
         Also raises ValueError for relations that no combination has the terms for.
         """
-        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
+        places = combinations(fronts, self.max_combinations, relations)
         records = records_of(fronts, runs)
         systems = systems_of(fronts, places, library, runs, relations)
         errors, limit = self._judge(systems, records, progress)
@@ -114,7 +114,8 @@ class RefinedScore:
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
         with progress.stage(None, "", "the best system refined on all data"):
             found = systems[winner].refined_on_all(runs)
-        return Decision(scores, found, self.label)
+        note = f"{self.label}{left_out(fronts, len(places), self.max_combinations)}"
+        return Decision(scores, found, note)
 
     def _judge(
         self, systems: Sequence[TrialSystem], records: Records, progress: Progress
