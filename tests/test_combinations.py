@@ -39,7 +39,7 @@ def test_the_first_of_eight_to_the_twelfth_choices_need_no_others() -> None:
     found = list(islice(best_first(costs), 14))
     assert found[0] == (0,) * 12
     assert sorted(map(sum, found)) == [0] + [1] * 12 + [2]
-    fronts = [front(f"s{k}", list(range(8))) for k in range(12)]
+    fronts = [front(f"s{k}", [float(n) for n in range(8)]) for k in range(12)]
     places = combinations(fronts, 13)
     assert places.sum() == 12
     note = "; the 13 most promising of 68719476736 combinations were tried"

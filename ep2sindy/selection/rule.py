@@ -108,7 +108,7 @@ def combinations(
     Raises ValueError if none of these has the terms that the relations name.
     """
     order = [np.argsort(_misfit(front), kind="stable") for front in fronts]
-    ranks = best_first([np.arange(len(places)) for places in order])
+    ranks = best_first([np.arange(len(places), dtype=np.float64) for places in order])
     kept = []
     for choice in islice(ranks, TRIED * most):
         place = np.array([places[rank] for places, rank in zip(order, choice, strict=True)])

@@ -204,6 +204,7 @@ class _Walk:
         for _ in range(JOINING_STEPS):
             defect = largest_gap(gaps(walk.maps[points], walk.state.nodes[points]))
             is_open = self.state.finite[points] & ~self.state.finished[points] & (defect > JOINED)
+            is_open = self.problem.agree(is_open, np.any)
             if not is_open.any():
                 break
             walk = walk.iterate(points[is_open], self.window, 0.0, hold=True)
