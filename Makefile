@@ -56,6 +56,7 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.free_runs
 	$(BIN)/python -m benchmarks.hallthruster
 	$(BIN)/python -m benchmarks.refine
+	$(BIN)/python -m benchmarks.many_states
 	$(BIN)/python -m benchmarks.intervals
 	$(BIN)/python -m benchmarks.pointwise
 	$(BIN)/python -m benchmarks.regimes

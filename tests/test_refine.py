@@ -277,8 +277,8 @@ def test_history_reports_every_iteration_as_it_comes() -> None:
     model = spread(PREY.model, 0.2, rng)
     found = refine(model, [data], window=60, n_windows=6, rng=rng, callback=seen.append)
     assert tuple(seen) == found.history
-    assert seen[0].block == 5
-    assert seen[-1].block == 60
+    assert seen[0].memory == 5
+    assert seen[-1].memory == 60
     assert seen[-1].step < 1e-7
     assert seen[-1].defect < 1e-7
 
@@ -310,6 +310,8 @@ def test_start_that_blows_up_is_a_result() -> None:
     found = refine(model, [clean(PREY)], window=50, n_windows=3, rng=rng)
     assert found.status == "non_finite"
     assert found.loss == np.inf
+    assert "window 0 (from sample " in found.message
+    assert found.message.endswith("follows no finite trajectory beyond sample 1")
     np.testing.assert_array_equal(found.model.coef, model.coef)
 
 

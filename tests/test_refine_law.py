@@ -184,7 +184,7 @@ def test_reweighting_and_fixed_starts_find_the_exact_law_too() -> None:
 
 def test_what_does_not_stay_finite_comes_back_as_it_was() -> None:
     wild = [replace(m, coef=-30.0 * m.coef) for m in truths()]
-    found = tied(wild, runs(), method=MultipleShooting(first_block=60, max_iter=1))
+    found = tied(wild, runs(), method=MultipleShooting(first_memory=60, max_iter=1))
     assert found.status in ("non_finite", "max_iter", "flat")
     if found.status == "non_finite":
         assert found.covariance is None

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,12 +31,12 @@ from ep2sindy.selection.rule import (
     Decision,
     Selection,
     SystemSelection,
-    admissible,
-    combinations,
+    best_first,
     support_of,
 )
 
-MAX_COMBINATIONS = 1_000_000  # most combinations of the fronts that relations tie together
+# Most combinations, of the fronts that relations tie together, to look at for one with the terms.
+MAX_COMBINATIONS = 100_000
 
 
 # For a correct equation chi-squared per row is 1 within its standard error, and a little more,
@@ -371,15 +372,20 @@ def _least_sum(
         tied = [k for k, front in enumerate(fronts) if front.equation in states]
         some = [fronts[k] for k in tied]
         own = [r for r in relations if any(state in states for _, state, _ in r.factors)]
-        every = combinations(
-            some,
-            MAX_COMBINATIONS,
-            use="compared under relations",
-            way_out="let the relations tie fewer states to each other",
+        order = [np.argsort(front.scores, kind="stable") for front in some]
+        ranked = best_first([f.scores[places] for f, places in zip(some, order, strict=True)])
+        tries = (
+            np.array([places[k] for places, k in zip(order, choice, strict=True)])
+            for choice in islice(ranked, MAX_COMBINATIONS)
         )
-        places = admissible(some, every, own)
-        sums = np.sum([f.scores[column] for f, column in zip(some, places.T, strict=True)], axis=0)
-        place[tied] = places[int(np.argmin(sums))]
+        best = next((t for t in tries if binding(own, support_of(some, t)) is not None), None)
+        if best is None:
+            raise ValueError(
+                f"the relations {[r.text for r in own]} name terms that none of the best "
+                f"{MAX_COMBINATIONS} combinations of candidates has; raise the search's "
+                "max_terms, or depth, or let the relations tie fewer states to each other"
+            )
+        place[tied] = best
     return place
 
 

@@ -138,7 +138,7 @@ class OperatingFit:
         if start is not None and settings.window is not None:
             method = settings.method or MultipleShooting()
             if isinstance(method, MultipleShooting):  # refine_law says that no other will do
-                method = replace(method, first_block=settings.window, tolerance=1e-4)
+                method = replace(method, first_memory=settings.window, tolerance=1e-4)
             settings = replace(settings, method=method)
         found = refine_law(
             [fit.model for fit in self.fits],

@@ -14,3 +14,4 @@ from ep2sindy.refinement.windows import WindowBatch as WindowBatch
 from ep2sindy.refinement.correction import Corrected as Corrected
 from ep2sindy.refinement.law import refine_law as refine_law
 from ep2sindy.refinement.law import LawRefinement as LawRefinement
+from ep2sindy.refinement.elimination import Elimination as Elimination

@@ -209,8 +209,10 @@ def integrate(problem: RefinementProblem, fit: RefinementFit) -> tuple[Refinemen
     start = np.zeros((*nodes.shape[:2], 1, nodes.shape[-1]))
     still = np.zeros_like(fit.scaling)
     open_points = points
+    known = fit.maps
     for _ in range(CLOSING_STEPS):
-        maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
+        maps = step_maps(problem, fit.step, fit.scaling, nodes, points) if known is None else known
+        known = None
         with np.errstate(invalid="ignore", over="ignore"):
             gaps = np.abs(maps[:, :, 0] - nodes[:, :, 1:].transpose(0, 3, 1, 2)).max(axis=(1, 2, 3))
         open_points = np.flatnonzero(finite & ~(gaps < CLOSED))
@@ -225,7 +227,7 @@ def integrate(problem: RefinementProblem, fit: RefinementFit) -> tuple[Refinemen
         nodes[open_points[sound]] = states[open_points[sound]]
         maps = step_maps(problem, fit.step, fit.scaling, nodes, points)
     finite &= np.isfinite(maps).all(axis=(1, 2, 3, 4))
-    return replace(fit, nodes=nodes, finite=finite), maps
+    return replace(fit, nodes=nodes, finite=finite, maps=None), maps
 
 
 def integrate_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndarray:
@@ -261,6 +263,32 @@ def rollout(problem: RefinementProblem, fit: RefinementFit, *, n_substeps: int =
             options={"grid_constructor": lambda func, y0, t: grid, "perturb": True},
         )  # fmt: skip
     return path.permute(1, 3, 0, 2).cpu().numpy()
+
+
+def failure(
+    problem: RefinementProblem, fit: RefinementFit, point: int, verdict: RefinementVerdict
+) -> str:
+    """At which stage and in which window a refinement failed, in words; nothing if it did not."""
+    failed = (RefinementStatus.NON_FINITE, RefinementStatus.FLAT, RefinementStatus.MAX_ITER)
+    if verdict.status not in failed:
+        return ""
+    batch, window = problem.batches[point], fit.nodes.shape[2]
+    where = int(np.argmax(np.nan_to_num(verdict.window_loss, nan=np.inf, posinf=np.inf)))
+    how = f"misses its data most, with a loss of {verdict.window_loss[where]:.3g}"
+    if verdict.status is RefinementStatus.NON_FINITE:
+        alone, at = problem.take(point), [point]
+        scaling, nodes = fit.scaling[at, : alone.n_free], fit.nodes[at]
+        part = replace(fit, scaling=scaling, nodes=nodes)
+        sound = np.isfinite(rollout(alone, part)[0]).all(axis=-1)
+        where = int(np.argmin(sound.sum(axis=1)))
+        how = f"follows no finite trajectory beyond sample {int(sound[where].sum())}"
+    stage = ""
+    if fit.memory is not None and fit.memory[point] < window:
+        stage = f"the longest memory without gaps was {fit.memory[point]} of {window} samples, and "
+    return (
+        f"{stage}window {where} (from sample {batch.start[where]} of trajectory "
+        f"{batch.trajectory[where]}, {window} samples of {batch.step_s:.3g} s) {how}"
+    )
 
 
 def step_triangles(problem: RefinementProblem, fit: RefinementFit, maps: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
@@ -121,13 +121,14 @@ class RefinementSettings:
 class Iteration:
     """One iteration of a fit, as reported to observers.
 
-    block: samples in one piece of trajectory at this stage. loss: mean square of (trajectory -
-    data) / std. step: largest relative change of a scaling. defect: largest gap between the end
-    of a step and the next node, in std; zero for methods without nodes.
+    memory: samples after which a stage forgets what happened; the window's if it forgets nothing.
+    loss: mean square of (trajectory - data) / std. step: largest relative change of a scaling.
+    defect: largest gap between the end of a step and the next node, in std; zero for methods
+    without nodes.
     """
 
     point: int
-    block: int
+    memory: int
     loss: float
     scaling: Float[np.ndarray, " free"]
     step: float
@@ -320,7 +321,9 @@ class RefinementFit:
     scaling: padded with ones beyond a model's own scalings. nodes: the fitted trajectories at the
     samples, in std. weights: the last ones used. finished: true if the method's own convergence
     test was met. finite: False for points that did not stay finite. step: time-step scheme from
-    node to node. theta: unknowns of the law that determines the scalings, if any.
+    node to node. theta: unknowns of the law that determines the scalings, if any. memory: samples,
+    the longest memory of a stage that left no gaps, if the method has stages. maps: one-step maps
+    at the nodes, if they are known.
     """
 
     scaling: Float[np.ndarray, "points free"]
@@ -330,6 +333,8 @@ class RefinementFit:
     finite: np.ndarray
     step: Step = ONE_RUNGE_KUTTA
     theta: Float[np.ndarray, " theta"] | None = None
+    memory: Int[np.ndarray, " points"] | None = None
+    maps: np.ndarray | None = None
 
 
 @runtime_checkable

@@ -18,6 +18,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.judge import (
     RefinementStatus,
     RefinementVerdict,
+    failure,
     fit_and_judge,
     integrate_windows,
 )
@@ -51,6 +52,8 @@ class Refinement:
     significantly; unidentifiable: the 95 % interval of a free coefficient reaches zero; flat: no
     better than a constant; non_finite: the given model is returned, without covariance.
     history: one entry per iteration. trajectories: the fitted states in SI, in windows of `batch`.
+    message: for non_finite, flat and max_iter, at which stage (by its memory in samples, see
+    `MultipleShooting`) and in which window the refinement failed; otherwise empty.
     """
 
     model: SparseModel
@@ -61,6 +64,7 @@ class Refinement:
     history: tuple[Iteration, ...]
     batch: WindowBatch
     trajectories: Float[np.ndarray, "windows samples n_states"]
+    message: str = ""
 
     def __repr__(self) -> str:
         body = model_lines(self.model, n_lines=N_LINES - 1)
@@ -110,6 +114,7 @@ def refine(
     constraint: Constraint | None = None,
     free_start: bool | None = None,
     n_reweights: int | None = None,
+    constraints: Sequence[Constraint | None] | None = None,
     points_per_batch: int = 8,
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
@@ -131,6 +136,7 @@ def refine(
     constraint: Constraint | None = None,
     free_start: bool | None = None,
     n_reweights: int | None = None,
+    constraints: Sequence[Constraint | None] | None = None,
     points_per_batch: int = 8,
     rng: np.random.Generator | int,
     callback: Callable[[Iteration], None] | None = None,
@@ -140,15 +146,13 @@ def refine(
     """Fit the free coefficients to windows spread over trajectories, by least squares.
 
     model: one model, or a list of models of the same states, each with its own list of
-    trajectories; for a list the result is a list. n_windows to n_reweights: override `settings`;
-    see `RefinementSettings`.
-    points_per_batch: number of models integrated together, few enough to fit in the processor's
-    cache; thousands on a GPU. A model that has converged leaves its batch. Models may differ in
-    their terms; each one in a batch costs as much as the largest. progress: see `Progress`.
+    trajectories; for a list the result is a list. n_windows to n_reweights: override `settings`,
+    see there. constraints: for a list, the constraint of each model or None, in place of
+    `constraint`. points_per_batch: models integrated together, few enough for the processor's
+    cache; thousands on a GPU. Each costs as much as the largest. progress: see `Progress`.
     Raises ValueError for a window that fits no trajectory, a missing variable, a model without
-    terms, a constraint that leaves out one of its terms, or models that differ in their variables
-    or the number of their windows. A failed fit is a result: see `status`.
-
+    terms, a constraint that leaves out one, or models that differ in their variables or the number
+    of their windows. A failed fit is a result: see `status` and `message`.
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     >>> refined = ep.refine(ep.discover(run).model, [run], rng=0)
     >>> str(refined.status)
@@ -160,13 +164,14 @@ def refine(
     }  # fmt: skip
     settings = settings.override(changes)
     models, records = _by_model(model, trajectories)
+    relations = _by_constraint(settings, models, constraints)
     batches = settings.cut(models, records, np.random.default_rng(rng))
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
         refinements: list[Refinement] = []
         for some in _chunks(len(models), points_per_batch):
             refinements += _refine(
-                models[some], batches[some],
-                settings=settings, callback=callback, device=device, advance=advance,
+                models[some], batches[some], relations[some], settings=settings,
+                callback=callback, device=device, advance=advance,
             )  # fmt: skip
     return refinements[0] if isinstance(model, SparseModel) else refinements
 
@@ -190,9 +195,27 @@ def _by_model(
     return model, cast("Sequence[Sequence[Trajectory]]", trajectories)
 
 
+def _by_constraint(
+    settings: RefinementSettings,
+    models: Sequence[SparseModel],
+    constraints: Sequence[Constraint | None] | None,
+) -> Sequence[Constraint | None]:
+    """Constraint of every model."""
+    if constraints is None:
+        return [settings.constraint] * len(models)
+    if settings.constraint is not None or len(constraints) != len(models):
+        raise ValueError(
+            "constraints must hold one entry per model, and replace `constraint`: "
+            f"{len(constraints)} came for {len(models)} models"
+            f"{'' if settings.constraint is None else ', beside a common one; leave out one'}"
+        )
+    return constraints
+
+
 def _refine(
     models: Sequence[SparseModel],
     batches: Sequence[WindowBatch],
+    relations: Sequence[Constraint | None],
     *,
     settings: RefinementSettings,
     callback: Callable[[Iteration], None] | None,
@@ -204,7 +227,7 @@ def _refine(
     problem = RefinementProblem.of(
         models,
         batches,
-        [settings.constraint] * len(models),
+        relations,
         free_start=settings.free_start,
         n_reweights=settings.n_reweights,
         observe=observe,
@@ -212,7 +235,7 @@ def _refine(
     )
     fit, verdicts = fit_and_judge(problem, settings.method or MultipleShooting())
     return [
-        _result(model, problem, fit, p, verdict, settings.constraint, history)
+        _result(model, problem, fit, p, verdict, relations[p], history)
         for p, (model, verdict) in enumerate(zip(models, verdicts, strict=True))
     ]
 
@@ -257,6 +280,7 @@ def _result(
         history=tuple(entry for entry in history if entry.point == point),
         batch=batch,
         trajectories=trajectories,
+        message=failure(problem, fit, point, verdict),
     )
 
 

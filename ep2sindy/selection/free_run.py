@@ -34,9 +34,9 @@ from ep2sindy.selection.rule import (
     FLOOR,
     MAX_ERROR,
     Decision,
-    admissible,
     combination_scores,
     combinations,
+    left_out,
 )
 from ep2sindy.selection.systems import (
     Fold,
@@ -184,7 +184,8 @@ class FreeRunScore:
     judged: states whose cycle counts, for example the one that was measured if the others are
     derived from it; None takes all. n_starts: number of runs over every held-out part for models
     without inputs, at phases spread over the period; all must end on the cycle.
-    max_combinations: more are refused. n_confirmed: most systems to refine on all data. seed: of
+    max_combinations: of more, the most promising are tried, those whose candidates rank best in
+    their own fronts; the note says so. n_confirmed: most systems to refine on all data. seed: of
     the random windows.
     """
 
@@ -227,12 +228,14 @@ class FreeRunScore:
     ) -> Decision:
         """Score the candidates, and refine the winning system on all data.
 
-        Raises ValueError for no runs, a state without a front, more than max_combinations, or
-        relations that no combination has the terms for.
+        Raises ValueError for no runs, a state without a front, or relations that no combination
+        has the terms for.
         """
-        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
+        places = combinations(fronts, self.max_combinations, relations)
         systems = systems_of(fronts, places, library, runs, relations)
-        return self.judge(Systems(fronts, places, systems), runs, progress=progress)
+        decision = self.judge(Systems(fronts, places, systems), runs, progress=progress)
+        rest = left_out(fronts, len(places), self.max_combinations)
+        return replace(decision, note=f"{decision.note}{rest}")
 
     def judge(
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT

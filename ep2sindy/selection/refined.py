@@ -23,9 +23,9 @@ from ep2sindy.selection.rule import (
     FLOOR,
     MAX_ERROR,
     Decision,
-    admissible,
     combination_scores,
     combinations,
+    left_out,
     smallest,
 )
 from ep2sindy.selection.systems import (
@@ -72,8 +72,8 @@ class RefinedScore:
     score = the least error of all combinations with the candidate, no less than that limit; the
     winner's candidates score marginally below it.
     window_s: None for one and a half dominant periods, or less if needed to leave three pairs of
-    windows. n_windows: most windows to judge on, over all records. max_combinations: more are
-    refused.
+    windows. n_windows: most windows to judge on, over all records. max_combinations: of more,
+    the most promising are judged, those whose candidates rank best in their own fronts.
     """
 
     window_s: float | None = None
@@ -93,8 +93,8 @@ class RefinedScore:
     ) -> list[Float[np.ndarray, " _candidates"]]:
         """Scores of every candidate by the errors of its combinations.
 
-        Raises ValueError for no runs, a state without a front, more than max_combinations, or
-        records too short for two windows.
+        Raises ValueError for no runs, a state without a front, or records too short for two
+        windows.
         """
         places = combinations(fronts, self.max_combinations)
         systems = systems_of(fronts, places, library, runs)
@@ -114,9 +114,11 @@ class RefinedScore:
 
         Also raises ValueError for relations that no combination has the terms for.
         """
-        places = admissible(fronts, combinations(fronts, self.max_combinations), relations)
+        places = combinations(fronts, self.max_combinations, relations)
         systems = systems_of(fronts, places, library, runs, relations)
-        return self.judge(Systems(fronts, places, systems), runs, progress=progress)
+        decision = self.judge(Systems(fronts, places, systems), runs, progress=progress)
+        rest = left_out(fronts, len(places), self.max_combinations)
+        return replace(decision, note=f"{decision.note}{rest}")
 
     def judge(
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT

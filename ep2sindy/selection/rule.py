@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import islice
 from math import prod
 from typing import Protocol, runtime_checkable
 
@@ -24,6 +26,9 @@ FLOOR = 1e-6
 # Upper bound on the error of a system, also used if it dies, diverges or cannot be refined. The
 # unit is the variance of the data (a constant at the mean has error 1), or the bound of a free run.
 MAX_ERROR = 10.0
+
+# Most combinations to look at for one that the relations admit, per combination to be tried.
+TRIED = 64
 
 
 @runtime_checkable
@@ -94,24 +99,71 @@ def score_candidates(
 
 
 def combinations(
-    fronts: Sequence[ParetoFront],
-    most: int,
-    *,
-    use: str = "integrated",
-    way_out: str = "raise max_combinations",
+    fronts: Sequence[ParetoFront], most: int, relations: Sequence[Relation] = ()
 ) -> Int[np.ndarray, "combinations fronts"]:
-    """Every choice of one candidate per front, by index.
+    """Choices of one candidate per front, by index, that have the terms named by the relations.
 
-    use, way_out: of the caller, for the error.
-    Raises ValueError for more than `most`.
+    If there are more than `most`, these are the most promising ones: those with the least sum of
+    ranks, a candidate's rank being its place in its own front by deviance or, after a regression,
+    by R2 on the test rows. They are returned in the order of their indices.
+    Memory grows with `most` alone, and at most TRIED times as many are looked at.
+    Raises ValueError if none of these has the terms that the relations name.
     """
-    counts = [len(front.candidates) for front in fronts]
-    if prod(counts) > most:
+    order = [np.argsort(_misfit(front), kind="stable") for front in fronts]
+    ranks = best_first([np.arange(len(places), dtype=np.float64) for places in order])
+    kept = []
+    for choice in islice(ranks, TRIED * most):
+        place = np.array([places[rank] for places, rank in zip(order, choice, strict=True)])
+        if not relations or binding(relations, support_of(fronts, place)) is not None:
+            kept.append(place)
+        if len(kept) == most:
+            break
+    if not kept:
         raise ValueError(
-            f"at most {most} combinations of candidates are {use}: {counts} candidates make "
-            f"{prod(counts)}; lower depth or the search's max_terms, or {way_out}"
+            f"the relations {[r.text for r in relations]} name terms that no combination of "
+            "candidates has; raise the search's max_terms, or depth"
         )
-    return np.indices(counts).reshape(len(counts), -1).T
+    found = np.array(kept, dtype=np.int64)
+    return found[np.lexsort(found.T[::-1])]
+
+
+def _misfit(front: ParetoFront) -> Float[np.ndarray, " _candidates"]:
+    """Values by which the candidates of one front are ranked, the best least."""
+    deviance = [c.deviance for c in front.candidates]
+    if None in deviance:
+        return np.array([-c.r2_test for c in front.candidates])
+    return np.array(deviance, dtype=np.float64)
+
+
+def best_first(costs: Sequence[Float[np.ndarray, " _"]]) -> Iterator[tuple[int, ...]]:
+    """Every choice of one place in each row of costs, by the summed cost, then by the places.
+
+    costs: each row in ascending order. A choice is put on the heap by one other alone, in which
+    its last place that is not zero is lower by one. So none comes twice, nothing is remembered but
+    the heap, and the heap grows by less than the number of rows at every choice.
+    """
+
+    def cost(choice: tuple[int, ...]) -> float:
+        return sum(float(row[k]) for row, k in zip(costs, choice, strict=True))
+
+    first = (0,) * len(costs)
+    heap = [(cost(first), first)] if all(map(len, costs)) else []
+    while heap:
+        _, choice = heappop(heap)
+        yield choice
+        last = max((k for k, place in enumerate(choice) if place), default=0)
+        for k in range(last, len(costs)):
+            if choice[k] + 1 < len(costs[k]):
+                later = (*choice[:k], choice[k] + 1, *choice[k + 1 :])
+                heappush(heap, (cost(later), later))
+
+
+def left_out(fronts: Sequence[ParetoFront], n_tried: int, most: int) -> str:
+    """Note on combinations that were not tried, empty if the cap left out none."""
+    n_all = prod(len(front.candidates) for front in fronts)
+    if n_tried < most or n_all <= most:
+        return ""
+    return f"; the {n_tried} most promising of {n_all} combinations were tried"
 
 
 def combination_scores(
@@ -156,21 +208,3 @@ def support_of(
     """The terms of every state in one combination."""
     pairs = zip(fronts, choice, strict=True)
     return {front.equation: front.candidates[k].terms for front, k in pairs}
-
-
-def admissible(
-    fronts: Sequence[ParetoFront],
-    places: Int[np.ndarray, "combinations fronts"],
-    relations: Sequence[Relation],
-) -> Int[np.ndarray, "_ fronts"]:
-    """Combinations that have the terms named by the relations.
-
-    Raises ValueError if there are none.
-    """
-    kept = [binding(relations, support_of(fronts, choice)) is not None for choice in places]
-    if not any(kept):
-        raise ValueError(
-            f"the relations {[r.text for r in relations]} name terms that no combination of "
-            "candidates has; raise the search's max_terms, or depth"
-        )
-    return places[np.array(kept)]

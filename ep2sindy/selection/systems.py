@@ -140,7 +140,7 @@ def budget(batch: WindowBatch) -> tuple[MultipleShooting, int]:
     The regression's coefficients are close, so whole windows are fitted at once in few iterations.
     Systems that need more are the wrong ones.
     """
-    method = MultipleShooting(first_block=batch.data.shape[1], tolerance=1e-3, max_iter=10)
+    method = MultipleShooting(first_memory=batch.data.shape[1], tolerance=1e-3, max_iter=10)
     return method, max(1, BATCH_STEPS // batch.steps.size)
 
 

@@ -255,7 +255,7 @@ def watcher(
             f"{method}/loss": iteration.loss,
             f"{method}/step": iteration.step,
             f"{method}/defect": iteration.defect,
-            f"{method}/window_stage": iteration.block,
+            f"{method}/window_stage": iteration.memory,
         }
         for (state, term), value in zip(names, iteration.scaling, strict=True):
             scalars[f"{method}/scaling/{state}/{term.replace('*', '.')}"] = float(value)

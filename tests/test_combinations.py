@@ -1,0 +1,68 @@
+"""Combinations of candidates: the most promising first, within bounded memory."""
+
+from itertools import islice, product
+
+import numpy as np
+import pytest
+
+from ep2sindy.library.relations import relations_of
+from ep2sindy.regression.front import Candidate, ParetoFront
+from ep2sindy.selection.rule import best_first, combinations, left_out
+
+
+def front(state: str, deviances: list[float]) -> ParetoFront:
+    """Front of an empty candidate, then one for each of the terms a, b, c, ..."""
+    terms = ["", *"abcdefg"]
+    one = np.ones(1)
+    return ParetoFront(
+        state,
+        [
+            Candidate(
+                state, tuple(term), one[: len(term)], 0.0, 0.0, 0.0, one[: len(term)], deviance
+            )
+            for term, deviance in zip(terms, deviances, strict=False)
+        ],
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_choices_come_by_their_summed_cost_and_none_twice(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    costs = [np.sort(rng.integers(0, 4, size=n).astype(float)) for n in (3, 1, 4, 2)]
+    every = list(product(*(range(len(row)) for row in costs)))
+    every.sort(key=lambda c: (sum(row[k] for row, k in zip(costs, c, strict=True)), c))
+    assert list(best_first(costs)) == every
+
+
+def test_the_first_of_eight_to_the_twelfth_choices_need_no_others() -> None:
+    costs = [np.arange(8.0)] * 12
+    found = list(islice(best_first(costs), 14))
+    assert found[0] == (0,) * 12
+    assert sorted(map(sum, found)) == [0] + [1] * 12 + [2]
+    fronts = [front(f"s{k}", [float(n) for n in range(8)]) for k in range(12)]
+    places = combinations(fronts, 13)
+    assert places.sum() == 12
+    note = "; the 13 most promising of 68719476736 combinations were tried"
+    assert left_out(fronts, 13, 13) == note
+
+
+def test_below_the_cap_every_combination_is_there_in_order() -> None:
+    fronts = [front("x", [3.0, 0.0]), front("y", [0.0, 1.0, 2.0])]
+    expected = [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2]]
+    assert combinations(fronts, 6).tolist() == expected
+    assert not left_out(fronts, 6, 6)
+
+
+def test_a_cap_keeps_the_best_by_deviance() -> None:
+    fronts = [front("x", [3.0, 0.0]), front("y", [5.0, 1.0, 2.0])]
+    assert combinations(fronts, 3).tolist() == [[0, 1], [1, 1], [1, 2]]
+
+
+def test_relations_hold_in_every_combination_that_a_cap_leaves() -> None:
+    fronts = [front("x", [0.0, 1.0, 2.0]), front("y", [0.0, 1.0, 2.0])]
+    tied = relations_of(["x: b == -1 * y: b"])
+    assert combinations(fronts, 2, tied).tolist() == [[0, 0], [0, 1]]
+    known = relations_of(["x: b == -1 * y: b", "y: b == 3"])
+    assert combinations(fronts, 1, known).tolist() == [[2, 2]]
+    with pytest.raises(ValueError, match="name terms that no combination of candidates has"):
+        combinations(fronts, 1, relations_of(["x: h == 1"]))
