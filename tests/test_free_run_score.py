@@ -260,12 +260,14 @@ def test_supports_are_completed_by_what_relations_ask():
     assert binding([parse_relation("x: 1 == 2")], {"x": ("x",)}) is None
 
 
-def confirmed(number, *, share, n_free=4, waveform=0.05, loss=1.0, broken=(), lives=True):
+def confirmed(
+    number, *, share, n_free=4, waveform=0.05, loss=1.0, broken=(), lives=True, repels=False
+):
     """A system as the rule has confirmed it, with these figures."""
     held = SimpleNamespace(n_free=n_free)
     verdict = ep.Verdict.LIVES if lives else ep.Verdict.DIES_OUT
     run = SimpleNamespace(verdict=verdict, model=SimpleNamespace(inputs=()))
-    return Confirmed(number, Trial(held, 0.3, waveform, loss), run, share, broken)
+    return Confirmed(number, Trial(held, 0.3, waveform, loss), run, share, broken, repels)
 
 
 @pytest.mark.parametrize(
@@ -278,6 +280,7 @@ def confirmed(number, *, share, n_free=4, waveform=0.05, loss=1.0, broken=(), li
         ([confirmed(0, share=0.0), confirmed(1, share=0.3, n_free=6)], 1),  # it attracts
         ([confirmed(0, share=1.0, broken=["x: y < 0"]), confirmed(1, share=0.1)], 1),
         ([confirmed(0, share=0.0, lives=False), confirmed(1, share=0.0)], 1),
+        ([confirmed(0, share=0.0, repels=True), confirmed(1, share=0.0, n_free=6)], 1),
     ],
 )
 def test_what_attracts_most_starts_is_preferred(others, best):

@@ -72,6 +72,9 @@ DEARER = 1
 # Largest ratio of the waveform errors of two systems that count as equals.
 ALIKE = 1.5
 
+# Smallest modulus of a repelling cycle's multipliers; a neutral cycle's is one but for errors.
+PUSH = 1.003
+
 # Fewest periods of a record, so that its folds leave windows of two periods: six, less a margin
 # for noise.
 MIN_PERIODS = 5.5
@@ -106,7 +109,7 @@ class Confirmed:
 
     number: among the systems. share: of starts around the cycle that reach it; zero if the model
     does not live, or if departures from its cycle do not die out. broken: demands that the
-    coefficients do not meet.
+    coefficients do not meet. repels: True if departures grow.
     """
 
     number: int
@@ -114,6 +117,7 @@ class Confirmed:
     run: FreeRun
     share: float
     broken: Sequence[str]
+    repels: bool = False
 
     @property
     def is_global(self) -> bool:
@@ -130,13 +134,14 @@ class Confirmed:
         is_close = ours.waveform <= ALIKE * theirs.waveform
         return ours.loss < GAIN * theirs.loss or (is_equal and is_close)
 
-    def rank(self) -> tuple[bool, int, bool, bool, int, float]:
+    def rank(self) -> tuple[bool, int, bool, bool, bool, int, float]:
         """Sorts the best first; the first of equals wins."""
         verdict = list(Verdict).index(self.run.verdict)
         size = self.trial.system.n_free
         return (
             bool(self.broken),
             verdict,
+            self.repels,
             not self.share,
             not self.is_global,
             size,
@@ -147,7 +152,7 @@ class Confirmed:
         """How the system was confirmed, in words."""
         how = str(self.run.verdict)
         if self.run.verdict is Verdict.LIVES and not self.share:
-            how = f"{how}, on a cycle that does not attract"
+            how = f"{how}, on a cycle that {'repels' if self.repels else 'does not attract'}"
         elif self.share and not self.run.model.inputs:
             how = f"{how}, {100.0 * self.share:.0f} % of starts reach it"
         found = f"{how}; {n_living or 'none'} of {n_systems} systems live where not fitted"
@@ -372,7 +377,8 @@ class FreeRunScore:
                 seed=self.seed,
             )
             own = self._confirm(k, trials[k], model, records, cycles)
-            resting = [e for e in found if e.run.verdict is Verdict.LIVES and not e.share]
+            living_on = [each for each in found if each.run.verdict is Verdict.LIVES]
+            resting = [each for each in living_on if not each.share and not each.repels]
             if own.share and resting and not own.outdoes(resting[0]):
                 own = replace(own, share=0.0)  # it attracts by chance
             found.append(own)
@@ -397,22 +403,27 @@ class FreeRunScore:
         longest, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
         run = free_run(model, longest, initial=start, bounds=self.bounds, judged=self.judged)
-        share = _share_reaching(run, cycles) if run.verdict is Verdict.LIVES else 0.0
-        return Confirmed(number, trial, run, share, trial.system.broken(model))
+        share, repels = _attraction(run, cycles) if run.verdict is Verdict.LIVES else (0.0, False)
+        return Confirmed(number, trial, run, share, trial.system.broken(model), repels)
 
 
-def _share_reaching(run: FreeRun, cycles: Sequence[Cycle]) -> float:
-    """Share of starts that reach the model's cycle; zero if departures from it do not die out.
+def _attraction(run: FreeRun, cycles: Sequence[Cycle]) -> tuple[float, bool]:
+    """Share of starts that reach the model's cycle, and whether departures from it grow.
 
-    A model with inputs is followed from its start alone: one.
+    The share is zero if departures do not die out. A model with inputs is followed from its start
+    alone: its share is one.
     """
     if run.model.inputs:
-        return 1.0
+        return 1.0, False
     period_s = 1.0 / cycles[0].frequency_Hz
     cycle = limit_cycle(run.model, run.rollout.states[-1], period_s=period_s)
-    if cycle is None or (np.abs(cycle.multipliers[1:]) > PULL).any():
-        return 0.0
-    return max(share_reaching(run.model, cycle, n_starts=N_REACHING), 0.5 / N_REACHING)
+    if cycle is None:
+        return 0.0, False
+    largest = float(np.abs(cycle.multipliers[1:]).max(initial=0.0))
+    if largest > PULL:
+        return 0.0, largest > PUSH
+    share = share_reaching(run.model, cycle, n_starts=N_REACHING)
+    return max(share, 0.5 / N_REACHING), False
 
 
 def cycles_of(records: Records, states: Sequence[str]) -> list[Cycle] | str:
