@@ -132,3 +132,15 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     figure = beside.figures("simple")["balance_simple"].draw()
     drawn = [ax for ax in figure.axes if ax.get_visible()]
     assert len(drawn) == len([each for each in beside.processes if each.recorded is not None])
+
+
+def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.Dataset) -> None:
+    library = ep.polynomial(STATES, degree=1, functions=["sqrt(n_i)"])
+    coef = np.zeros((len(library), 2))
+    coef[library.index("n_i"), 0] = coef[library.index("n_n"), 1] = -1e5
+    coef[library.index("sqrt(n_i)"), 0] = 1e14
+    model = ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
+    parts = split_in_time(data, 0.25)
+    beside = model_balance(model, None, data, *parts, exact, ep.FreeRunBounds(), period_s=None)
+    assert not beside.processes
+    assert {each.process for each in beside.terms} == {""}

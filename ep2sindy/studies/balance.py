@@ -231,7 +231,7 @@ ROLES: Metrics[TermRole] = [
 class ModelBalance:
     """A living model beside the balance of its zone.
 
-    processes: none if the model is not one of n_i and n_n. terms: each left out in turn.
+    processes: none if the model is not of products of n_i and n_n. terms: each left out in turn.
     """
 
     processes: Sequence[ComparedProcess]
@@ -302,7 +302,7 @@ def model_balance(
     support = {state: list(model.terms(state)) for state in model.states}
     held_to = held_to or constraint(model.library, support)
     ours = balance is not None and set(model.states) == set(model.library.variables)
-    ours = ours and set(model.states) == {IONS, NEUTRALS}
+    ours = ours and set(model.states) == {IONS, NEUTRALS} and not model.library.functions
     known = _recorded(balance, data) if ours and balance is not None else {}
     processes = compared_processes(model, data, balance) if ours and balance is not None else []
     window, left_out = two_periods(train), {}
