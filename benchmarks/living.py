@@ -27,7 +27,6 @@ from ep2sindy.studies.balance import compared_processes, inflow_of
 from ep2sindy.studies.living import cycle_of, start_of
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
-BREATHING = "300V_5mgs"
 CHANNEL, DOWNSTREAM = "channel", "downstream"
 ZONES = (CHANNEL, DOWNSTREAM, (0.0, 0.010), (0.005, 0.015), (0.010, 0.020), (0.020, 0.030))
 SPLITS = {"last": (0.0, 0.75), "first": (0.25, 1.0), "second half": (0.0, 0.5)}  # what is fitted

@@ -125,9 +125,9 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     assert roles["n_n", "n_i*n_n"].alone == pytest.approx(-mean)
     assert roles["n_i", "n_i*n_n"].process == "ionization"
     without = roles["n_n", "n_n"].without
-    if without is not None:
-        assert list(without.model.terms("n_n")) == ["1", "n_i*n_n"]
-        assert without.model.terms("n_n")["1"] == 2.3e23
+    assert without is not None
+    assert list(without.model.terms("n_n")) == ["1", "n_i*n_n"]
+    assert without.model.terms("n_n")["1"] == 2.3e23
     assert set(beside.tables("simple")) == {"terms_simple", "balance_simple"}
     figure = beside.figures("simple")["balance_simple"].draw()
     drawn = [ax for ax in figure.axes if ax.get_visible()]

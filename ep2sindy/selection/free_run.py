@@ -35,8 +35,6 @@ from ep2sindy.selection.rule import (
     MAX_ERROR,
     Decision,
     combination_scores,
-    combinations,
-    left_out,
 )
 from ep2sindy.selection.systems import (
     Fold,
@@ -45,10 +43,10 @@ from ep2sindy.selection.systems import (
     Systems,
     TrialSystem,
     budget,
+    combined,
     demands_note,
     folds_of,
     records_of,
-    systems_of,
 )
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import samples_in_periods, steps_in
@@ -236,11 +234,8 @@ class FreeRunScore:
         Raises ValueError for no runs, a state without a front, or relations that no combination
         has the terms for.
         """
-        places = combinations(fronts, self.max_combinations, relations)
-        systems = systems_of(fronts, places, library, runs, relations)
-        decision = self.judge(Systems(fronts, places, systems), runs, progress=progress)
-        rest = left_out(fronts, len(places), self.max_combinations)
-        return replace(decision, note=f"{decision.note}{rest}")
+        found = combined(fronts, library, runs, relations, most=self.max_combinations)
+        return self.judge(found, runs, progress=progress)
 
     def judge(
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
@@ -252,13 +247,15 @@ class FreeRunScore:
         if isinstance(cycles, str):
             rule = RefinedScore(max_combinations=self.max_combinations)
             decision = rule.judge(found, runs, progress=progress)
-            return replace(decision, note=f"{cycles}: chosen by windows held out instead")
+            return replace(
+                decision, note=f"{cycles}: chosen by windows held out instead{found.left_out}"
+            )
         trials = self._trials(records, cycles, systems, progress)
         errors = np.array([trial.error for trial in trials])
         winner, model, note = self._winner(records, cycles, trials, progress)
         limit = max(1.0, float(errors[winner]))
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
-        return Decision(scores, model, note, systems[winner].constraint)
+        return Decision(scores, model, f"{note}{found.left_out}", systems[winner].constraint)
 
     def _window(self, records: Records, cycles: Sequence[Cycle]) -> int:
         """Number of samples in a window."""

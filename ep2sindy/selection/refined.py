@@ -25,7 +25,6 @@ from ep2sindy.selection.rule import (
     Decision,
     combination_scores,
     combinations,
-    left_out,
     smallest,
 )
 from ep2sindy.selection.systems import (
@@ -33,6 +32,7 @@ from ep2sindy.selection.systems import (
     Systems,
     TrialSystem,
     budget,
+    combined,
     demands_note,
     records_of,
     systems_of,
@@ -114,11 +114,8 @@ class RefinedScore:
 
         Also raises ValueError for relations that no combination has the terms for.
         """
-        places = combinations(fronts, self.max_combinations, relations)
-        systems = systems_of(fronts, places, library, runs, relations)
-        decision = self.judge(Systems(fronts, places, systems), runs, progress=progress)
-        rest = left_out(fronts, len(places), self.max_combinations)
-        return replace(decision, note=f"{decision.note}{rest}")
+        found = combined(fronts, library, runs, relations, most=self.max_combinations)
+        return self.judge(found, runs, progress=progress)
 
     def judge(
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
@@ -139,7 +136,7 @@ class RefinedScore:
                 break
             errors[winner] = np.inf
         scores = combination_scores(fronts, places, errors, limit=limit, winner=winner)
-        note = demands_note(self.label, broken)
+        note = demands_note(self.label, broken) + found.left_out
         return Decision(scores, model, note, systems[winner].constraint)
 
     def _judge(

@@ -16,7 +16,7 @@ from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import ParetoFront
-from ep2sindy.selection.rule import support_of
+from ep2sindy.selection.rule import combinations, left_out, support_of
 from ep2sindy.signals.kalman import KalmanSmoother
 
 # Most time steps, over windows and systems, of one refinement batch: more would not fit the cache.
@@ -41,10 +41,6 @@ class TrialSystem:
     model: SparseModel
     constraint: Constraint
     demands: Sequence[Demand] = ()
-
-    @property
-    def n_terms(self) -> int:
-        return int(np.count_nonzero(self.model.coef))
 
     @property
     def n_free(self) -> int:
@@ -90,12 +86,31 @@ class TrialSystem:
 class Systems:
     """Systems to be judged, and for each the candidates of the fronts that its equations are.
 
-    places: index of the candidate in every front.
+    places: index of the candidate in every front. left_out: how many of how many combinations these
+    are, as the end of a note; empty if they are all.
     """
 
     fronts: Sequence[ParetoFront]
     places: Int[np.ndarray, "systems fronts"]
     systems: Sequence[TrialSystem]
+    left_out: str = ""
+
+
+def combined(
+    fronts: Sequence[ParetoFront],
+    library: Library,
+    runs: Sequence[Trajectory],
+    relations: Sequence[Relation],
+    *,
+    most: int,
+) -> Systems:
+    """The combinations of candidates as systems, the most promising if there are more than `most`.
+
+    Raises ValueError for relations that no combination has the terms for.
+    """
+    places = combinations(fronts, most, relations)
+    systems = systems_of(fronts, places, library, runs, relations)
+    return Systems(fronts, places, systems, left_out(fronts, len(places), most))
 
 
 def demands_note(note: str, broken: Sequence[str]) -> str:
