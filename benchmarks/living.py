@@ -2,7 +2,8 @@
 
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
 finds them: over operating points, splits of the record and seeds, on the default source and on the
-former one; beside free terms, in other zones, in noise, and from the (z, r) simulator. Every model
+former one; beside free terms, in other zones, in several at once (`several`, `three`), in noise,
+and from the (z, r) simulator. Every model
 called living is run again by another solver, ten times as long; its processes are compared with the
 balance of the zone. Prints the tables of docs/living.md; name some to print those alone.
 """
@@ -14,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as field_of
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -23,7 +25,14 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
-from ep2sindy.studies.balance import compared_processes, inflow_of
+from ep2sindy.data.sampling import ZoneAverage, side_by_side
+from ep2sindy.library.relations import Constraint
+from ep2sindy.studies.balance import (
+    ComparedProcess,
+    compared_processes,
+    inflows_of,
+    zone_processes,
+)
 from ep2sindy.studies.living import cycle_of, start_of
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
@@ -51,10 +60,21 @@ SETS = {"default": ep.thruster.Thruster(), "former": FORMER}
 
 @dataclass(frozen=True)
 class Record:
-    """Averages over a zone, and the balance of that zone."""
+    """Averages over zones, the balance of each, and their lengths if there are several.
+
+    balances: by zone; a single one is called "".
+    """
 
     run: ep.Trajectory
-    balance: xr.Dataset
+    balances: dict[str, xr.Dataset]
+    sizes: dict[str, float] = field_of(default_factory=dict)
+
+    def processes(self, model: ep.SparseModel, held: Constraint | None) -> list[ComparedProcess]:
+        """What zones exchange, in the record and by a model."""
+        if self.sizes:
+            assert held is not None
+            return zone_processes(model, held, self.run, self.balances, self.sizes)
+        return compared_processes(model, self.run, self.balances[""])
 
 
 @dataclass(frozen=True)
@@ -103,25 +123,55 @@ def record(label: str, z: str | tuple[float, float] = CHANNEL, name: str = "defa
     """Zone averages of a simulation."""
     zone = ep.Zone(z=z)
     run = ep.zone_average(field(label, name), zone, states=STATES, label=label)
-    return Record(run, ep.thruster.zone_balance(field(label, name), zone))
+    return Record(run, {"": ep.thruster.zone_balance(field(label, name), zone)})
 
 
-def conserving(
-    fitted: ep.Trajectory, balance: xr.Dataset, *, seed: int, weak: bool
-) -> ep.Discovery:
+@cache
+def zones_record(label: str, n_zones: int) -> Record:
+    """Averages over zones of equal length that make up the channel."""
+    run = field(label)
+    edges = np.linspace(0.0, ep.thruster.Thruster().channel_length, n_zones + 1)
+    zones = {f"z{k + 1}": tuple(edges[k : k + 2]) for k in range(n_zones)}
+    settings = ZoneAverage(STATES, zones=zones)
+    parts = side_by_side(zones, run)
+    return Record(
+        settings.trajectory(run, inputs=[], label=label),
+        {name: ep.thruster.zone_balance(run, zone) for name, zone in parts.items()},
+        settings.sizes(run),
+    )
+
+
+def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -> ep.Discovery:
     """Under the roles of `+exp=breathing`: up to six free coefficients of degree 3."""
-    roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow=inflow_of(balance))
+    roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow=inflows_of(whole.balances))
     method = ep.Regression(
         ep.WeightedWeak() if weak else ep.Differential(),
         ep.BestSubset(max_terms=6, n_best=200),
-        ep.FreeRunScore(seed=seed),
+        ep.FreeRunScore(seed=seed, window_periods=4.0, n_confirmed=16),
         depth=16,
     )
     library = ep.polynomial(STATES, degree=3)
     return ep.discover([fitted], library, method, roles=roles, seed=seed)
 
 
-def free(fitted: ep.Trajectory, balance: xr.Dataset, *, seed: int, weak: bool) -> ep.Discovery:
+def by_neighbourhood(
+    fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool
+) -> ep.Discovery:
+    """Several zones under the roles of `+exp=zones`: up to 14 free coefficients, 20 for three."""
+    two = len(whole.sizes) == 2
+    roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known"})
+    roles = roles.in_zones(whole.sizes).with_known(inflows_of(whole.balances))
+    method = ep.Regression(
+        ep.WeightedWeak() if weak else ep.Differential(),
+        ep.BestSubset(max_terms=14 if two else 20, n_best=200 if two else 1000),
+        ep.FreeRunScore(seed=seed, window_periods=8.0),
+        depth=6 if two else 4,
+    )
+    library = ep.polynomial(fitted.state_names, degree=3)
+    return ep.discover([fitted], library, method, roles=roles, seed=seed)
+
+
+def free(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -> ep.Discovery:
     """Every term free in its own equation, degree 2, up to 4 + 4 terms."""
     method = ep.Regression(
         ep.WeightedWeak() if weak else ep.Differential(),
@@ -146,18 +196,17 @@ def case(
 ) -> Case:
     """Select on one record, run freely over another from its first sample."""
     begun = time.process_time()
-    found = search(fitted, whole.balance, seed=seed, weak=weak)
+    found = search(fitted, whole, seed=seed, weak=weak)
     cpu_s, model = time.process_time() - begun, found.model
     run = ep.free_run(model, judged, initial=start_of(judged, model))
     multiplier = share = float("nan")
     if run.verdict is ep.Verdict.LIVES and (cycle := cycle_of(run)) is not None:
-        multiplier = float(np.abs(cycle.multipliers[1]))
+        multiplier = float(np.abs(cycle.multipliers[1:]).max())
         share = ep.share_reaching(model, cycle)
     confirmed = run.verdict is not ep.Verdict.LIVES or lives_on(model, judged)
     held = found.constraint
     n_free = int(np.count_nonzero(model.coef)) if held is None else len(held.free)
-    compared = compared_processes(model, whole.run, whole.balance)
-    processes = {each.name: (each.ratio, each.r2) for each in compared}
+    processes = {p.name: (p.ratio, p.r2) for p in whole.processes(model, held)}
     return Case(run, n_free, multiplier, share, cpu_s, confirmed, processes)
 
 
@@ -240,6 +289,21 @@ def print_points(name: str = "default", search: Callable = conserving) -> None:
     print(line("all", everything))
 
 
+def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
+    """Six operating points, the channel cut into zones of equal length."""
+    print(f"\n{n_zones} zones, equations that conserve: median / worst of {len(draws)} draws")
+    everything = []
+    for label in POINTS:
+        whole = zones_record(label, n_zones)
+        cases = [
+            case(*parts(whole.run, s), whole, seed=seed, search=by_neighbourhood)
+            for s, seed in draws
+        ]
+        everything += cases
+        print("\n".join([line(label, cases), balances(cases), structures(cases)]), flush=True)
+    print(line("all", everything))
+
+
 def print_zones() -> None:
     """Six operating points, other zones: free terms, since no inflow is known."""
     print(f"\nsix points, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
@@ -294,7 +358,7 @@ def print_plane() -> None:
     zone = ep.Zone(z=CHANNEL)
     whole = Record(
         ep.zone_average(run, zone, states=STATES, label="plane"),
-        ep.thruster.zone_balance(run, zone),
+        {"": ep.thruster.zone_balance(run, zone)},
     )
     for split in SPLITS:
         cases = [case(*parts(whole.run, split), whole, seed=seed) for seed in range(N_SEEDS)]
@@ -308,6 +372,8 @@ def main() -> None:
         "former": lambda: print_points("former"),
         "free": lambda: print_points(search=free),
         "zones": print_zones,
+        "several": lambda: print_several(2, [(split, 0) for split in SPLITS]),
+        "three": lambda: print_several(3, [("last", 0)]),
         "noise": print_noise,
         "plane": print_plane,
     }

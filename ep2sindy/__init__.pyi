@@ -8,7 +8,8 @@ from ep2sindy.data.inspection import inspect_file as inspect_file
 from ep2sindy.data.open import read_field as read_field  # for configs
 from ep2sindy.data.open import write_field as write_field
 from ep2sindy.data.zones import zone_average as zone_average
-from ep2sindy.data.zones import point_samples as point_samples
+from ep2sindy.data.sampling import zone_averages as zone_averages
+from ep2sindy.data.sampling import point_samples as point_samples
 from ep2sindy.data.zones import Zone as Zone  # for configs
 from ep2sindy.data.mapping import Variable as Variable  # for configs
 from ep2sindy.library.units import Clock as Clock

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.studies.balance import compared_processes, inflow_of, model_balance
+from ep2sindy.studies.balance import compared_processes, inflows_of, model_balance
 from ep2sindy.studies.fits import split_in_time
 
 STATES = ["n_i", "n_n"]
@@ -42,7 +42,7 @@ def test_the_supply_is_the_mass_flow(field: xr.Dataset, exact: xr.Dataset) -> No
     assert field.attrs["neutral_inflow"] == pytest.approx(particles)
     length_m = float(field["dz"].values[field["z"].values <= 0.025].sum())
     assert exact["supply"].values == pytest.approx(particles / length_m, rel=1e-5)
-    assert inflow_of(exact) == {"n_n": pytest.approx(particles / length_m, rel=1e-5)}
+    assert inflows_of({"": exact}) == {"n_n": pytest.approx(particles / length_m, rel=1e-5)}
 
 
 def test_a_field_without_averages_gives_nearly_the_same(field: xr.Dataset, exact: xr.Dataset):
@@ -63,7 +63,7 @@ def test_a_file_gives_what_it_can(field: xr.Dataset) -> None:
     assert set(ep.thruster.zone_balance(flat, ep.Zone())) == {"change_i", "change_n"}
     downstream = ep.thruster.zone_balance(field, ep.Zone(z="downstream"))
     assert "supply" not in downstream  # what enters through an inner face is not known beforehand
-    assert inflow_of(downstream) == {}
+    assert inflows_of({"": downstream}) == {}
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,9 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     held_to = ep.constraint(library, support, tie)
     model = model_of({"n_i": -5e5, "n_i*n_n": 5e-14}, {"1": 2.3e23, "n_n": -3e3, "n_i*n_n": -5e-14})
     parts = split_in_time(data, 0.25)
-    beside = model_balance(model, held_to, data, *parts, exact, ep.FreeRunBounds(), period_s=5e-5)
+    beside = model_balance(
+        model, held_to, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=5e-5
+    )
     roles = {(each.state, each.term): each for each in beside.terms}
     assert roles["n_n", "1"].without is None  # known: it is not left out
     assert roles["n_n", "1"].alone == pytest.approx(float(exact["supply"].mean()))
@@ -141,6 +143,8 @@ def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.
     coef[library.index("sqrt(n_i)"), 0] = 1e14
     model = ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
     parts = split_in_time(data, 0.25)
-    beside = model_balance(model, None, data, *parts, exact, ep.FreeRunBounds(), period_s=None)
+    beside = model_balance(
+        model, None, data, *parts, {"": exact}, ep.FreeRunBounds(), period_s=None
+    )
     assert not beside.processes
     assert {each.process for each in beside.terms} == {""}

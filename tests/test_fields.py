@@ -7,8 +7,9 @@ import xarray as xr
 from ep2sindy.data import zones
 from ep2sindy.data.fields import check_field, mask_outside
 from ep2sindy.data.open import read_field, write_field
+from ep2sindy.data.sampling import GridPoint, point_samples
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.data.zones import GridPoint, Zone, point_samples, zone_average
+from ep2sindy.data.zones import Zone, zone_average
 from ep2sindy.studies.source import Sampling
 
 T = np.linspace(0.0, 1e-4, 11)

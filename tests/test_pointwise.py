@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from ep2sindy.data.zones import point_samples
+from ep2sindy.data.sampling import point_samples
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import STATUSES, Kept, PointSearch, blocks_of, pointwise

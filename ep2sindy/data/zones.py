@@ -1,4 +1,4 @@
-"""Trajectories from fields: zones of a grid, averages over zones, and single grid points."""
+"""Zones of a grid, and trajectories of averages over one of them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -14,7 +13,6 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.fields import (
     SPACE,
-    cell_edges,
     cell_sizes,
     channel_length_m,
     check_field,
@@ -83,92 +81,6 @@ def zone_average(
         label=label,
         clock=clock_of(field),
     )
-
-
-@dataclass(frozen=True)
-class ZoneAverage:
-    """Settings of `zone_average` without the field, for use in a config."""
-
-    states: Sequence[str]
-    zone: Zone | None = None
-    products: Sequence[str] = ()
-    axisymmetric: bool = True
-
-    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
-        return zone_average(
-            field,
-            self.zone,
-            states=self.states,
-            inputs=inputs,
-            products=self.products,
-            axisymmetric=self.axisymmetric,
-            label=label,
-        )
-
-    def place(self, field: xr.Dataset) -> str:
-        """Description of the part of the field's grid that is averaged over."""
-        words = describe_zone(self.zone, field)
-        return f"average over {words}" if words else ""
-
-
-@dataclass(frozen=True)
-class GridPoint:
-    """Settings of `point_samples` without the field, for use in a config; it has no products."""
-
-    states: Sequence[str]
-    z: float | None = None
-    r: float | None = None
-    products: ClassVar[tuple[str, ...]] = ()
-
-    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
-        return point_samples(
-            field, z=self.z, r=self.r, states=self.states, inputs=inputs, label=label
-        )
-
-    def place(self, field: xr.Dataset) -> str:
-        """Description of the grid point that is used."""
-        places = _nearest(field, z=self.z, r=self.r)
-        texts = [f"{a} = {1e3 * grid_points(field, a)[k]:.4g} mm" for a, (k,) in places.items()]
-        return f"the grid point at {', '.join(texts)}" if texts else ""
-
-
-def point_samples(
-    field: xr.Dataset,
-    *,
-    z: float | None = None,
-    r: float | None = None,
-    states: Sequence[str],
-    inputs: Sequence[str] = (),
-    label: str = "",
-) -> Trajectory:
-    """Samples at the grid point nearest to (z, r).
-
-    z, r: place in m; one is needed for each axis that the field has.
-
-    Raises ValueError for a place outside the grid's cells or without plasma.
-    """
-    check_field(field)
-    nearest = _nearest(field, z=z, r=r)
-    return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
-
-
-def _nearest(field: xr.Dataset, *, z: float | None, r: float | None) -> dict[str, list[int]]:
-    """Index of the grid point nearest to a place, for each axis."""
-    places = {axis: value for axis, value in (("z", z), ("r", r)) if value is not None}
-    axes = [axis for axis in SPACE if axis in field.dims]
-    if sorted(places) != sorted(axes):
-        raise ValueError(f"a point needs one place per axis {axes} of its field: {places} came")
-    nearest = {}
-    for axis, place in places.items():
-        points = grid_points(field, axis)
-        ends = cell_edges(points)[[0, -1]] if len(points) > 1 else points[[0, 0]]
-        if not ends[0] <= place <= ends[1]:
-            raise ValueError(
-                f"a point must lie on the grid: {axis} = {place:g} m came, the grid's cells reach "
-                f"from {ends[0]:g} to {ends[1]:g} m"
-            )
-        nearest[axis] = [int(np.argmin(np.abs(points - place)))]
-    return nearest
 
 
 Factors = list[tuple[str, int]]

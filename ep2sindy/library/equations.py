@@ -21,11 +21,14 @@ def latex_name(variable: str) -> str:
     """LaTeX of a variable: `n_i` -> `n_{i}`, `T_e_eV` -> `T_{e,eV}`.
 
     An average `<n_i*n_n>` stands in angle brackets. Words are set upright: in italics they would
-    read as products of their letters.
+    read as products of their letters. A zone is an index: `n_i@exit` -> `n_{i,exit}`.
     """
+    variable, _, zone = variable.partition("@")
     if variable.startswith("<"):
-        return rf"\langle {latex_term_name(variable[1:-1])} \rangle"
+        place = f"_{{{zone}}}" if zone else ""
+        return rf"\langle {latex_term_name(variable[1:-1])} \rangle{place}"
     stem, _, index = re.sub(r"([#$%&{}])", r"\\\1", re.sub(r"[\\^~]", " ", variable)).partition("_")
+    index = "_".join(filter(None, (index, zone)))
     if _is_greek(stem):
         stem = rf"\{stem}"
     elif len(stem) > 1:
@@ -218,10 +221,13 @@ def _part_html(part: Part) -> str:
 
 
 def _variable_html(variable: str) -> str:
+    variable, _, zone = variable.partition("@")
     if variable.startswith("<") and variable.endswith(">"):
-        return f"&lang;{_term_html(variable[1:-1])}&rang;"
+        place = f"<sub>{html.escape(zone)}</sub>" if zone else ""
+        return f"&lang;{_term_html(variable[1:-1])}&rang;{place}"
     stem, _, index = variable.partition("_")
     stem = f"&{stem};" if _is_greek(stem) else html.escape(stem)
+    index = ",".join(filter(None, (index, zone)))
     return f"<i>{stem}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 # The grammar of terms, as patterns without capturing groups. Possessive quantifiers (`++`, `*+`)
 # prevent backtracking, since a term from someone else may be very long.
-VARIABLE = r"(?:<[^<>]+>|[^\W\d]\w*+)"  # a word, or the average of a product in < >
+# A word, or the average of a product in < >; of one zone among several as n_i@exit.
+VARIABLE = r"(?:(?:<[^<>]+>|[^\W\d]\w*+)(?:@\w++)?)"
 
 NUMBER = r"(?:\d++\.?\d*+|\.\d++)(?:[eE][+-]?\d++)?"
 
@@ -59,8 +60,13 @@ def check_variable(name: str) -> None:
 
 
 def check_state(name: str) -> None:
-    """Raise ValueError unless a name is a valid variable or an average such as `<n_i*n_n>`."""
-    if not (isinstance(name, str) and re.fullmatch(rf"<{_AVERAGED}(?:\*{_AVERAGED})*>", name)):
+    """Raise ValueError unless a name is a valid variable or an average such as `<n_i*n_n>`.
+
+    The name of a zone may follow: `n_i@exit`, see `zone_averages`.
+    """
+    averaged = rf"<{_AVERAGED}(?:\*{_AVERAGED})*>"
+    name = re.sub(r"(?<=.)@\w{1,100}$", "", name) if isinstance(name, str) else name
+    if not (isinstance(name, str) and re.fullmatch(averaged, name)):
         check_variable(name)
 
 

@@ -28,6 +28,8 @@ _ADDEND = re.compile(
     rf"(?P<state>{VARIABLE})\s*+:\s*+(?P<term>{_TERM})|(?P<number>[+-]?{_NUMBER}))\s*+"
 )
 
+Place = tuple[str, str]  # (state, term)
+
 _EXAMPLE = "write it like 'n_i: n_i*n_n == -1 * n_n: n_i*n_n'"
 
 
@@ -123,13 +125,28 @@ def relations_from_matrix(
     return support, tuple(map(parse_relation, texts))
 
 
+@dataclass(frozen=True)
+class Process:
+    """One term in one role: its coefficient enters the equations with these factors.
+
+    factors: (state, term) -> what a coefficient of one adds to the equation. one_sign: True if its
+    coefficient must be positive.
+    """
+
+    role: str
+    term: str
+    factors: Mapping[Place, float]
+    one_sign: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Constraint:
     """Parametrisation of all coefficients that obey the relations: coef = C z + d, in SI.
 
     coefficients: (state, term) of each, equation by equation, in the order of the library.
     free: (free,), indices of the coefficients that z holds: C[free] is the identity, d[free] zero.
-    states: one per equation, including equations without terms.
+    states: one per equation, including equations without terms. processes: those that the free
+    coefficients determine, as many, if it comes from a search under `Roles`; else empty.
     """
 
     states: tuple[str, ...]
@@ -137,6 +154,7 @@ class Constraint:
     C: Float[np.ndarray, "coefs free"]
     d: Float[np.ndarray, " coefs"]
     free: Int[np.ndarray, " free"]
+    processes: Sequence[Process] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "C", read_only(self.C))

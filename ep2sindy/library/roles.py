@@ -8,34 +8,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import VARIABLE
-from ep2sindy.library.relations import Constraint
+from ep2sindy.library.relations import Constraint, Place, Process
 from ep2sindy.runtime.values import check_list
 
 KNOWN, FREE, EITHER = "known", "free", "known or free"
 _SIGN = re.compile(rf"\s*(?P<state>{VARIABLE})\s*:\s*(?P<term>\S.*?)\s*(?P<side>[<>])\s*0\s*")
-
-Place = tuple[str, str]  # (state, term)
-
-
-@dataclass(frozen=True)
-class Process:
-    """One term in one role: its coefficient enters the equations with these factors.
-
-    factors: (state, term) -> 1 or -1. one_sign: True if its coefficient must be positive.
-    """
-
-    role: str
-    term: str
-    factors: Mapping[Place, float]
-    one_sign: bool = False
 
 
 @dataclass(frozen=True)
@@ -44,13 +31,18 @@ class Roles:
 
     Every role is played by a term or more.
     exchange: pairs (from, to); a term in this role leaves the first equation and enters the second
-    with the same coefficient, which may be negative. outflow: states that lose something to the
-    outside, by terms of their own powers, each of which takes away; or state -> the terms that may.
+    with the same coefficient, which may be negative. Any term may, or those of a third entry:
+    (from, to, terms). outflow: states that lose something to the outside, by terms of their own
+    powers, each of which takes away; or state -> the terms that may, of either sign.
     inflow: state -> the constant that it is supplied with, in SI per second; "free" if it is to be
     found. An experiment also takes "known", the inflow that the record itself gives, and "known or
     free". signs: demanded of coefficients, such as "n_i: n_i < 0". A state without a role has an
-    equation of free terms.
-    Raises ValueError for an exchange of a state with itself, or a sign that cannot be read.
+    equation of free terms. sizes: state -> length or volume that it is an average over; what leaves
+    a small place changes a large one by less. Absent ones are one. forward: True if in the mean
+    over the records every exchange moves more from the first state to the second than back, and
+    every outflow takes away.
+    Raises ValueError for an exchange of a state with itself, a size that is not positive, or a sign
+    that cannot be read.
 
     >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"])
     >>> library = ep.polynomial(["prey", "predator"], degree=2)
@@ -58,17 +50,26 @@ class Roles:
     ['predator', 'predator^2']
     """
 
-    exchange: Sequence[Sequence[str]] = ()
+    exchange: Sequence[Sequence[Any]] = ()
     outflow: Sequence[str] | Mapping[str, Sequence[str]] = ()
     inflow: Mapping[str, float | str] = field(default_factory=dict)
     signs: Sequence[str] = ()
+    sizes: Mapping[str, float] = field(default_factory=dict)
+    forward: bool = False
 
     def __post_init__(self) -> None:
         check_list("exchange", self.exchange)
         check_list("signs", self.signs)
-        for pair in self.exchange:
-            if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1]:
-                raise ValueError(f"an exchange joins two states, (from, to): {pair!r} came")
+        for entry in self.exchange:
+            if isinstance(entry, str) or len(entry) not in (2, 3) or entry[0] == entry[1]:
+                raise ValueError(
+                    "an exchange joins two states, (from, to), by any term or those of a list, "
+                    f"(from, to, terms): {entry!r} came"
+                )
+            check_list("the terms of an exchange", entry[2] if len(entry) == 3 else ())
+        for state, size in self.sizes.items():
+            if isinstance(size, str | bool) or not 0.0 < size < np.inf:
+                raise ValueError(f"sizes must be positive numbers: {state} has {size!r}")
         if not isinstance(self.outflow, Mapping):
             check_list("outflow", self.outflow)
         for state, value in self.inflow.items():
@@ -85,9 +86,9 @@ class Roles:
     @property
     def states(self) -> tuple[str, ...]:
         """Every state that has a role, once."""
-        named = [state for pair in self.exchange for state in pair]
+        named = [state for entry in self.exchange for state in entry[:2]]
         signed = [parse_sign(text)[0][0] for text in self.signs]
-        return tuple(dict.fromkeys([*named, *self.outflow, *self.inflow, *signed]))
+        return tuple(dict.fromkeys([*named, *self.outflow, *self.inflow, *signed, *self.sizes]))
 
     @property
     def signed(self) -> dict[Place, int]:
@@ -114,7 +115,50 @@ class Roles:
                 )
         own = {s: known[s] if value == KNOWN else value for s, value in self.inflow.items()}
         own |= {s: known.get(s, FREE) for s, value in self.inflow.items() if value == EITHER}
-        return Roles(self.exchange, self.outflow, own, self.signs)
+        return replace(self, inflow=own)
+
+    def in_zones(self, sizes: Mapping[str, float]) -> Roles:
+        """These roles in adjoining zones of one place, in the order in which the states move on.
+
+        sizes: zone -> its length or volume. States become those of `zone_averages`, `n_i@exit`.
+        What states exchange in a zone, they exchange by their product, alone or times one more
+        density of the zone or of the giver in a neighbouring zone. Every state with a role moves
+        from each zone to the next by terms that it is a factor of, alone or times one other density
+        of its zone or its own in the next one. It enters the first zone and leaves the last.
+        In the mean all of them go forward. A number as inflow is that of all zones together, as if
+        they were one.
+        Raises ValueError for demanded signs, or terms, which are of one zone's equations.
+        """
+        if self.signs or isinstance(self.outflow, Mapping) or any(e[2:] for e in self.exchange):
+            raise ValueError(
+                "roles in several zones take terms by neighbourhood: give exchanges as (from, to), "
+                f"outflow as a list of states, and no signs; {self} came"
+            )
+        zones, states = list(sizes), self.states
+        exchange = [
+            (*pair, _exchanged(*pair, near=[f"{giver}@{z}" for z in _beside(zones, k)]))
+            for k, zone in enumerate(zones)
+            for giver, taker in self.exchange
+            for pair in [(f"{giver}@{zone}", f"{taker}@{zone}")]
+        ]
+        for zone, beyond in pairwise(zones):
+            own = [f"{state}@{zone}" for state in states]
+            for state in states:
+                there = f"{state}@{beyond}"
+                terms = _carried(f"{state}@{zone}", [*own, there])
+                exchange.append((f"{state}@{zone}", there, terms))
+        last = [f"{state}@{zones[-1]}" for state in states]
+        share = sum(sizes.values()) / sizes[zones[0]]
+        return Roles(
+            exchange=exchange,
+            outflow={f"{s}@{zones[-1]}": _carried(f"{s}@{zones[-1]}", last) for s in self.outflow},
+            inflow={
+                f"{state}@{zones[0]}": value if isinstance(value, str) else share * value
+                for state, value in self.inflow.items()
+            },
+            sizes={f"{state}@{zone}": sizes[zone] for zone in zones for state in states},
+            forward=True,
+        )
 
     def processes(self, library: Library, states: Sequence[str]) -> list[Process]:
         """Every process that the library and these roles allow, in the equations of the states.
@@ -124,20 +168,22 @@ class Roles:
         """
         self._check(library, states)
         found = []
-        terms = [name for name in library.names if name != "1"]
-        for giver, taker in self.exchange:
-            for term in terms:
-                factors = {(giver, term): -1.0, (taker, term): 1.0}
+        every = [name for name in library.names if name != "1"]
+        for giver, taker, *some in self.exchange:
+            gain = self.sizes.get(giver, 1.0) / self.sizes.get(taker, 1.0)
+            for term in _names(library, some[0]) if some else every:
+                factors = {(giver, term): -1.0, (taker, term): gain}
                 found.append(Process(f"{giver} to {taker}", term, MappingProxyType(factors)))
+        named = isinstance(self.outflow, Mapping)
         for state in self.outflow:
             for term in self._leaving(state, library):
                 factors = {(state, term): -1.0}
                 found.append(
-                    Process(f"{state} out", term, MappingProxyType(factors), one_sign=True)
+                    Process(f"{state} out", term, MappingProxyType(factors), one_sign=not named)
                 )
         for state in [s for s, value in self.inflow.items() if value == FREE]:
             found.append(Process(f"{state} in", "1", MappingProxyType({(state, "1"): 1.0})))
-        roles = {state for pair in self.exchange for state in pair} | {*self.outflow, *self.inflow}
+        roles = {s for entry in self.exchange for s in entry[:2]} | {*self.outflow, *self.inflow}
         for state in [s for s in states if s not in roles]:
             found += [
                 Process(f"{state} free", term, MappingProxyType({(state, term): 1.0}))
@@ -148,7 +194,7 @@ class Roles:
     def _leaving(self, state: str, library: Library) -> list[str]:
         """The terms by which a state may flow out."""
         if isinstance(self.outflow, Mapping):
-            return [library.names[library.index(term)] for term in self.outflow[state]]
+            return _names(library, self.outflow[state])
         powers = re.compile(rf"{re.escape(state)}(\^\d+)?")
         return [name for name in library.names if powers.fullmatch(name)]
 
@@ -166,6 +212,26 @@ class Roles:
             library.index("1")
         for _, term in self.signed:
             library.index(term)
+
+
+def _names(library: Library, terms: Sequence[str]) -> list[str]:
+    """Terms as the library writes them. Raises ValueError for one that it lacks."""
+    return [library.names[library.index(term)] for term in terms]
+
+
+def _beside(zones: Sequence[str], k: int) -> list[str]:
+    """The neighbours of a zone."""
+    return [*zones[max(k - 1, 0) : k], *zones[k + 1 : k + 2]]
+
+
+def _exchanged(giver: str, taker: str, *, near: Sequence[str]) -> list[str]:
+    """Terms by which a state gives another of its zone something; see `Roles.in_zones`."""
+    return [f"{giver}*{taker}", *(f"{giver}*{taker}*{x}" for x in (giver, taker, *near))]
+
+
+def _carried(state: str, others: Sequence[str]) -> list[str]:
+    """Terms by which a state moves on."""
+    return [state, *(f"{state}*{other}" for other in others)]
 
 
 def parse_sign(text: str) -> tuple[Place, int]:
@@ -195,9 +261,17 @@ def constraint_of(
     free = _independent_rows(shares)
     if len(free) < len(processes):
         return None
-    # Factors are 1, -1 and 0 and so is the result: rounding removes what the inverse adds.
-    C = np.rint(shares @ np.linalg.inv(shares[free])) + 0.0
-    return Constraint(tuple(states), tuple(order), C, fixed - C @ fixed[free], free)
+    C = shares @ np.linalg.inv(shares[free])
+    # Most factors are 1, -1 and 0 and so is the result: rounding removes what the inverse adds.
+    C = np.where(np.abs(C - np.rint(C)) < 1e-9, np.rint(C), C) + 0.0
+    d = fixed - C @ fixed[free]
+    return Constraint(tuple(states), tuple(order), C, d, free, tuple(processes))
+
+
+def shares_of(held: Constraint) -> Float[np.ndarray, "free processes"]:
+    """What the constraint's processes, with coefficients of one, make of its free coefficients."""
+    places = [held.coefficients[k] for k in held.free]
+    return np.array([[p.factors.get(at, 0.0) for p in held.processes] for at in places])
 
 
 def _independent_rows(matrix: Float[np.ndarray, "rows columns"]) -> np.ndarray:

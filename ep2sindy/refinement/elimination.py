@@ -146,6 +146,7 @@ def _without_weakest(
         C=C[stays],
         d=constraint.d[stays],
         free=place[constraint.free[rest]],
+        processes=(),
     )
     values = [model.coef[model.library.index(term), model.states.index(s)] for s, term in kept]
     z = np.array(values)[shorter.free]

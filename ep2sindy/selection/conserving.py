@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms
-from ep2sindy.library.relations import Constraint
-from ep2sindy.library.roles import Process, Roles, constraint_of
+from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Constraint, Process
+from ep2sindy.library.roles import Roles, constraint_of, shares_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.regression.constrained import MIN_RESIDUAL
@@ -18,6 +19,8 @@ from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import Search
 from ep2sindy.selection.systems import Demand, Systems, TrialSystem
+
+Support = tuple[np.ndarray, np.ndarray]  # indices of processes, and their coefficients
 
 
 def conserving_systems(
@@ -27,7 +30,8 @@ def conserving_systems(
 
     One regression over the training rows of all equations, each weighted by its residuals, has one
     column per process; so a search proposes processes, and what they move is conserved exactly. Of
-    every size, the `depth` best systems are kept in which every role is played by a process.
+    every size, the `depth` best systems are kept in which every role is played by a process, in its
+    direction if the roles demand one and any system of the search obeys.
     Raises ValueError for roles that do not fit the task, or if no system plays them all.
     """
     processes = roles.processes(task.library, task.states)
@@ -35,11 +39,17 @@ def conserving_systems(
     norms = column_norms(columns)
     unit = columns / norms
     masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
+    means = _means(task)
+    whole = _ranked(_complete(masks, processes), unit, target)
+    directed = [
+        (chosen, values)
+        for chosen, values in whole
+        if _is_directed([processes[k] for k in chosen], values / norms[chosen], roles, task, means)
+    ]
     found = []
-    for mask in _best(_complete(masks, processes), unit, target, depth):
-        chosen = np.flatnonzero(mask)
-        values = np.linalg.lstsq(unit[:, chosen], target, rcond=None)[0] / norms[chosen]
-        system = _system(task, [processes[k] for k in chosen], values, roles)
+    for chosen, values in _first_of_each_size(directed or whole, depth):
+        ours = [processes[k] for k in chosen]
+        system = _system(task, ours, values / norms[chosen], roles, means)
         if system is not None:
             found.append(system)
     if not found:
@@ -88,22 +98,44 @@ def _complete(
     return masks[np.all(played, axis=0)]
 
 
-def _best(
+def _ranked(
     masks: Bool[np.ndarray, "supports processes"],
     columns: Float[np.ndarray, "rows processes"],
     target: Float[np.ndarray, " rows"],
-    depth: int,
-) -> list[Bool[np.ndarray, " processes"]]:
-    """The `depth` supports of least residual of every size, smallest sizes first."""
+) -> list[Support]:
+    """The supports with their coefficients, smallest sizes first, of a size by their residual."""
     xx, xy = columns.T @ columns, columns.T @ target
     ranked = []
     for mask in masks:
         own = np.flatnonzero(mask)
-        gain = xy[own] @ np.linalg.lstsq(xx[np.ix_(own, own)], xy[own], rcond=None)[0]
-        ranked.append((len(own), -gain, own.tolist(), mask))
+        values = np.linalg.lstsq(xx[np.ix_(own, own)], xy[own], rcond=None)[0]
+        ranked.append((len(own), -float(xy[own] @ values), own.tolist(), values))
     ranked.sort(key=lambda each: each[:3])
-    sizes = [size for size, *_ in ranked]
-    return [each[-1] for k, each in enumerate(ranked) if k - sizes.index(each[0]) < depth]
+    return [(np.array(own), values) for _, _, own, values in ranked]
+
+
+def _first_of_each_size(supports: Sequence[Support], depth: int) -> list[Support]:
+    sizes = [len(chosen) for chosen, _ in supports]
+    return [each for k, each in enumerate(supports) if k - sizes.index(sizes[k]) < depth]
+
+
+def _is_directed(
+    processes: Sequence[Process],
+    values: Float[np.ndarray, " processes"],
+    roles: Roles,
+    task: Task,
+    means: Float[np.ndarray, " terms"],
+) -> bool:
+    """Whether the coefficients of a regression obey what `_demands` asks of directions."""
+    rates: dict[str, float] = {}
+    for process, value in zip(processes, values, strict=True):
+        if process.one_sign and value <= 0.0:
+            return False
+        rate = value * means[task.library.index(process.term)]
+        rates[process.role] = rates.get(process.role, 0.0) + rate
+    return not roles.forward or all(
+        rate > 0.0 for role, rate in rates.items() if not role.endswith(" free")
+    )
 
 
 def _system(
@@ -111,6 +143,7 @@ def _system(
     processes: Sequence[Process],
     values: Float[np.ndarray, " processes"],
     roles: Roles,
+    means: Float[np.ndarray, " terms"],
 ) -> TrialSystem | None:
     """The system of these processes; None if its coefficients do not tell them apart."""
     held = constraint_of(task.library, task.states, processes, roles.known_inflow)
@@ -118,24 +151,38 @@ def _system(
         return None
     empty = np.zeros((len(task.library), len(task.states)))
     model = SparseModel(task.library, task.states, empty, task.runs[0].units)
-    coef = held.coef(_shares(held, processes) @ values)
-    return TrialSystem(with_coef(model, held, coef)[0], held, _demands(held, processes, roles))
+    coef = held.coef(shares_of(held) @ values)
+    return TrialSystem(
+        with_coef(model, held, coef)[0], held, _demands(held, roles, task.library, means)
+    )
 
 
-def _shares(held: Constraint, processes: Sequence[Process]) -> Float[np.ndarray, "free processes"]:
-    """What the processes, with coefficients of one, make of the free coefficients."""
-    places = [held.coefficients[k] for k in held.free]
-    return np.array([[p.factors.get(at, 0.0) for p in processes] for at in places])
+def _means(task: Task) -> Float[np.ndarray, " terms"]:
+    """Mean of every term over the records."""
+    values = np.concatenate([run.columns(task.library.variables) for run in task.runs])
+    mean: Float[np.ndarray, " terms"] = task.library.evaluate(values).mean(axis=0)
+    return mean
 
 
-def _demands(held: Constraint, processes: Sequence[Process], roles: Roles) -> list[Demand]:
-    """What an outflow takes away is positive, and coefficients have the signs asked for."""
+def _demands(
+    held: Constraint, roles: Roles, library: Library, means: Float[np.ndarray, " terms"]
+) -> list[Demand]:
+    """What an outflow takes away is positive, and coefficients have the signs asked for.
+
+    Processes of one sign are positive each; others of an outflow, and of an exchange that goes
+    forward, together and in the mean.
+    """
     found = []
-    for process, row in zip(processes, np.linalg.inv(_shares(held, processes)), strict=True):
+    together: dict[str, np.ndarray] = {}
+    for process, row in zip(held.processes, np.linalg.inv(shares_of(held)), strict=True):
+        weights = np.zeros(len(held.coefficients))
+        weights[held.free] = row
         if process.one_sign:
-            weights = np.zeros(len(held.coefficients))
-            weights[held.free] = row
             found.append(Demand(f"{process.role} by {process.term} > 0", weights))
+        elif roles.forward and not process.role.endswith(" free"):
+            rate = weights * means[library.index(process.term)]
+            together[process.role] = together.get(process.role, 0.0) + rate
+    found += [Demand(f"{role} > 0 in the mean", weights) for role, weights in together.items()]
     for (state, term), sign in roles.signed.items():
         if (state, term) in held.coefficients:
             weights = np.zeros(len(held.coefficients))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.living import balance_figure
 from ep2sindy.library.names import split_factors
-from ep2sindy.library.relations import Constraint, constraint
+from ep2sindy.library.relations import Constraint, Process, constraint
+from ep2sindy.library.roles import shares_of
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.free_run import FreeRun, free_run
 from ep2sindy.model.model import SparseModel
@@ -26,8 +28,9 @@ from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.living import start_of, two_periods
 
 IONS, NEUTRALS = "n_i", "n_n"
+NO_SIZES: Mapping[str, float] = MappingProxyType({})
 CAPTION = (
-    "What the zone gains or loses by each process, over two periods: in the record (grey), and by "
+    "What zones gain or lose by each process, over two periods: in the record (grey), and by "
     "the model's terms at the record's densities (colour)."
 )
 NOTE = (
@@ -48,11 +51,16 @@ PLACES: Mapping[tuple[str, str, bool], tuple[tuple[str, ...], str]] = {
 }
 
 
-def inflow_of(balance: xr.Dataset | None) -> dict[str, float]:
-    """The inflows that the balance of a zone gives, by state, in m^-3/s: that of the neutrals."""
-    if balance is None or "supply" not in balance:
-        return {}
-    return {NEUTRALS: float(balance["supply"].mean())}
+def inflows_of(balances: Mapping[str, xr.Dataset]) -> dict[str, float]:
+    """The inflows that the balances of zones give, by state, in m^-3/s: those of the neutrals.
+
+    balances: by zone; a single one is called "".
+    """
+    return {
+        f"{NEUTRALS}@{zone}" if zone else NEUTRALS: float(balance["supply"].mean())
+        for zone, balance in balances.items()
+        if "supply" in balance
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +149,91 @@ def compared_processes(
         "neutrals that enter", known.get("supply"), supply, [f"{NEUTRALS}': 1"]
     )
     return [each for each in (inflow, *found) if each.modelled.any() or each.recorded is not None]
+
+
+def zone_processes(
+    model: SparseModel,
+    held_to: Constraint,
+    data: Trajectory,
+    balances: Mapping[str, xr.Dataset],
+    sizes: Mapping[str, float],
+) -> list[ComparedProcess]:
+    """The processes of ions and neutrals in and between several zones, in record and model.
+
+    held_to: the model's constraint, from a search under `Roles.in_zones`. balances: by zone.
+    sizes: zone -> its length. Rates are those of the zone that gives, or takes from outside.
+    """
+    theta = model.library.evaluate(data.columns(model.library.variables))
+    free = [held_to.coefficients[k] for k in held_to.free]
+    coef = np.array([model.terms(state).get(term, 0.0) for state, term in free])
+    values = np.linalg.solve(shares_of(held_to), coef)
+    rates: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+    for process, value in zip(held_to.processes, values, strict=True):
+        column = theta[:, model.library.index(process.term)]
+        rates.setdefault(_ends(process), {})[process.term] = value * column
+    for (state, _), value in zip(held_to.coefficients, held_to.d, strict=True):
+        if value:
+            rates.setdefault(("", state), {})["1"] = np.full(len(theta), value)
+    known = {zone: _recorded(balance, data) for zone, balance in balances.items()}
+    gone = _through_ends(known, sizes)
+    found = []
+    for ends, terms in rates.items():
+        recorded = _zone_rate(*ends, known, gone)
+        modelled = _sum(terms, len(theta))
+        found.append(ComparedProcess(_zone_words(*ends), recorded, modelled, list(terms)))
+    return found
+
+
+def _ends(process: Process) -> tuple[str, str]:
+    """The state that a process takes from, and the one that it gives to; "" is the outside."""
+    giver, taker = (
+        next((state for (state, _), f in process.factors.items() if sign * f > 0.0), "")
+        for sign in (-1.0, 1.0)
+    )
+    return giver, taker
+
+
+def _through_ends(
+    known: Mapping[str, Mapping[str, np.ndarray]], sizes: Mapping[str, float]
+) -> dict[tuple[str, str], np.ndarray]:
+    """(state, zone) -> what passes the far end of each zone, by the zone's length, in m^-3/s."""
+    found = {}
+    for state, key in ((IONS, "exit_i"), (NEUTRALS, "exit_n")):
+        passed: Any = 0.0
+        for zone, size in sizes.items():
+            if key not in known[zone]:
+                break
+            passed = passed + size * known[zone][key]
+            found[state, zone] = passed / size
+    return found
+
+
+def _zone_words(giver: str, taker: str) -> str:
+    (state, _, zone), (other, _, beyond) = giver.partition("@"), taker.partition("@")
+    names = {IONS: "ions", NEUTRALS: "neutrals"}
+    if not giver:
+        return f"{names[other]} that enter"
+    if not taker:
+        return f"{names[state]} that leave"
+    if zone != beyond:
+        return f"{names[state]} from {zone} to {beyond}"
+    return f"{zone}: {names[state]} that become {names[other]}, less those given back"
+
+
+def _zone_rate(
+    giver: str,
+    taker: str,
+    known: Mapping[str, Mapping[str, np.ndarray]],
+    gone: Mapping[tuple[str, str], np.ndarray],
+) -> np.ndarray | None:
+    """The rate of a process in the record; None if it does not give it."""
+    (state, _, zone), (_, _, beyond) = giver.partition("@"), taker.partition("@")
+    if not giver:
+        return known[beyond].get("supply")
+    if zone != beyond:  # to the next zone, or to the outside
+        return gone.get((state, zone))
+    exchanged = _difference(known[zone], "ionization", "returned")
+    return exchanged if state == NEUTRALS or exchanged is None else -exchanged
 
 
 def _less_of(
@@ -259,12 +352,10 @@ class ModelBalance:
         blocks: list[Block] = []
         if self.processes:
             rows = ResultTable(self.processes, PROCESSES).screen()
-            blocks.append(
-                Table(rows, title="what the zone exchanges, in record and model", note=NOTE)
-            )
+            blocks.append(Table(rows, title="what is exchanged, in record and model", note=NOTE))
         rows = ResultTable(self.terms, ROLES).screen()
         blocks.append(Table(rows, title="each term by its process, and left out"))
-        if self.processes:
+        if any(np.isfinite(each.alone) for each in self.terms):
             blocks.append(Text(
                 "If alone: the coefficient with which the term would exchange as much as the "
                 "record, in the mean, if no other term did."
@@ -287,24 +378,29 @@ def model_balance(
     data: Trajectory,
     train: Trajectory,
     held: Trajectory,
-    balance: xr.Dataset | None,
+    balances: Mapping[str, xr.Dataset],
     bounds: FreeRunBounds,
     *,
+    sizes: Mapping[str, float] = NO_SIZES,
     period_s: float | None,
     progress: Progress = SILENT,
 ) -> ModelBalance:
     """Compare a model with the balance of its zone, and leave out each of its terms in turn.
 
     held_to: what the model's coefficients obey; None if they are free. Models without a term are
-    refined on `train` and run over `held`. balance: of the zone, by `zone_balance`; None if there
-    is none. period_s: of the model's cycle, for the figure.
+    refined on `train` and run over `held`. balances: of the zones, by `zone_balance`; a single one
+    is called "". sizes: length of each of several zones. period_s: of the model's cycle, for the
+    figure.
     """
+    balance = balances.get("")
     support = {state: list(model.terms(state)) for state in model.states}
     held_to = held_to or constraint(model.library, support)
     ours = balance is not None and set(model.states) == set(model.library.variables)
     ours = ours and set(model.states) == {IONS, NEUTRALS} and not model.library.functions
     known = _recorded(balance, data) if ours and balance is not None else {}
     processes = compared_processes(model, data, balance) if ours and balance is not None else []
+    if sizes and balances and held_to is not None and held_to.processes:
+        processes = zone_processes(model, held_to, data, balances, sizes)
     window, left_out = two_periods(train), {}
     free = range(len(held_to.free))
     for k in count_pieces(progress, free, "coefficient", "models without a term"):
@@ -314,6 +410,9 @@ def model_balance(
         coef = model.terms(state).get(term, 0.0)
         follows = np.flatnonzero(held_to.C[row])
         process, alone = _alone(model, data, state, term, known) if ours else ("", np.nan)
+        if sizes and processes:
+            ends = (_ends(each) for each in held_to.processes if (state, term) in each.factors)
+            process = "; ".join(_zone_words(*each) for each in ends)
         run = left_out[int(follows[0])] if follows.size else None
         roles.append(TermRole(state, term, coef, process, alone, run))
     return ModelBalance(processes, roles, data, period_s)

@@ -29,7 +29,7 @@ from ep2sindy.report.document import Captioned, Section, Table
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.balance import inflow_of
+from ep2sindy.studies.balance import inflows_of
 from ep2sindy.studies.fits import (
     COMPARED,
     Evaluation,
@@ -44,7 +44,7 @@ from ep2sindy.studies.fits import (
     terms_of,
 )
 from ep2sindy.studies.living import LivingSearch, two_periods
-from ep2sindy.studies.source import Source, balance_of
+from ep2sindy.studies.source import Source, balances_of
 from ep2sindy.studies.study import Count, Counts, Share
 from ep2sindy.studies.views import PlotRange
 
@@ -113,7 +113,7 @@ class Study:
             name: fit_and_evaluate(train, held, library, each, form, rng=next(streams))
             for name, each, form in count_pieces(run.watch, fits, "fit")
         }
-        inflow = inflow_of(balance_of(self.source, field, run))
+        inflow = inflows_of(balances_of(self.source, field, run))
         lives, own = self._living(train, inflow, rng=next(streams), progress=run.watch)
         starts = {
             "ils": (judged["base"].model, free),

@@ -30,11 +30,11 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.studies.balance import ModelBalance, inflow_of, model_balance
+from ep2sindy.studies.balance import ModelBalance, inflows_of, model_balance
 from ep2sindy.studies.fits import split_in_time
 from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
-from ep2sindy.studies.source import Source, balance_of, data_summary
+from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
 from ep2sindy.studies.study import Coefficients, PositiveOrAll, ShareOrNone
 from ep2sindy.studies.views import (
     INTEGRATED,
@@ -66,6 +66,7 @@ _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<a
 class LibraryCase:
     """A polynomial library; variables_if_present are left out if the field lacks them.
 
+    Of several zones, each variable stands for its averages in all of them.
     functions, function_degree: as in `ep.polynomial`; `my_module.tanh` is the function that
     my_module registers by that name. n_norm: the knee's norm for this library, if it differs from
     the method's.
@@ -79,9 +80,9 @@ class LibraryCase:
     function_degree: int = 1
     n_norm: str | None = None
 
-    def library(self, data: xr.Dataset) -> Library:
+    def library(self, data: xr.Dataset, sampling: Sampling) -> Library:
         optional = [name for name in self.variables_if_present if name in data]
-        names = [*self.variables, *optional]
+        names = sampling.columns([*self.variables, *optional])
         return polynomial(
             names,
             degree=self.degree,
@@ -95,6 +96,21 @@ class LibraryCase:
         if self.n_norm is None or not isinstance(method.selection, Knee):
             return method
         return replace(method, selection=replace(method.selection, n_norm=self.n_norm))
+
+
+@dataclass(frozen=True)
+class Zones:
+    """The zones of a record: balances of ions and neutrals, and lengths in m if there are several.
+
+    balances: by name, see `balances_of`.
+    """
+
+    balances: Mapping[str, xr.Dataset] = field(default_factory=dict)
+    sizes: Mapping[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def of(source: Source, data: xr.Dataset, run: Run) -> Zones:
+        return Zones(balances_of(source, data, run), zone_sizes_of(source, data))
 
 
 @dataclass(frozen=True)
@@ -132,7 +148,8 @@ class Study:
         methods = {name: case.method(self.method) for name, case in self.libraries.items()}
         with run.progress(None, "", "data"):
             opened = self.source.fields()
-        libraries = {name: case.library(opened[0]) for name, case in self.libraries.items()}
+        sampling = self.source.trajectory
+        libraries = {n: case.library(opened[0], sampling) for n, case in self.libraries.items()}
         runs = [self.source.sampled(field, libraries.values(), run) for field in opened]
         data = runs[0]
         if len(runs) > 1:
@@ -142,10 +159,10 @@ class Study:
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
         pairs = list(zip(libraries.items(), streams, strict=True))
-        balance = balance_of(self.source, opened[0], run) if self.living is not None else None
+        zones = Zones.of(self.source, opened[0], run) if self.living is not None else Zones()
         results = {
             name: self._result(
-                runs, name, library, methods[name], balance, rng=rng, progress=run.watch
+                runs, name, library, methods[name], zones, rng=rng, progress=run.watch
             )
             for (name, library), rng in count_pieces(run.watch, pairs, "library")
         }
@@ -161,7 +178,7 @@ class Study:
         name: str,
         library: Library,
         method: AnyMethod,
-        balance: xr.Dataset | None,
+        zones: Zones,
         *,
         rng: np.random.Generator,
         progress: Progress,
@@ -169,8 +186,7 @@ class Study:
         """Discovery of one library in all records; free runs of its model and the published one.
 
         Both run over the first record; the discovered model also runs over the other records. A
-        model that lives is searched for in the first record. balance: of its zone, by
-        `zone_balance`.
+        model that lives is searched for in the first record.
         """
         s = self.rollout_s
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
@@ -182,7 +198,7 @@ class Study:
         lives = beside = None
         if self.living is not None and not found.model.inputs:
             lives, beside = self._lives(
-                data, library, rows, found.model, balance, rng=rng, progress=progress
+                data, library, rows, found.model, zones, rng=rng, progress=progress
             )
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
@@ -203,20 +219,21 @@ class Study:
         library: Library,
         rows: Regression,
         selected: SparseModel,
-        balance: xr.Dataset | None,
+        zones: Zones,
         *,
         rng: np.random.Generator,
         progress: Progress,
     ) -> tuple[Living, ModelBalance]:
-        """A model that lives, and the balance of the zone beside it."""
+        """A model that lives, and the balance of its zones beside it."""
         assert self.living is not None
         parts = split_in_time(data, self.held_out or HELD_OUT)
-        inflow = inflow_of(balance)
         lives = living_model(
-            *parts, library, rows, self.living, selected, inflow=inflow, rng=rng, progress=progress
-        )
+            *parts, library, rows, self.living, selected, inflow=inflows_of(zones.balances),
+            sizes=zones.sizes, rng=rng, progress=progress,
+        )  # fmt: skip
         beside = model_balance(
-            lives.model, lives.discovery.constraint, data, *parts, balance, self.living.bounds,
+            lives.model, lives.discovery.constraint, data, *parts, zones.balances,
+            self.living.bounds, sizes=zones.sizes,
             period_s=None if lives.cycle is None else lives.cycle.period_s, progress=progress,
         )  # fmt: skip
         return lives, beside

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,6 +55,7 @@ CAPTIONS = {
     "starts.",
     "waveform": WAVEFORM,
 }
+NO_SIZES: Mapping[str, float] = MappingProxyType({})
 STARTS = ((0.5, 0.5), (0.5, 2.0), (1.0, 1.0), (2.0, 0.5), (2.0, 2.0))  # times the cycle's mean
 N_PERIODS = 12.0  # duration of a run from another start, in periods
 
@@ -80,16 +82,19 @@ class LivingSearch:
         rows: Regression,
         *,
         inflow: Mapping[str, float],
+        sizes: Mapping[str, float] = NO_SIZES,
         rng: np.random.Generator,
         progress: Progress = SILENT,
     ) -> Discovery:
         """The discovery in a record, with the formulation and bootstraps of `rows`.
 
-        inflow: of states, as far as the record gives it.
+        inflow: of states, as far as the record gives it. sizes: length of each of several zones,
+        in which the roles then hold.
         """
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
-        roles = self.roles and self.roles.with_known(inflow)
+        roles = self.roles.in_zones(sizes) if self.roles and sizes else self.roles
+        roles = roles and roles.with_known(inflow)
         return discover(train, library, own, roles=roles, seed=rng, progress=progress)
 
     @property
@@ -349,15 +354,18 @@ def living_model(
     selected: SparseModel,
     *,
     inflow: Mapping[str, float],
+    sizes: Mapping[str, float],
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> Living:
     """Find a living model in one part of a record, and run it over the other.
 
     selected: the model selected by derivatives, which is refined for comparison. inflow: of states,
-    as far as the record gives it.
+    as far as the record gives it. sizes: length of each of several zones.
     """
-    found = settings.found(train, library, rows, inflow=inflow, rng=rng, progress=progress)
+    found = settings.found(
+        train, library, rows, inflow=inflow, sizes=sizes, rng=rng, progress=progress
+    )
     with progress.stage(None, "", "free run and limit cycle"):
         start = start_of(held, found.model)
         run = free_run(found.model, held, initial=start, bounds=settings.bounds)

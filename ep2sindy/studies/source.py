@@ -15,8 +15,9 @@ from ep2sindy.data.fields import grid_points
 from ep2sindy.data.gaps import describe_gaps
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
+from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
-from ep2sindy.data.zones import Zone, ZoneAverage, describe_zone, resolve_zone
+from ep2sindy.data.zones import Zone, describe_zone, resolve_zone
 from ep2sindy.library.library import Library
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
@@ -85,6 +86,10 @@ class Sampling(Protocol):
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory: ...
 
+    def columns(self, names: Sequence[str]) -> list[str]:
+        """What variables are called in the trajectory: of several zones, each has its own."""
+        ...
+
     def place(self, field: xr.Dataset) -> str:
         """The place on the field's grid, in words; empty for a field without a grid."""
         ...
@@ -100,7 +105,8 @@ class Source:
 
     @property
     def states(self) -> list[str]:
-        return list(self.trajectory.states)
+        """The states by the names that they have in the trajectory."""
+        return self.trajectory.columns(self.trajectory.states)
 
     def field(self) -> xr.Dataset:
         """The single record; see `open_prepared`."""
@@ -113,9 +119,9 @@ class Source:
     def inputs(self, libraries: Iterable[Library]) -> list[str]:
         """Variables of the libraries that are neither states nor averages of products."""
         products = [f"<{name.replace(' ', '')}>" for name in self.trajectory.products]
-        known = {*self.states, *products}
+        known = {*self.states, *self.trajectory.columns(products)}
         variables = dict.fromkeys(v for library in libraries for v in library.variables)
-        return [name for name in variables if name not in known]
+        return list(dict.fromkeys(v.partition("@")[0] for v in variables if v not in known))
 
     def sampled(self, field: xr.Dataset, libraries: Iterable[Library], run: Run) -> Trajectory:
         """The trajectory that the libraries need; also reports the data on screen and page."""
@@ -130,22 +136,30 @@ def zone_of(source: Source) -> Zone | None:
     return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
 
 
-def balance_of(source: Source, field: xr.Dataset, run: Run) -> xr.Dataset | None:
-    """Balance of ions and neutrals in the zone that is averaged over; None if there is none.
+def zone_sizes_of(source: Source, field: xr.Dataset) -> dict[str, float]:
+    """Length in m of each of several zones that the trajectory is averaged over; else empty."""
+    sampling = source.trajectory
+    return sampling.sizes(field) if isinstance(sampling, ZoneAverage) else {}
 
-    A balance that cannot be made, as of a zone that reaches into the plume, is reported.
+
+def balances_of(source: Source, field: xr.Dataset, run: Run) -> dict[str, xr.Dataset]:
+    """Balance of ions and neutrals in every zone that is averaged over; a single one is called "".
+
+    Balances that cannot be made, as of a zone that reaches into the plume, are reported.
     """
     sampling = source.trajectory
     if not isinstance(sampling, ZoneAverage) or not {"n_i", "n_n"} <= set(field.data_vars):
-        return None
-    zone = resolve_zone(sampling.zone, field)
-    if zone.r is not None:
-        return None
+        return {}
+    single = {"": resolve_zone(sampling.zone, field)}
+    zones = single if sampling.zones is None else side_by_side(sampling.zones, field)
+    if any(zone.r is not None for zone in zones.values()):
+        return {}
     try:
-        return zone_balance(field, zone, axisymmetric=sampling.axisymmetric)
+        axisymmetric = sampling.axisymmetric
+        return {n: zone_balance(field, z, axisymmetric=axisymmetric) for n, z in zones.items()}
     except ValueError as error:
         run.say(f"the model has no balance of its zone beside it: {error}")
-        return None
+        return {}
 
 
 def say_field(run: Run, field: xr.Dataset) -> None:

@@ -1,0 +1,216 @@
+"""How a field becomes a trajectory: averages over several zones, one, or a single grid point."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+import xarray as xr
+
+from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, check_field, grid_points
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.zones import Zone, describe_zone, resolve_zone, zone_average, zone_slices
+
+
+def zone_averages(
+    field: xr.Dataset,
+    zones: Mapping[str, Zone | Sequence[float]],
+    *,
+    states: Sequence[str],
+    inputs: Sequence[str] = (),
+    products: Sequence[str] = (),
+    axisymmetric: bool = True,
+    label: str = "",
+) -> Trajectory:
+    """One trajectory of the averages over several zones, named `n_i@exit` and so on.
+
+    zones: name -> `Zone`, or (from, to) in z in m, in the order in which they lie. A grid point on
+    an edge that two zones share belongs to the first. Otherwise as `zone_average`, zone by zone.
+    Raises ValueError also for names that are no words, and for zones that overlap or come in
+    another order.
+
+    >>> field = ep.read_field("run.nc")
+    >>> zones = {"anode": (0.0, 0.0125), "exit": (0.0125, 0.025)}
+    >>> ep.zone_averages(field, zones, states=["n_i", "n_n"]).state_names
+    ('n_i@anode', 'n_n@anode', 'n_i@exit', 'n_n@exit')
+    """
+    runs = {
+        name: zone_average(
+            field, zone, states=states, inputs=inputs, products=products,
+            axisymmetric=axisymmetric, label=label,
+        )
+        for name, zone in side_by_side(zones, field).items()
+    }  # fmt: skip
+    first = next(iter(runs.values()))
+    return Trajectory(
+        t=first.t,
+        states=np.column_stack([run.states for run in runs.values()]),
+        state_names=in_zones(runs, first.state_names),
+        inputs=np.column_stack([run.inputs for run in runs.values()]),
+        input_names=in_zones(runs, first.input_names),
+        units={f"{n}@{name}": unit for name, run in runs.items() for n, unit in run.units.items()},
+        label=label,
+        clock=first.clock,
+    )
+
+
+def in_zones(zones: Iterable[str], names: Sequence[str]) -> list[str]:
+    """Names of the averages of variables over several zones, zone by zone."""
+    return [f"{name}@{zone}" for zone in zones for name in names]
+
+
+def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset) -> dict[str, Zone]:
+    """Zones with ends in m that share no grid point; see `zone_averages`."""
+    if not isinstance(zones, Mapping) or not zones:
+        raise ValueError(
+            "zones must be given by name, with their ends in z in m, as in "
+            f"{{anode: [0, 0.0125], exit: [0.0125, 0.025]}}: {zones!r} came"
+        )
+    found: dict[str, Zone] = {}
+    taken, reached_m = 0, -math.inf
+    for name, given in zones.items():
+        if not re.fullmatch(r"\w{1,100}", str(name)):
+            raise ValueError(f"a zone's name must be a word, such as 'exit': {name!r} came")
+        zone = resolve_zone(given if isinstance(given, Zone) else Zone(z=given), field)
+        begin_m, end_m = map(float, zone.z or (-math.inf, math.inf))
+        if begin_m < reached_m or zone.z is None:
+            raise ValueError(
+                "zones must follow each other in z without overlap, each with its ends in m: "
+                f"{name} is {zone.z}"
+                + (f", after one that ends at {reached_m:g} m" if found else "")
+            )
+        inside = zone_slices(field, zone)["z"]
+        if inside.stop <= taken:
+            raise ValueError(
+                f"each zone must hold grid points of its own: {name}, {zone.z} m, has "
+                "only one that belongs to the zone before; give wider zones"
+            )
+        if inside.start < taken:
+            zone = replace(zone, z=(float(grid_points(field, "z")[taken]), end_m))
+        found[str(name)] = zone
+        taken, reached_m = inside.stop, end_m
+    return found
+
+
+@dataclass(frozen=True)
+class ZoneAverage:
+    """Settings of `zone_average` without the field, for use in a config.
+
+    zones: of `zone_averages`, which are then taken in place of the one zone.
+    """
+
+    states: Sequence[str]
+    zone: Zone | None = None
+    products: Sequence[str] = ()
+    axisymmetric: bool = True
+    zones: Mapping[str, Zone | Sequence[float]] | None = None
+
+    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
+        settings: Any = {
+            "states": self.states,
+            "inputs": inputs,
+            "products": self.products,
+            "axisymmetric": self.axisymmetric,
+            "label": label,
+        }
+        if self.zones is None:
+            return zone_average(field, self.zone, **settings)
+        return zone_averages(field, self.zones, **settings)
+
+    def columns(self, names: Sequence[str]) -> list[str]:
+        """What the averages of variables are called in the trajectory."""
+        return list(names) if self.zones is None else in_zones(self.zones, names)
+
+    def sizes(self, field: xr.Dataset) -> dict[str, float]:
+        """Length in m of each of several zones; empty for a single one.
+
+        Raises ValueError for zones that do not adjoin: nothing is known of what lies between.
+        """
+        if self.zones is None:
+            return {}
+        parts = side_by_side(self.zones, field)
+        inside = [zone_slices(field, zone)["z"] for zone in parts.values()]
+        if any(there.start != here.stop for here, there in pairwise(inside)):
+            raise ValueError(
+                "zones that exchange something must adjoin, each beginning where the one before "
+                f"ends: {dict(self.zones)} came"
+            )
+        lengths = cell_sizes(field, "z", axisymmetric=self.axisymmetric)
+        return {n: float(lengths[part].sum()) for n, part in zip(parts, inside, strict=True)}
+
+    def place(self, field: xr.Dataset) -> str:
+        """Description of the part of the field's grid that is averaged over."""
+        if self.zones is None:
+            words = describe_zone(self.zone, field)
+            return f"average over {words}" if words else ""
+        parts = side_by_side(self.zones, field).items()
+        return "; ".join(f"{name}: average over {describe_zone(z, field)}" for name, z in parts)
+
+
+@dataclass(frozen=True)
+class GridPoint:
+    """Settings of `point_samples` without the field, for use in a config; it has no products."""
+
+    states: Sequence[str]
+    z: float | None = None
+    r: float | None = None
+    products: ClassVar[tuple[str, ...]] = ()
+
+    def columns(self, names: Sequence[str]) -> list[str]:
+        """What the variables are called in the trajectory: as they are."""
+        return list(names)
+
+    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
+        return point_samples(
+            field, z=self.z, r=self.r, states=self.states, inputs=inputs, label=label
+        )
+
+    def place(self, field: xr.Dataset) -> str:
+        """Description of the grid point that is used."""
+        places = _nearest(field, z=self.z, r=self.r)
+        texts = [f"{a} = {1e3 * grid_points(field, a)[k]:.4g} mm" for a, (k,) in places.items()]
+        return f"the grid point at {', '.join(texts)}" if texts else ""
+
+
+def point_samples(
+    field: xr.Dataset,
+    *,
+    z: float | None = None,
+    r: float | None = None,
+    states: Sequence[str],
+    inputs: Sequence[str] = (),
+    label: str = "",
+) -> Trajectory:
+    """Samples at the grid point nearest to (z, r).
+
+    z, r: place in m; one is needed for each axis that the field has.
+
+    Raises ValueError for a place outside the grid's cells or without plasma.
+    """
+    check_field(field)
+    nearest = _nearest(field, z=z, r=r)
+    return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
+
+
+def _nearest(field: xr.Dataset, *, z: float | None, r: float | None) -> dict[str, list[int]]:
+    """Index of the grid point nearest to a place, for each axis."""
+    places = {axis: value for axis, value in (("z", z), ("r", r)) if value is not None}
+    axes = [axis for axis in SPACE if axis in field.dims]
+    if sorted(places) != sorted(axes):
+        raise ValueError(f"a point needs one place per axis {axes} of its field: {places} came")
+    nearest = {}
+    for axis, place in places.items():
+        points = grid_points(field, axis)
+        ends = cell_edges(points)[[0, -1]] if len(points) > 1 else points[[0, 0]]
+        if not ends[0] <= place <= ends[1]:
+            raise ValueError(
+                f"a point must lie on the grid: {axis} = {place:g} m came, the grid's cells reach "
+                f"from {ends[0]:g} to {ends[1]:g} m"
+            )
+        nearest[axis] = [int(np.argmin(np.abs(points - place)))]
+    return nearest

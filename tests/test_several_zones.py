@@ -1,0 +1,240 @@
+"""Several zones in one trajectory: averages, names, roles by neighbourhood, and balances."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import ep2sindy as ep
+from ep2sindy.data.sampling import ZoneAverage, side_by_side
+from ep2sindy.library.equations import equation_html, latex_derivative, latex_term_name
+from ep2sindy.library.names import check_state
+from ep2sindy.library.relations import parse_relation
+from ep2sindy.library.roles import constraint_of, shares_of
+from ep2sindy.studies.balance import inflows_of, zone_processes
+
+STATES = ["n_i", "n_n"]
+ROLES = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": 0.4})
+SIZES = {"a": 1.0, "b": 2.0}
+NAMES = ["n_i@a", "n_n@a", "n_i@b", "n_n@b"]
+
+
+@pytest.fixture(scope="module")
+def field() -> xr.Dataset:
+    return ep.thruster.simulate(
+        ep.thruster.Thruster(), ep.thruster.OperatingPoint(300.0, 5.0), n_cells=40,
+        duration_s=6e-4, warm_up_s=2e-4, progress=False,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def zones(field: xr.Dataset) -> dict[str, tuple[float, float]]:
+    return {"anode": (0.0, 0.01), "exit": (0.01, 0.025)}
+
+
+@pytest.fixture(scope="module")
+def run(field: xr.Dataset, zones: dict[str, tuple[float, float]]) -> ep.Trajectory:
+    return ep.zone_averages(field, zones, states=STATES, label="two")
+
+
+def test_every_zone_has_its_own_average(field, zones, run) -> None:
+    assert run.state_names == ("n_i@anode", "n_n@anode", "n_i@exit", "n_n@exit")
+    assert set(run.units.values()) == {"m^-3"}
+    for k, z in enumerate(zones.values()):
+        alone = ep.zone_average(field, ep.Zone(z=z), states=STATES)
+        assert np.array_equal(run.states[:, 2 * k : 2 * k + 2], alone.states)
+
+
+def test_the_averages_of_all_zones_make_that_of_the_channel(field, zones, run) -> None:
+    sizes = ZoneAverage(STATES, zones=zones).sizes(field)
+    whole = ep.zone_average(field, ep.Zone(z="channel"), states=STATES)
+    share = np.array([*sizes.values()]) / sum(sizes.values())
+    assert share @ run.states[:, ::2].T == pytest.approx(whole.states[:, 0], rel=1e-6)
+
+
+def test_a_grid_point_on_a_shared_edge_belongs_to_the_first_zone() -> None:
+    data = {"n": (("time", "z"), np.outer(np.arange(1.0, 6.0), np.arange(5.0)), {"units": "m^-3"})}
+    field = xr.Dataset(data, coords={"time": np.arange(5.0), "z": 0.01 * np.arange(5.0)})
+    run = ep.zone_averages(field, {"a": (0.0, 0.02), "b": (0.02, 0.04)}, states=["n"])
+    assert run.states[0].tolist() == pytest.approx([1.0, 3.5])  # 0, 1, 2 and 3, 4
+
+
+def test_inputs_and_products_are_averaged_in_every_zone(field, zones) -> None:
+    run = ep.zone_averages(field, zones, states=["n_i"], inputs=["R_ion"], products=["n_i*n_n"])
+    assert run.input_names == ("R_ion@anode", "<n_i*n_n>@anode", "R_ion@exit", "<n_i*n_n>@exit")
+    settings = ZoneAverage(["n_i"], zones=zones)
+    assert settings.columns(["R_ion"]) == ["R_ion@anode", "R_ion@exit"]
+    assert "anode: average over z 0 to 10 mm" in settings.place(field)
+
+
+@pytest.mark.parametrize(
+    ("zones", "message"),
+    [
+        ({}, "zones must be given by name"),
+        ([(0.0, 0.01)], "zones must be given by name"),
+        ({"an ode": (0.0, 0.01)}, "name must be a word"),
+        ({"a": (0.0, 0.015), "b": (0.01, 0.02)}, "without overlap.*after one that ends at 0.015"),
+        ({"b": (0.01, 0.02), "a": (0.0, 0.01)}, "must follow each other"),
+        ({"a": ep.Zone()}, "each with its ends in m"),
+        ({"a": (0.0, 0.9)}, "stay on the grid"),
+        ({"a": (0.01, 0.0)}, "two increasing numbers"),
+    ],
+)
+def test_zones_that_make_no_sense_are_refused(field, zones, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        ep.zone_averages(field, zones, states=STATES)
+
+
+def test_zones_that_exchange_must_adjoin(field) -> None:
+    apart = ZoneAverage(STATES, zones={"a": (0.0, 0.01), "b": (0.015, 0.025)})
+    assert len(apart.trajectory(field, inputs=[], label="").state_names) == 4
+    with pytest.raises(ValueError, match="must adjoin"):
+        apart.sizes(field)
+
+
+def test_a_zone_is_part_of_a_name_in_every_notation() -> None:
+    check_state("n_i@exit")
+    for wrong in ("n_i@", "@exit", "n_i@a@b", "n i@a"):
+        with pytest.raises(ValueError, match="must be a word"):
+            check_state(wrong)
+    assert latex_derivative("n_i@exit") == r"\dot{n}_{i,exit}"
+    assert latex_term_name("x@a*<n_i*n_n>@b") == r"x_{a} \, \langle n_{i} \, n_{n} \rangle_{b}"
+    assert "<i>n</i><sub>i,exit</sub>" in equation_html("n_i@exit", {"n_i@exit": 1.0})
+    library = ep.polynomial(NAMES, degree=2)
+    assert library.names[library.index("n_n@b*n_i@a")] == "n_i@a*n_n@b"
+    relation = parse_relation("n_i@a: n_i@a*n_n@a == -1 * n_n@a: n_i@a*n_n@a")
+    assert [state for _, state, _ in relation.factors] == ["n_i@a", "n_n@a"]
+
+
+def test_roles_in_zones_are_those_of_neighbours() -> None:
+    roles = ROLES.in_zones(SIZES)
+    library = ep.polynomial(NAMES, degree=3)
+    found: dict[str, list] = {}
+    for process in roles.processes(library, NAMES):
+        found.setdefault(process.role, []).append(process)
+    assert list(found) == [
+        "n_n@a to n_i@a", "n_n@b to n_i@b", "n_n@a to n_n@b", "n_i@a to n_i@b", "n_i@b out",
+        "n_n@b out",
+    ]  # fmt: skip
+    assert [p.term for p in found["n_n@a to n_i@a"]] == [
+        "n_i@a*n_n@a", "n_i@a*n_n@a^2", "n_i@a^2*n_n@a", "n_i@a*n_n@a*n_n@b"
+    ]  # fmt: skip
+    assert [p.term for p in found["n_n@a to n_n@b"]] == [
+        "n_n@a", "n_n@a^2", "n_i@a*n_n@a", "n_n@a*n_n@b"
+    ]  # fmt: skip
+    moved = found["n_n@a to n_n@b"][0]
+    assert moved.factors == {("n_n@a", "n_n@a"): -1.0, ("n_n@b", "n_n@a"): 0.5}
+    assert roles.inflow == {"n_n@a": pytest.approx(1.2)}  # 0.4 of three parts enters one
+
+
+def test_a_chain_of_three_zones_has_two_neighbours_in_the_middle() -> None:
+    roles = ROLES.in_zones({"a": 1.0, "b": 1.0, "c": 1.0})
+    middle = next(terms for giver, taker, terms in roles.exchange if taker == "n_i@b")
+    assert middle[-2:] == ["n_n@b*n_i@b*n_n@a", "n_n@b*n_i@b*n_n@c"]
+    assert not any("a" in giver[-1] and "c" in taker[-1] for giver, taker, _ in roles.exchange)
+
+
+# Two vessels, b twice as large: what leaves a by N or G enters b, and leaves it again.
+R, F, G, OUT, P = 1.0, 0.6, 0.5, 0.8, 0.1
+CHAIN = {
+    "n_i@a": {"n_i@a": -F, "n_i@a*n_n@a": R},
+    "n_n@a": {"1": 1.2, "n_n@a": -G, "n_i@a*n_n@a": -R},
+    "n_i@b": {"n_i@a": F / 2, "n_i@b": -OUT, "n_i@b*n_n@b": R},
+    "n_n@b": {"n_n@a": G / 2, "n_n@b": -P, "n_i@b*n_n@b": -R},
+}
+
+
+def chain() -> ep.Trajectory:
+    library = ep.polynomial(NAMES, degree=3)
+    coef = np.zeros((len(library), 4))
+    for k, terms in enumerate(CHAIN.values()):
+        for term, value in terms.items():
+            coef[library.index(term), k] = value
+    model = ep.SparseModel(library, NAMES, coef, dict.fromkeys(NAMES, "m^-3"))
+    t = np.linspace(0.0, 30.0, 3001)
+    return ep.Trajectory(
+        t, model.simulate(t, np.array([0.1, 2.0, 1.5, 0.2])).states, NAMES, units=model.units
+    )
+
+
+def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
+    record = chain()
+    method = ep.Regression(
+        search=ep.BestSubset(max_terms=6, n_best=100), selection=ep.RefinedScore(), depth=4
+    )
+    library = ep.polynomial(NAMES, degree=3)
+    found = ep.discover(record, library, method, roles=ROLES.in_zones(SIZES))
+    for state, terms in CHAIN.items():
+        assert found.model.terms(state) == pytest.approx(terms, rel=2e-3)
+    ours, theirs = (found.model.terms(s)["n_i@a"] for s in ("n_i@a", "n_i@b"))
+    assert theirs == -ours / 2  # exactly, by the sizes
+    assert {p.role for p in found.constraint.processes} == {
+        p.role for p in ROLES.in_zones(SIZES).processes(library, NAMES)
+    }
+
+
+def test_what_a_search_demands_of_directions_is_kept() -> None:
+    record = chain()
+    back = ep.Roles(exchange=[("n_i", "n_n")], outflow=STATES, inflow={"n_n": 0.4}).in_zones(SIZES)
+    method = ep.Regression(
+        search=ep.BestSubset(max_terms=6, n_best=100), selection=ep.RefinedScore(), depth=2
+    )
+    found = ep.discover(record, ep.polynomial(NAMES, degree=3), method, roles=back)
+    assert "n_i@a to n_n@a > 0 in the mean" in found.note  # no model gives ions to neutrals
+
+
+def test_signs_and_terms_are_of_one_zone() -> None:
+    for roles in (
+        ep.Roles(signs=["n_i: n_i < 0"]),
+        ep.Roles(outflow={"n_i": ["n_i"]}),
+        ep.Roles(exchange=[("n_n", "n_i", ["n_i"])]),
+    ):
+        with pytest.raises(ValueError, match="terms by neighbourhood"):
+            roles.in_zones(SIZES)
+    with pytest.raises(ValueError, match="sizes must be positive"):
+        ep.Roles(sizes={"x": 0.0})
+    with pytest.raises(ValueError, match="by any term or those of a list"):
+        ep.Roles(exchange=[("x", "y", ["x"], 3)])
+
+
+def test_an_exchange_takes_the_terms_that_are_named() -> None:
+    library = ep.polynomial(STATES, degree=2)
+    roles = ep.Roles(exchange=[("n_n", "n_i", ["n_n*n_i"])], outflow={"n_i": ["n_i", "n_i*n_n"]})
+    found = roles.processes(library, STATES)
+    assert [(p.role, p.term) for p in found] == [
+        ("n_n to n_i", "n_i*n_n"), ("n_i out", "n_i"), ("n_i out", "n_i*n_n")
+    ]  # fmt: skip
+    assert not any(p.one_sign for p in found)
+
+
+def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones, run) -> None:
+    """A model of made-up rates: each process has the rate of its own terms, and its record."""
+    parts = side_by_side(zones, field)
+    balances = {name: ep.thruster.zone_balance(field, zone) for name, zone in parts.items()}
+    sizes = ZoneAverage(STATES, zones=zones).sizes(field)
+    roles = ROLES.in_zones(sizes).with_known(inflows_of(balances))
+    library = ep.polynomial(run.state_names, degree=3)
+    chosen = {p.role: p for p in roles.processes(library, run.state_names)}  # the last of each
+    held = constraint_of(library, run.state_names, [*chosen.values()], roles.known_inflow)
+    assert held is not None
+    rates = 1e23 * np.arange(1.0, 7.0)
+    theta = library.evaluate(run.states)
+    means = [theta[:, library.index(p.term)].mean() for p in chosen.values()]
+    values = held.coef(shares_of(held) @ (rates / means))
+    coef = np.zeros((len(library), 4))
+    for (state, term), value in zip(held.coefficients, values, strict=True):
+        coef[library.index(term), run.state_names.index(state)] = value
+    model = ep.SparseModel(library, run.state_names, coef, run.units)
+    found = {p.name: p for p in zone_processes(model, held, run, balances, sizes)}
+    assert [p.modelled.mean() for p in found.values()][:6] == pytest.approx(rates)
+    whole = ep.thruster.zone_balance(field, ep.Zone(z="channel"))
+    share = sum(sizes.values()) / sizes["exit"]
+    for name, term in (("ions that leave", "exit_i"), ("neutrals that leave", "exit_n")):
+        assert found[name].recorded == pytest.approx(share * whole[term].values, rel=1e-3)
+    inner = balances["anode"]["exit_n"].values
+    assert found["neutrals from anode to exit"].recorded == pytest.approx(inner)
+    assert found["neutrals that enter"].recorded.mean() == pytest.approx(
+        float(whole["supply"].mean()) * sum(sizes.values()) / sizes["anode"], rel=1e-3
+    )
+    made = balances["exit"]["ionization"].values - balances["exit"]["returned"].values
+    name = "exit: neutrals that become ions, less those given back"
+    assert np.array_equal(found[name].recorded, made)
