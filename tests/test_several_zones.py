@@ -11,6 +11,7 @@ from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.library.roles import constraint_of, shares_of
 from ep2sindy.studies.balance import inflows_of, zone_processes
+from tests.programs import composed, computed
 
 STATES = ["n_i", "n_n"]
 ROLES = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": 0.4})
@@ -84,6 +85,18 @@ def test_zones_that_make_no_sense_are_refused(field, zones, message) -> None:
         ep.zone_averages(field, zones, states=STATES)
 
 
+def test_a_number_cuts_the_zone_into_equal_parts(field) -> None:
+    settings = ZoneAverage(STATES, ep.Zone(z="channel"), zones=2)
+    parts = settings.parts(field)
+    assert [part.z for part in parts.values()] == [(0.0, 0.0125), (0.0125, 0.025)]
+    assert settings.columns(["n_i"]) == ["n_i@z1", "n_i@z2"]
+    assert settings.trajectory(field, inputs=[], label="").state_names[-1] == "n_n@z2"
+    whole = ZoneAverage(STATES, zones=3).parts(field)
+    assert whole["z3"].z[1] > field["z"].values[-1]
+    with pytest.raises(ValueError, match="zones must be"):
+        ZoneAverage(STATES, zones=0)
+
+
 def test_zones_that_exchange_must_adjoin(field) -> None:
     apart = ZoneAverage(STATES, zones={"a": (0.0, 0.01), "b": (0.015, 0.025)})
     assert len(apart.trajectory(field, inputs=[], label="").state_names) == 4
@@ -150,7 +163,7 @@ def chain() -> ep.Trajectory:
         for term, value in terms.items():
             coef[library.index(term), k] = value
     model = ep.SparseModel(library, NAMES, coef, dict.fromkeys(NAMES, "m^-3"))
-    t = np.linspace(0.0, 30.0, 3001)
+    t = np.linspace(0.0, 30.0, 601)
     return ep.Trajectory(
         t, model.simulate(t, np.array([0.1, 2.0, 1.5, 0.2])).states, NAMES, units=model.units
     )
@@ -238,3 +251,36 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     made = balances["exit"]["ionization"].values - balances["exit"]["returned"].values
     name = "exit: neutrals that become ions, less those given back"
     assert np.array_equal(found[name].recorded, made)
+
+
+def test_the_experiment_reports_zones_and_their_processes(tmp_path) -> None:
+    record = chain()
+    z = np.array([0.0025, 0.0075, 0.0125, 0.0175, 0.0225, 0.0275])
+    density = {
+        name: (("time", "z"), 1e18 * record.columns([f"{name}@{k}" for k in "aabbbb"]))
+        for name in STATES
+    }
+    field = xr.Dataset(density, coords={"time": 1e-6 * record.t, "z": z})
+    for name, unit in (("n_i", "m^-3"), ("n_n", "m^-3"), ("time", "s"), ("z", "m")):
+        field[name].attrs["units"] = unit
+    ep.write_field(field, tmp_path / "chain.nc")
+    found = computed(composed(
+        "+exp=zones", "data=file", f"data.path={tmp_path}/chain.nc", f"output={tmp_path}",
+        "trajectory.zones={a: [0.0, 0.01], b: [0.01, 0.03]}", "data.z.name=z", "bootstraps.n=4",
+        "living.search.max_terms=7", "living.depth=2", "rollout_s=null",
+    ))  # fmt: skip
+    assert found.summary["data"]["variables"] == NAMES
+    result = found.summary["models"]["zones"]
+    living = result["living"]["coefficients"]
+    taken = living["n_i@a"]["n_i@a"]["value"]
+    assert living["n_i@b"]["n_i@a"]["value"] == pytest.approx(-taken / 2, rel=1e-6)
+    assert living["n_n@a"]["1"]["value"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
+    processes = {each["process"]: each for each in result["balance"]["processes"]}
+    recorded = [each["recorded"] for each in processes.values()]
+    assert np.isnan(recorded).all()  # a file of densities alone
+    assert processes["neutrals from a to b"]["modelled"] == pytest.approx(
+        G * 1e24 * record.states[:, 1].mean(), rel=0.01
+    )
+    terms = {(each["state"], each["term"]): each for each in result["balance"]["terms"]}
+    assert terms["n_i@b", "n_i@a"]["process"] == "ions from a to b"
+    assert "<mi>i</mi><mo>,</mo><mi>a</mi>" in found.page  # n with the index i,a

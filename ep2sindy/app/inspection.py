@@ -30,6 +30,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "ils": ("n_i", "n_n"),
     "parametric": ("n_i", "n_n", "R_ion", "u_iz"),
     "predict": ("n_i", "n_n"),
+    "zones": ("n_i", "n_n"),
     "pointwise": ("n_i", "n_n", "R_ion", "u_iz"),
     "trace": (),
     "discover": (),

@@ -15,6 +15,7 @@ import xarray as xr
 from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, check_field, grid_points
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone, resolve_zone, zone_average, zone_slices
+from ep2sindy.runtime.values import check_count
 
 
 def zone_averages(
@@ -101,14 +102,39 @@ def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset)
 class ZoneAverage:
     """Settings of `zone_average` without the field, for use in a config.
 
-    zones: of `zone_averages`, which are then taken in place of the one zone.
+    zones: those of `zone_averages`, taken in place of the one zone; or a number, for as many parts
+    of that zone, of equal length in z, called z1, z2 and so on.
+    Raises ValueError for a number of zones below one.
     """
 
     states: Sequence[str]
     zone: Zone | None = None
     products: Sequence[str] = ()
     axisymmetric: bool = True
-    zones: Mapping[str, Zone | Sequence[float]] | None = None
+    zones: Mapping[str, Zone | Sequence[float]] | int | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.zones, int):
+            check_count("zones", self.zones)
+
+    def parts(self, field: xr.Dataset) -> dict[str, Zone]:
+        """The zones by name; a single one is called ""."""
+        if isinstance(self.zones, Mapping):
+            return side_by_side(self.zones, field)
+        whole = resolve_zone(self.zone, field)
+        if self.zones is None:
+            return {"": whole}
+        begin_m, end_m = map(float, whole.z or cell_edges(grid_points(field, "z"))[[0, -1]])
+        edges_m = np.linspace(begin_m, end_m, self.zones + 1)
+        cut = {n: replace(whole, z=z) for n, z in zip(self._names, pairwise(edges_m), strict=True)}
+        return side_by_side(cut, field)
+
+    @property
+    def _names(self) -> list[str]:
+        """Of several zones."""
+        if isinstance(self.zones, int):
+            return [f"z{k + 1}" for k in range(self.zones)]
+        return list(self.zones or {})
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
         settings: Any = {
@@ -120,11 +146,11 @@ class ZoneAverage:
         }
         if self.zones is None:
             return zone_average(field, self.zone, **settings)
-        return zone_averages(field, self.zones, **settings)
+        return zone_averages(field, self.parts(field), **settings)
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """What the averages of variables are called in the trajectory."""
-        return list(names) if self.zones is None else in_zones(self.zones, names)
+        return list(names) if self.zones is None else in_zones(self._names, names)
 
     def sizes(self, field: xr.Dataset) -> dict[str, float]:
         """Length in m of each of several zones; empty for a single one.
@@ -133,12 +159,12 @@ class ZoneAverage:
         """
         if self.zones is None:
             return {}
-        parts = side_by_side(self.zones, field)
+        parts = self.parts(field)
         inside = [zone_slices(field, zone)["z"] for zone in parts.values()]
         if any(there.start != here.stop for here, there in pairwise(inside)):
             raise ValueError(
                 "zones that exchange something must adjoin, each beginning where the one before "
-                f"ends: {dict(self.zones)} came"
+                f"ends: {self.zones} came"
             )
         lengths = cell_sizes(field, "z", axisymmetric=self.axisymmetric)
         return {n: float(lengths[part].sum()) for n, part in zip(parts, inside, strict=True)}
@@ -148,7 +174,7 @@ class ZoneAverage:
         if self.zones is None:
             words = describe_zone(self.zone, field)
             return f"average over {words}" if words else ""
-        parts = side_by_side(self.zones, field).items()
+        parts = self.parts(field).items()
         return "; ".join(f"{name}: average over {describe_zone(z, field)}" for name, z in parts)
 
 

@@ -15,9 +15,9 @@ from ep2sindy.data.fields import grid_points
 from ep2sindy.data.gaps import describe_gaps
 from ep2sindy.data.open import files_of
 from ep2sindy.data.quantities import DoubtfulUnit, unit_doubts
-from ep2sindy.data.sampling import ZoneAverage, side_by_side
+from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
-from ep2sindy.data.zones import Zone, describe_zone, resolve_zone
+from ep2sindy.data.zones import Zone, describe_zone
 from ep2sindy.library.library import Library
 from ep2sindy.operating.records import OperatingRecord, naming, point_label
 from ep2sindy.report.run import Run
@@ -150,8 +150,7 @@ def balances_of(source: Source, field: xr.Dataset, run: Run) -> dict[str, xr.Dat
     sampling = source.trajectory
     if not isinstance(sampling, ZoneAverage) or not {"n_i", "n_n"} <= set(field.data_vars):
         return {}
-    single = {"": resolve_zone(sampling.zone, field)}
-    zones = single if sampling.zones is None else side_by_side(sampling.zones, field)
+    zones = sampling.parts(field)
     if any(zone.r is not None for zone in zones.values()):
         return {}
     try:
