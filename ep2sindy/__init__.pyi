@@ -19,6 +19,7 @@ from ep2sindy.library.library import Library as Library
 from ep2sindy.library.library import polynomial as polynomial
 from ep2sindy.library.library import named_terms as named_terms
 from ep2sindy.library.roles import Roles as Roles  # for configs
+from ep2sindy.signals.delay import Delay as Delay
 
 # Discover
 from ep2sindy.discovery.discover import discover as discover

@@ -44,7 +44,7 @@ def test_every_role_has_its_terms_and_no_other():
 
 def test_the_constraint_is_that_of_the_processes():
     chosen = processes(("n_n to n_i", "n_i*n_n"), ("n_n to n_i", "n_i"), ("n_i out", "n_i"))
-    held = constraint_of(LIBRARY, STATES, chosen, {"n_n": 7.0})
+    held = constraint_of(LIBRARY, STATES, chosen, {("n_n", "1"): 7.0})
     assert held.coefficients == (
         ("n_i", "n_i"), ("n_i", "n_i*n_n"), ("n_n", "1"), ("n_n", "n_i"), ("n_n", "n_i*n_n"),
     )  # fmt: skip
@@ -172,3 +172,28 @@ def test_three_states_exchange_in_pairs():
     coef = dict(zip(held.coefficients, held.coef(np.array([-2.0, -3.0, -5.0])), strict=True))
     assert coef == {("x", "x"): -2.0, ("y", "x"): 2.0, ("y", "y"): -3.0, ("z", "y"): 3.0,
                     ("z", "z"): -5.0}  # fmt: skip
+
+
+def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
+    roles = ep.Roles(outflow=["n_i"], equations={"n_n": {"n_i^2*n_n": 2.0, "1": -1.0}})
+    library = ep.polynomial(["n_i"], degree=2)
+    whole = roles.with_known_terms(library, STATES)
+    assert whole.names == (*library.names, "n_i^2*n_n")
+    processes = roles.processes(library, STATES)
+    assert [(p.role, p.term) for p in processes] == [("n_i out", "n_i"), ("n_i out", "n_i^2")]
+    held = constraint_of(whole, STATES, processes[:1], roles.known)
+    assert held.coefficients == (("n_i", "n_i"), ("n_n", "1"), ("n_n", "n_i^2*n_n"))
+    assert held.coef(np.array([-5.0])).tolist() == [-5.0, -1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("equations", "message"),
+    [
+        ({"n_i": {"n_i": 1.0}}, r"roles or a known equation: \['n_i'\] have both"),
+        ({"n_x": {"n_i": 1.0}}, r"must name states: \['n_x'\] came"),
+        ({"n_n": {"n_y": 1.0}}, "n_y"),
+    ],
+)
+def test_known_equations_that_make_no_sense_are_refused(equations, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        ep.Roles(outflow=["n_i"], equations=equations).processes(LIBRARY, STATES)

@@ -310,8 +310,9 @@ class Regression:
                 "roles tie all equations together, so a rule must judge whole systems: selection "
                 f"must be FreeRunScore() or RefinedScore(), {self.selection!r} came"
             )
+        library = roles.with_known_terms(task.library, task.states)
         with progress.stage(None, "", "rows of the regression"):
-            problems = self.formulation.assemble(task.runs, task.library, rng=rng)
+            problems = self.formulation.assemble(task.runs, library, rng=rng)
         systems = conserving_systems(problems, task, roles, self.search, depth=self.depth)
         decision = self.selection.judge(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.library.library import Library
+from ep2sindy.library.library import Library, library_of
 from ep2sindy.library.names import VARIABLE
 from ep2sindy.library.relations import Constraint, Place, Process
+from ep2sindy.library.terms import read_term
 from ep2sindy.runtime.values import check_list
 
 KNOWN, FREE, EITHER = "known", "free", "known or free"
@@ -40,9 +41,10 @@ class Roles:
     equation of free terms. sizes: state -> length or volume that it is an average over; what leaves
     a small place changes a large one by less. Absent ones are one. forward: True if in the mean
     over the records every exchange moves more from the first state to the second than back, and
-    every outflow takes away.
-    Raises ValueError for an exchange of a state with itself, a size that is not positive, or a sign
-    that cannot be read.
+    every outflow takes away. equations: state -> terms with their coefficients in SI, where the
+    equation is known and nothing is to be found; the library need not hold these terms.
+    Raises ValueError for an exchange of a state with itself, a size that is not positive, a sign
+    that cannot be read, or a role of a state whose equation is known.
 
     >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"])
     >>> library = ep.polynomial(["prey", "predator"], degree=2)
@@ -56,6 +58,7 @@ class Roles:
     signs: Sequence[str] = ()
     sizes: Mapping[str, float] = field(default_factory=dict)
     forward: bool = False
+    equations: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_list("exchange", self.exchange)
@@ -82,13 +85,21 @@ class Roles:
                 )
         for text in self.signs:
             parse_sign(text)
+        if both := [state for state in self.equations if state in self._with_roles]:
+            raise ValueError(f"a state has roles or a known equation: {both} have both")
+
+    @property
+    def _with_roles(self) -> set[str]:
+        """The states whose equations the roles make."""
+        return {s for entry in self.exchange for s in entry[:2]} | {*self.outflow, *self.inflow}
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Every state that has a role, once."""
+        """Every state that is named, once."""
         named = [state for entry in self.exchange for state in entry[:2]]
         signed = [parse_sign(text)[0][0] for text in self.signs]
-        return tuple(dict.fromkeys([*named, *self.outflow, *self.inflow, *signed, *self.sizes]))
+        more = [*self.outflow, *self.inflow, *signed, *self.sizes, *self.equations]
+        return tuple(dict.fromkeys([*named, *more]))
 
     @property
     def signed(self) -> dict[Place, int]:
@@ -96,9 +107,12 @@ class Roles:
         return dict(map(parse_sign, self.signs))
 
     @property
-    def known_inflow(self) -> dict[str, float]:
-        """The inflows that are given as numbers, by state."""
-        return {s: float(v) for s, v in self.inflow.items() if not isinstance(v, str)}
+    def known(self) -> dict[Place, float]:
+        """The coefficients that are given as numbers: of inflows and known equations."""
+        given = {(s, "1"): float(v) for s, v in self.inflow.items() if not isinstance(v, str)}
+        for state, terms in self.equations.items():
+            given |= {(state, term): float(value) for term, value in terms.items()}
+        return given
 
     def with_known(self, known: Mapping[str, float]) -> Roles:
         """These roles with a record's inflows in place of "known".
@@ -183,13 +197,26 @@ class Roles:
                 )
         for state in [s for s, value in self.inflow.items() if value == FREE]:
             found.append(Process(f"{state} in", "1", MappingProxyType({(state, "1"): 1.0})))
-        roles = {s for entry in self.exchange for s in entry[:2]} | {*self.outflow, *self.inflow}
-        for state in [s for s in states if s not in roles]:
+        taken = self._with_roles | {*self.equations}
+        for state in [s for s in states if s not in taken]:
             found += [
                 Process(f"{state} free", term, MappingProxyType({(state, term): 1.0}))
                 for term in library.names
             ]
         return found
+
+    def with_known_terms(self, library: Library, states: Sequence[str]) -> Library:
+        """The library with all terms of the known equations; those added stand in no other.
+
+        Raises ValueError for a term of something that is no variable or state.
+        """
+        named = [term for terms in self.equations.values() for term in terms]
+        missing = [term for term in dict.fromkeys(named) if term not in library.names]
+        if not missing:
+            return library
+        variables = tuple(dict.fromkeys([*library.variables, *states]))
+        more = [read_term(term, variables) for term in missing]
+        return library_of(variables, [*library.terms, *more])
 
     def _leaving(self, state: str, library: Library) -> list[str]:
         """The terms by which a state may flow out."""
@@ -208,10 +235,11 @@ class Roles:
                 f"the inflow of {open_} is known only where a record gives it, as in the "
                 f"experiments on a simulated thruster: give a number in SI per second, or {FREE!r}"
             )
-        if self.known_inflow or FREE in self.inflow.values():
+        if self.inflow:
             library.index("1")
         for _, term in self.signed:
             library.index(term)
+        self.with_known_terms(library, states)
 
 
 def _names(library: Library, terms: Sequence[str]) -> list[str]:
@@ -246,18 +274,18 @@ def constraint_of(
     library: Library,
     states: Sequence[str],
     processes: Sequence[Process],
-    known: Mapping[str, float],
+    known: Mapping[Place, float],
 ) -> Constraint | None:
-    """The exact constraint of a model with these processes and known inflows.
+    """The exact constraint of a model with these processes and known coefficients.
 
     Returns None if the coefficients do not determine the processes, as with an exchange and the
     outflow of both states by one term.
     """
     places = {place for process in processes for place in process.factors}
-    places |= {(state, "1") for state in known}
+    places |= {*known}
     order = sorted(places, key=lambda at: (states.index(at[0]), library.index(at[1])))
     shares = np.array([[p.factors.get(place, 0.0) for p in processes] for place in order])
-    fixed = np.array([known.get(s, 0.0) if term == "1" else 0.0 for s, term in order])
+    fixed = np.array([known.get(place, 0.0) for place in order])
     free = _independent_rows(shares)
     if len(free) < len(processes):
         return None

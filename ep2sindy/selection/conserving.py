@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint, Process
+from ep2sindy.library.relations import Constraint, Place, Process
 from ep2sindy.library.roles import Roles, constraint_of, shares_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.refine import with_coef
@@ -31,11 +32,13 @@ def conserving_systems(
     One regression over the training rows of all equations, each weighted by its residuals, has one
     column per process; so a search proposes processes, and what they move is conserved exactly. Of
     every size, the `depth` best systems are kept in which every role is played by a process, in its
-    direction if the roles demand one and any system of the search obeys.
+    direction if the roles demand one and any system of the search obeys. problems: rows of the
+    task's library with the terms of known equations, `with_known_terms`.
     Raises ValueError for roles that do not fit the task, or if no system plays them all.
     """
     processes = roles.processes(task.library, task.states)
-    columns, target = _joint_rows(problems, task, processes, roles.known_inflow)
+    task = replace(task, library=problems[0].library)
+    columns, target = _joint_rows(problems, task, processes, roles.known)
     norms = column_norms(columns)
     unit = columns / norms
     masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
@@ -65,9 +68,9 @@ def _joint_rows(
     problems: Sequence[RegressionRows],
     task: Task,
     processes: Sequence[Process],
-    known: Mapping[str, float],
+    known: Mapping[Place, float],
 ) -> tuple[Float[np.ndarray, "rows processes"], Float[np.ndarray, " rows"]]:
-    """Rows of all equations, with one column per process; known inflows are subtracted.
+    """Rows of all equations, with one column per process; what is known is subtracted.
 
     An equation's rows are divided by what a fit of the whole library leaves of its target, so that
     no equation counts for its units.
@@ -78,7 +81,9 @@ def _joint_rows(
             shares = np.array(
                 [[p.factors.get((state, term), 0.0) for p in processes] for term in library.names]
             )
-            fixed = np.where(np.array(library.names) == "1", known.get(state, 0.0), 0.0)
+            if not shares.any():
+                continue  # the whole equation is known
+            fixed = np.array([known.get((state, term), 0.0) for term in library.names])
             target = problem.train_target(k)
             theta = problem.train_theta
             left = target - theta @ np.linalg.lstsq(theta, target, rcond=None)[0]
@@ -146,7 +151,7 @@ def _system(
     means: Float[np.ndarray, " terms"],
 ) -> TrialSystem | None:
     """The system of these processes; None if its coefficients do not tell them apart."""
-    held = constraint_of(task.library, task.states, processes, roles.known_inflow)
+    held = constraint_of(task.library, task.states, processes, roles.known)
     if held is None:
         return None
     empty = np.zeros((len(task.library), len(task.states)))

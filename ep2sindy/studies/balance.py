@@ -171,8 +171,8 @@ def zone_processes(
     for process, value in zip(held_to.processes, values, strict=True):
         column = theta[:, model.library.index(process.term)]
         rates.setdefault(_ends(process), {})[process.term] = value * column
-    for (state, _), value in zip(held_to.coefficients, held_to.d, strict=True):
-        if value:
+    for (state, term), value in zip(held_to.coefficients, held_to.d, strict=True):
+        if term == "1" and value:
             rates.setdefault(("", state), {})["1"] = np.full(len(theta), value)
     known = {zone: _recorded(balance, data) for zone, balance in balances.items()}
     gone = _through_ends(known, sizes)
