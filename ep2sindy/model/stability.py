@@ -419,7 +419,7 @@ def find_closed_orbit(
 
 def deviations(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarray, " n_states"]:
     """Standard deviations of the states; the size of a constant state, or one if it is zero."""
-    # Less than the first run resolves is rounding, by which a point of rest would look like a cycle.
+    # Less than the first run resolves is rounding: by it, a point of rest would look like a cycle.
     std, size = states.std(axis=0), np.abs(states).max(axis=0)
     return np.where(std > START_RTOL * size, std, np.where(size > 0.0, size, 1.0))
 
