@@ -2,10 +2,10 @@
 
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
 finds them: over operating points, splits of the record and seeds, on the default source and on the
-former one; beside free terms, in other zones, in several at once (`several`, `three`), in noise,
-and from the (z, r) simulator. Every model
-called living is run again by another solver, ten times as long; its processes are compared with the
-balance of the zone. Prints the tables of docs/living.md; name some to print those alone.
+former one; beside free terms, in other zones, in several at once (`several`, `three`), with delayed
+terms, in noise, and from the (z, r) simulator. Every model called living is run again by another
+solver, ten times as long; its processes are compared with the balance of the zone. Prints the
+tables of docs/living.md; name some to print those alone.
 """
 
 from __future__ import annotations
@@ -62,12 +62,13 @@ SETS = {"default": ep.thruster.Thruster(), "former": FORMER}
 class Record:
     """Averages over zones, the balance of each, and their lengths if there are several.
 
-    balances: by zone; a single one is called "".
+    balances: by zone; a single one is called "". delays: of the neutrals, if they are followed.
     """
 
     run: ep.Trajectory
     balances: dict[str, xr.Dataset]
     sizes: dict[str, float] = field_of(default_factory=dict)
+    delays: Sequence[ep.Delay] = ()
 
     def processes(self, model: ep.SparseModel, held: Constraint | None) -> list[ComparedProcess]:
         """What zones exchange, in the record and by a model."""
@@ -141,6 +142,16 @@ def zones_record(label: str, n_zones: int) -> Record:
     )
 
 
+def with_delays(whole: Record, delay_s: float, n_stages: int) -> Record:
+    """A record in which the neutrals of every zone are followed with a delay."""
+    run, neutrals = whole.run, [name for name in whole.run.state_names if name.startswith("n_n")]
+    delays = [ep.Delay(name, delay_s, n_stages) for name in neutrals]
+    for delay in delays:
+        run = delay.along(run)
+    kept = {name: b.sel(time=slice(run.t[0], None)) for name, b in whole.balances.items()}
+    return Record(run, kept, whole.sizes, delays)
+
+
 def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -> ep.Discovery:
     """Under the roles of `+exp=breathing`: up to six free coefficients of degree 3."""
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow=inflows_of(whole.balances))
@@ -151,6 +162,13 @@ def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -
         depth=16,
     )
     library = ep.polynomial(STATES, degree=3)
+    if whole.delays:
+        powers = {s: [s, f"{s}^2", f"{s}^3"] for s in STATES}
+        both = [n for n in library.names if n != "1"]
+        roles = replace(roles, exchange=[("n_n", "n_i", both)], outflow=powers, forward=True)
+        roles = move_on_later(roles, whole.delays)
+        names = [*STATES, whole.delays[0].last]
+        library = library.over(names) + ep.polynomial(names, degree=1)
     return ep.discover([fitted], library, method, roles=roles, seed=seed)
 
 
@@ -161,14 +179,31 @@ def by_neighbourhood(
     two = len(whole.sizes) == 2
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known"})
     roles = roles.in_zones(whole.sizes).with_known(inflows_of(whole.balances))
+    names = [name for name in fitted.state_names if "lag" not in name]
+    library = ep.polynomial(names, degree=3)
+    if whole.delays:
+        roles = move_on_later(roles, whole.delays)
+        last = [delay.last for delay in whole.delays]
+        library = library.over([*names, *last]) + ep.polynomial([*names, *last], degree=1)
     method = ep.Regression(
         ep.WeightedWeak() if weak else ep.Differential(),
         ep.BestSubset(max_terms=14 if two else 20, n_best=200 if two else 1000),
         ep.FreeRunScore(seed=seed, window_periods=8.0),
         depth=6 if two else 4,
     )
-    library = ep.polynomial(fitted.state_names, degree=3)
     return ep.discover([fitted], library, method, roles=roles, seed=seed)
+
+
+def move_on_later(roles: ep.Roles, delays: Sequence[ep.Delay]) -> ep.Roles:
+    """The roles where what moves on, or leaves, may also do so as it was some time ago."""
+    last = {delay.state: delay.last for delay in delays}
+    exchange = [
+        (giver, taker, [*terms, last[giver]] if giver in last and giver in terms else terms)
+        for giver, taker, terms in roles.exchange
+    ]
+    outflow = {s: [*terms, *filter(None, [last.get(s)])] for s, terms in roles.outflow.items()}
+    known = {name: terms for delay in delays for name, terms in delay.equations.items()}
+    return replace(roles, exchange=exchange, outflow=outflow, equations=known)
 
 
 def free(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -> ep.Discovery:
@@ -304,6 +339,17 @@ def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
     print(line("all", everything))
 
 
+def print_delayed() -> None:
+    """Neutrals that may leave, or move on, as they were 60 us (some period) ago."""
+    print("\nneutrals with a delay of 60 us in four stages, whole channel; last quarter, one draw")
+    cases = {label: (record(label), 4, conserving) for label in POINTS}
+    cases |= {"two zones": (zones_record("300V_5mgs", 2), 3, by_neighbourhood)}
+    for name, (bare, n_stages, search) in cases.items():
+        whole = with_delays(bare, 60e-6, n_stages)
+        found = [case(*parts(whole.run, "last"), whole, seed=0, search=search)]
+        print("\n".join([line(name, found), structures(found)]), flush=True)
+
+
 def print_zones() -> None:
     """Six operating points, other zones: free terms, since no inflow is known."""
     print(f"\nsix points, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
@@ -374,6 +420,7 @@ def main() -> None:
         "zones": print_zones,
         "several": lambda: print_several(2, [(split, 0) for split in SPLITS]),
         "three": lambda: print_several(3, [("last", 0)]),
+        "delayed": print_delayed,
         "noise": print_noise,
         "plane": print_plane,
     }

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
+import ep2sindy as ep
 from ep2sindy.signals.attractor import (
     _moving_average,
     best_shift,
@@ -129,3 +130,28 @@ def test_distances_of_distributions_and_spectra():
     assert spectrum_distance(t, one, one) == 0.0
     assert spectrum_distance(t, one, other) > 0.6
     assert spectrum_distance(t, one, 7.0 * one) == pytest.approx(0.0, abs=1e-12)
+
+
+def noisy_wave(share: float, *, n_periods: int = 50) -> tuple[ep.Trajectory, np.ndarray]:
+    """A wave with one overtone in white noise, given in its standard deviations; and the wave."""
+    t = np.linspace(0.0, float(n_periods), 40 * n_periods + 1)
+    wave = 3.0 + np.cos(2.0 * np.pi * t) + 0.5 * np.sin(4.0 * np.pi * t)
+    noise = share * wave.std() * np.random.default_rng(0).normal(size=len(t))
+    inputs = np.arange(len(t), dtype=np.float64)[:, None]
+    return ep.Trajectory(t, (wave + noise)[:, None], ["x"], inputs, ["u"], label="wave"), wave
+
+
+def test_the_mean_cycle_is_as_certain_as_its_harmonics() -> None:
+    run, wave = noisy_wave(2.0)
+    found = ep.signals.mean_cycle(run)
+    # Five coefficients and the frequency from n samples: the noise falls by sqrt(6 / n).
+    off = (found.states[:, 0] - wave).std() / wave.std()
+    assert off < 2.0 * 2.0 * np.sqrt(6.0 / run.n_samples)
+    assert np.array_equal(found.inputs, run.inputs)
+    assert (found.label, found.units) == ("wave", run.units)
+
+
+def test_what_does_not_repeat_has_no_mean_cycle() -> None:
+    run, _ = noisy_wave(1.0, n_periods=2)
+    with pytest.raises(ValueError, match="repeats itself, three periods or more: wave does not"):
+        ep.signals.mean_cycle(run)

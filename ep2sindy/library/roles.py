@@ -7,6 +7,7 @@ search takes it into all of them or into none, and what it moves is conserved.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -254,12 +255,17 @@ def _beside(zones: Sequence[str], k: int) -> list[str]:
 
 def _exchanged(giver: str, taker: str, *, near: Sequence[str]) -> list[str]:
     """Terms by which a state gives another of its zone something; see `Roles.in_zones`."""
-    return [f"{giver}*{taker}", *(f"{giver}*{taker}*{x}" for x in (giver, taker, *near))]
+    return [_product(giver, taker), *(_product(giver, taker, x) for x in (giver, taker, *near))]
 
 
 def _carried(state: str, others: Sequence[str]) -> list[str]:
     """Terms by which a state moves on."""
-    return [state, *(f"{state}*{other}" for other in others)]
+    return [state, *(_product(state, other) for other in others)]
+
+
+def _product(*names: str) -> str:
+    powers = Counter(names)
+    return "*".join(name if n == 1 else f"{name}^{n}" for name, n in powers.items())
 
 
 def parse_sign(text: str) -> tuple[Place, int]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy import fft
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
 
@@ -144,6 +145,25 @@ def white_variance(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samp
     The noise floor is the median power there, which spectral lines of a signal hardly change.
     """
     return _white_variance(*power_spectrum(t, x))
+
+
+def mean_cycle(run: Trajectory) -> Trajectory:
+    """The run with its states on their mean waveform, at the phase of every sample.
+
+    White noise averages out over the periods, and so does all that does not repeat, such as a
+    transient. Inputs stay as they are.
+    Raises ValueError for a run that `find_cycle` finds no cycle in.
+
+    >>> run = ep.Trajectory(t, np.sin(t) + noise, ["x"])
+    >>> quiet = ep.signals.mean_cycle(run)
+    """
+    cycle = find_cycle(run.t, run.states)
+    if cycle is None:
+        raise ValueError(
+            f"a mean cycle needs a record that repeats itself, three periods or more: "
+            f"{run.label or 'this run'} does not"
+        )
+    return replace(run, states=cycle.waveform(cycle.phase))
 
 
 def _white_variance(frequency: np.ndarray, power: np.ndarray) -> float:

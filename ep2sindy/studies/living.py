@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.method import Regression
@@ -32,10 +33,10 @@ from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pic
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.rule import SystemSelection
-from ep2sindy.signals.attractor import find_cycle
+from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.kalman import KalmanSmoother
 from ep2sindy.signals.spectrum import samples_in_periods
-from ep2sindy.studies.study import Count
+from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
@@ -67,6 +68,8 @@ class LivingSearch:
     depth: number of candidates per size, and equation if there are no roles. roles: of terms, for
     equations that conserve what states exchange; None leaves every term free. degree: of a library
     of the states of its own; None takes the library that the equations were selected from.
+    noise_limit: white noise of a state, in standard deviations of its cycle, above which the search
+    sees the record's mean cycle (`ep.signals.mean_cycle`); None never does.
     """
 
     search: Search
@@ -74,6 +77,7 @@ class LivingSearch:
     selection: SystemSelection
     roles: Roles | None = None
     degree: Count | None = None
+    noise_limit: Positive | None = None
 
     def found(
         self,
@@ -95,7 +99,28 @@ class LivingSearch:
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
         roles = self.roles.in_zones(sizes) if self.roles and sizes else self.roles
         roles = roles and roles.with_known(inflow)
-        return discover(train, library, own, roles=roles, seed=rng, progress=progress)
+        seen, words = self._quiet(train)
+        found = discover(seen, library, own, roles=roles, seed=rng, progress=progress)
+        if not words:
+            return found
+        # The noise is gone from the samples, and with it what intervals are made of.
+        model = replace(found.model, covariance=None)
+        return replace(found, model=model, note=f"{words}{found.note}")
+
+    def _quiet(self, train: Trajectory) -> tuple[Trajectory, str]:
+        """What the search sees of a record, and why, if that is its mean cycle."""
+        cycle = find_cycle(train.t, train.states)
+        if self.noise_limit is None or cycle is None:
+            return train, ""
+        white = np.sqrt([white_variance(train.t, x) for x in train.states.T])
+        noise = white / zero_to_one(cycle.std)
+        if noise.max() <= self.noise_limit:
+            return train, ""
+        worst = train.state_names[int(noise.argmax())]
+        return mean_cycle(train), (
+            f"found in the mean cycle, without intervals, since the white noise of {worst} is "
+            f"{noise.max():.2g} times its variation; "
+        )
 
     @property
     def bounds(self) -> FreeRunBounds:
