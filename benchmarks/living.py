@@ -40,6 +40,7 @@ CHANNEL, DOWNSTREAM = "channel", "downstream"
 ZONES = (CHANNEL, DOWNSTREAM, (0.0, 0.010), (0.005, 0.015), (0.010, 0.020), (0.020, 0.030))
 SPLITS = {"last": (0.0, 0.75), "first": (0.25, 1.0), "second half": (0.0, 0.5)}  # what is fitted
 DRAWS = [(split, seed) for split in SPLITS for seed in range(3)] + [("last", 3)]
+ONCE = [(split, 0) for split in SPLITS]
 N_SEEDS = 1  # in other zones
 NOISES = ((0.2, 6.0), (0.4, 50.0))  # share of each state's RMS, periods
 N_NOISE_DRAWS = 3
@@ -152,11 +153,11 @@ def with_delays(whole: Record, delay_s: float, n_stages: int) -> Record:
     return Record(run, kept, whole.sizes, delays)
 
 
-def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -> ep.Discovery:
+def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
     """Under the roles of `+exp=breathing`: up to six free coefficients of degree 3."""
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow=inflows_of(whole.balances))
     method = ep.Regression(
-        ep.WeightedWeak() if weak else ep.Differential(),
+        ep.Differential(),
         ep.BestSubset(max_terms=6, n_best=200),
         ep.FreeRunScore(seed=seed, window_periods=4.0, n_confirmed=16),
         depth=16,
@@ -172,9 +173,7 @@ def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -
     return ep.discover([fitted], library, method, roles=roles, seed=seed)
 
 
-def by_neighbourhood(
-    fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool
-) -> ep.Discovery:
+def by_neighbourhood(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
     """Several zones under the roles of `+exp=zones`: up to 14 free coefficients, 20 for three."""
     two = len(whole.sizes) == 2
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known"})
@@ -186,7 +185,7 @@ def by_neighbourhood(
         last = [delay.last for delay in whole.delays]
         library = library.over([*names, *last]) + ep.polynomial([*names, *last], degree=1)
     method = ep.Regression(
-        ep.WeightedWeak() if weak else ep.Differential(),
+        ep.Differential(),
         ep.BestSubset(max_terms=14 if two else 20, n_best=200 if two else 1000),
         ep.FreeRunScore(seed=seed, window_periods=8.0),
         depth=6 if two else 4,
@@ -206,10 +205,10 @@ def move_on_later(roles: ep.Roles, delays: Sequence[ep.Delay]) -> ep.Roles:
     return replace(roles, exchange=exchange, outflow=outflow, equations=known)
 
 
-def free(fitted: ep.Trajectory, whole: Record, *, seed: int, weak: bool) -> ep.Discovery:
+def free(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
     """Every term free in its own equation, degree 2, up to 4 + 4 terms."""
     method = ep.Regression(
-        ep.WeightedWeak() if weak else ep.Differential(),
+        ep.Differential(),
         ep.BestSubset(max_terms=4, n_best=2),
         ep.FreeRunScore(seed=seed),
         depth=2,
@@ -226,12 +225,11 @@ def case(
     whole: Record,
     *,
     seed: int,
-    weak: bool = False,
     search: Callable[..., ep.Discovery] = conserving,
 ) -> Case:
     """Select on one record, run freely over another from its first sample."""
     begun = time.process_time()
-    found = search(fitted, whole, seed=seed, weak=weak)
+    found = search(fitted, whole, seed=seed)
     cpu_s, model = time.process_time() - begun, found.model
     run = ep.free_run(model, judged, initial=start_of(judged, model))
     multiplier = share = float("nan")
@@ -311,14 +309,16 @@ def structures(cases: Sequence[Case]) -> str:
     return "\n".join(f"    {n} x {terms}" for terms, n in found.most_common())
 
 
-def print_points(name: str = "default", search: Callable = conserving) -> None:
+def print_points(
+    name: str = "default", search: Callable = conserving, draws: Sequence[tuple[str, int]] = DRAWS
+) -> None:
     """Six operating points, the whole channel."""
     words = "equations that conserve" if search is conserving else "free terms"
-    print(f"\n{name} source, whole channel, {words}: median / worst of {len(DRAWS)} draws")
+    print(f"\n{name} source, whole channel, {words}: median / worst of {len(draws)} draws")
     everything = []
     for label in POINTS:
         whole = record(label, CHANNEL, name)
-        cases = [case(*parts(whole.run, s), whole, seed=seed, search=search) for s, seed in DRAWS]
+        cases = [case(*parts(whole.run, s), whole, seed=seed, search=search) for s, seed in draws]
         everything += cases
         print("\n".join([line(label, cases), balances(cases), structures(cases)]), flush=True)
     print(line("all", everything))
@@ -378,7 +378,7 @@ def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> e
 
 
 def print_noise() -> None:
-    """White noise on both densities; judged on the clean record behind it."""
+    """White noise on both densities, the mean cycle searched; judged on the clean record."""
     for (share, n_periods), (z, search) in product(NOISES, NOISY):
         words = f"{100 * share:.0f} % noise, {n_periods:.0f} periods, {z}, {search.__name__}"
         print(f"\n{words}: {N_NOISE_DRAWS} draws; noise in standard deviations of n_n")
@@ -387,8 +387,8 @@ def print_noise() -> None:
             clean = whole.run.window(round(0.75 * whole.run.n_samples), whole.run.n_samples)
             cases = [
                 case(
-                    noisy(whole.run, share, n_periods, seed=k), clean, whole, seed=k, weak=True,
-                    search=search,
+                    ep.signals.mean_cycle(noisy(whole.run, share, n_periods, seed=k)),
+                    clean, whole, seed=k, search=search,
                 )
                 for k in range(N_NOISE_DRAWS)
             ]  # fmt: skip
@@ -415,10 +415,10 @@ def main() -> None:
     """Print every table, or those that are named."""
     tables: dict[str, Callable[[], None]] = {
         "points": print_points,
-        "former": lambda: print_points("former"),
+        "former": lambda: print_points("former", draws=ONCE),
         "free": lambda: print_points(search=free),
         "zones": print_zones,
-        "several": lambda: print_several(2, [(split, 0) for split in SPLITS]),
+        "several": lambda: print_several(2, ONCE),
         "three": lambda: print_several(3, [("last", 0)]),
         "delayed": print_delayed,
         "noise": print_noise,

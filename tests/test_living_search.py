@@ -29,7 +29,9 @@ def searched(run: ep.Trajectory, settings: LivingSearch) -> ep.Discovery:
 def test_in_noise_the_mean_cycle_is_searched_and_said() -> None:
     run = record(0.5)
     found = searched(run, SETTINGS)
-    assert found.note.startswith("found in the mean cycle, without intervals, since the white noise of ")
+    assert found.note.startswith(
+        "found in the mean cycle, without intervals, since the white noise of "
+    )
     assert found.model.covariance is None
     assert ep.free_run(found.model, record(0.0)).verdict is ep.Verdict.LIVES
 
