@@ -93,8 +93,12 @@ def test_a_number_cuts_the_zone_into_equal_parts(field) -> None:
     assert settings.trajectory(field, inputs=[], label="").state_names[-1] == "n_n@z2"
     whole = ZoneAverage(STATES, zones=3).parts(field)
     assert whole["z3"].z[1] > field["z"].values[-1]
-    with pytest.raises(ValueError, match="zones must be"):
-        ZoneAverage(STATES, zones=0)
+
+
+@pytest.mark.parametrize("zones", [0, -1, 2.5, True, "two", [(0.0, 0.01)]])
+def test_zones_are_a_number_or_have_names(zones) -> None:
+    with pytest.raises(ValueError, match="whole number of parts, one or more, or zones by name"):
+        ZoneAverage(STATES, zones=zones)
 
 
 def test_zones_that_exchange_must_adjoin(field) -> None:

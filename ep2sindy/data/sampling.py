@@ -15,7 +15,6 @@ import xarray as xr
 from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, check_field, grid_points
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone, resolve_zone, zone_average, zone_slices
-from ep2sindy.runtime.values import check_count
 
 
 def zone_averages(
@@ -104,7 +103,7 @@ class ZoneAverage:
 
     zones: those of `zone_averages`, taken in place of the one zone; or a number, for as many parts
     of that zone, of equal length in z, called z1, z2 and so on.
-    Raises ValueError for a number of zones below one.
+    Raises ValueError for zones that are neither names with places nor a number of one or more.
     """
 
     states: Sequence[str]
@@ -114,8 +113,14 @@ class ZoneAverage:
     zones: Mapping[str, Zone | Sequence[float]] | int | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.zones, int):
-            check_count("zones", self.zones)
+        zones = self.zones
+        if zones is None or isinstance(zones, Mapping):
+            return
+        if isinstance(zones, bool) or not isinstance(zones, int) or zones < 1:
+            raise ValueError(
+                "zones must be a whole number of parts, one or more, or zones by name, such as "
+                f"{{anode: [0, 0.01], exit: [0.01, 0.025]}} in m: {zones!r} came"
+            )
 
     def parts(self, field: xr.Dataset) -> dict[str, Zone]:
         """The zones by name; a single one is called ""."""
