@@ -154,8 +154,11 @@ def mean_cycle(run: Trajectory) -> Trajectory:
     transient. Inputs stay as they are.
     Raises ValueError for a run that `find_cycle` finds no cycle in.
 
-    >>> run = ep.Trajectory(t, np.sin(t) + noise, ["x"])
-    >>> quiet = ep.signals.mean_cycle(run)
+    >>> t = np.linspace(0.0, 300.0, 3001)
+    >>> noise = np.random.default_rng(0).normal(size=3001)
+    >>> quiet = ep.signals.mean_cycle(ep.Trajectory(t, (np.sin(t) + noise)[:, None], ["x"]))
+    >>> bool(np.abs(quiet.states[:, 0] - np.sin(t)).max() < 0.2)
+    True
     """
     cycle = find_cycle(run.t, run.states)
     if cycle is None:

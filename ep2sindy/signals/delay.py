@@ -35,10 +35,11 @@ class Delay:
     ('x_lag1', 'x_lag2', 'x_lag3')
     >>> delay.equations["x_lag2"]
     {'x_lag1': 1.5, 'x_lag2': -1.5}
-    >>> long = delay.along(run)
-    >>> library = ep.polynomial(["x", delay.last], degree=2)
-    >>> roles = ep.Roles(equations=delay.equations)
-    >>> found = ep.discover(long, library, ep.Regression(selection=ep.FreeRunScore()), roles=roles)
+    >>> t = np.linspace(0.0, 60.0, 601)
+    >>> long = delay.along(ep.Trajectory(t, 2.0 + np.sin(t)[:, None], ["x"]))
+    >>> roles = ep.Roles(equations=delay.equations)  # for `ep.discover` of the long run
+    >>> long.state_names, float(long.t[0])
+    (('x', 'x_lag1', 'x_lag2', 'x_lag3'), 6.0)
     """
 
     state: str
