@@ -123,11 +123,27 @@ def _phase(
     phase = 2.0 * np.pi * rough_Hz * (t - t[0])
     for _ in range(3):
         phase = _sharpen(t, phase, scaled, 1)
-    if rough_Hz * (t[-1] - t[0]) >= 2.0 * PERIODS_TRACKED:
-        phase = phase + _drift(t, scaled[:, leader], phase)
+    tried = [phase]
+    n_periods = rough_Hz * (t[-1] - t[0])
+    if n_periods >= 2.0 * PERIODS_TRACKED:
+        tried.append(phase + _drift(t, scaled[:, leader], phase))
     for _ in range(2):
-        phase = _sharpen(t, phase, scaled, most)
-    return phase
+        tried = [_sharpen(t, each, scaled, most) for each in tried]
+    if len(tried) == 1:
+        return tried[0]
+    # What is followed in noise is noise, too: a phase that wanders must be worth its freedom (BIC),
+    # a number for every half of the window, in which a Hann window's weight lies.
+    straight, wandering = (len(t) * np.log(_left(each, scaled, most)).sum() for each in tried)
+    price = np.log(len(t)) * n_periods / (0.5 * PERIODS_TRACKED)
+    return tried[1] if straight - wandering > price else tried[0]
+
+
+def _left(phase: np.ndarray, scaled: np.ndarray, order: int) -> np.ndarray:
+    """What a Fourier series in the phase leaves of the squares of every state that varies."""
+    scaled = scaled[:, scaled.any(axis=0)]
+    basis = np.linalg.qr(_columns(phase, order))[0]
+    whole = np.square(scaled).sum(axis=0)
+    return np.maximum(whole - np.square(basis.T @ scaled).sum(axis=0), 1e-12 * whole)
 
 
 def _line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
