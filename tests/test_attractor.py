@@ -161,7 +161,7 @@ def test_a_phase_is_followed_where_it_wanders_and_not_where_noise_does(wander: f
     if not wander:
         np.testing.assert_allclose(found.phase, straight, atol=1e-9)
     off = found.phase - true
-    # Of a phase that is followed, noise and what eight periods smooth are left; else 1 rad would be.
+    # Noise and what eight periods smooth are left of a phase that is followed; else 1 rad would be.
     assert (off - off.mean()).std() < (0.3 if wander else 0.02)
 
 
