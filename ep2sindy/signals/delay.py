@@ -12,8 +12,8 @@ from ep2sindy.library.names import check_state
 from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.spectrum import is_uniform
 
-# The chain forgets how it was started: after this many delays, less than e^-3 of it is left in
-# one stage, and in more stages less.
+# The chain forgets how it was started: after this many delays, e^-3 of it is left in one stage, and
+# less in more.
 N_FILLING = 3.0
 
 

@@ -109,8 +109,7 @@ class LivingSearch:
 
     def _quiet(self, train: Trajectory) -> tuple[Trajectory, str]:
         """What the search sees of a record, and why, if that is its mean cycle."""
-        cycle = find_cycle(train.t, train.states)
-        if self.noise_limit is None or cycle is None:
+        if self.noise_limit is None or (cycle := find_cycle(train.t, train.states)) is None:
             return train, ""
         white = np.sqrt([white_variance(train.t, x) for x in train.states.T])
         noise = white / zero_to_one(cycle.std)
