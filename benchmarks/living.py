@@ -341,7 +341,7 @@ def print_several(n_zones: int, draws: Sequence[tuple[str, int]]) -> None:
 
 def print_delayed() -> None:
     """Neutrals that may leave, or move on, as they were 60 us (some period) ago."""
-    print("\nneutrals with a delay of 60 us, four stages (three in two zones); last quarter, one draw")
+    print("\nneutrals with a delay of 60 us; last quarter, one draw")
     cases = {label: (record(label), 4, conserving) for label in POINTS}
     cases |= {"two zones": (zones_record("300V_5mgs", 2), 3, by_neighbourhood)}
     for name, (bare, n_stages, search) in cases.items():
