@@ -67,6 +67,12 @@ from ep2sindy.model.stability import limit_cycle as limit_cycle
 from ep2sindy.model.stability import share_reaching as share_reaching
 from ep2sindy.model.model import coef_matrix as coef_matrix
 
+# Forecasts
+from ep2sindy.forecasting.forecast import forecast as forecast
+from ep2sindy.forecasting.forecast import Forecast as Forecast
+from ep2sindy.forecasting.skill import forecast_skill as forecast_skill
+from ep2sindy.forecasting.skill import ForecastSkill as ForecastSkill
+
 # Refinement
 from ep2sindy.refinement.refine import refine as refine
 from ep2sindy.refinement.refine import Refinement as Refinement
@@ -93,6 +99,7 @@ from ep2sindy import discovery as discovery
 from ep2sindy import regression as regression
 from ep2sindy import selection as selection
 from ep2sindy import model as model
+from ep2sindy import forecasting as forecasting
 from ep2sindy import refinement as refinement
 from ep2sindy import signals as signals
 from ep2sindy import operating as operating

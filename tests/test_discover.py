@@ -275,14 +275,17 @@ def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
     assert list(found.noise_test.left) == ["y"]
 
 
-def test_a_rule_that_judges_free_runs_says_nothing_of_the_noise_of_rows() -> None:
+def test_a_rule_that_judges_free_runs_says_a_misfit_where_others_do() -> None:
     run = replace(lotka_volterra(), rate_Hz=5.0).trajectory(noise=0.05, rng=0)
     rule = FreeRunScore(n_windows=4, n_folds=2)
     recipe = Regression(WeightedWeak(), BestSubset(max_terms=2), rule, Bootstraps(n=0))
     found = discover(run, named_terms(["x", "y"], ["x", "y", "x*y"]), recipe)
-    assert not found.noise_test.left
-    assert not found.noise_test.tested
+    assert found.noise_test.tested
     assert found.misfit == ""
+    poor = discover(run, named_terms(["x", "y"], ["x", "y"]), recipe)
+    assert "leaves white noise of x'" in poor.misfit
+    by_rows = discover(run, named_terms(["x", "y"], ["x", "y"]), replace(recipe, selection=EBIC()))
+    assert "leaves white noise of x'" in by_rows.misfit
 
 
 @dataclass(frozen=True)
@@ -318,12 +321,12 @@ def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
     still = discover(run, library, TrajectorySearch(selection=Stillness()))
     assert not still.model.coef.any()
     assert still.estimate.misfit == ""
-    assert not still.noise_test.tested
+    assert "leaves white noise" in still.misfit
     poor = discover(
         run, library.take(np.array([True, True, False])), TrajectorySearch(selection=Stillness())
     )
     assert poor.estimate.misfit
-    assert poor.misfit == ""  # nothing is said of a model that was not tested
+    assert "leaves white noise" in poor.misfit
 
 
 def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:

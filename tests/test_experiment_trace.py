@@ -1,5 +1,4 @@
 import json
-import re
 from functools import cache
 from pathlib import Path
 
@@ -65,10 +64,17 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     assert summary["signal"]["embedding"] == "LogRate"
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
     log = (folder / "run.log").read_text()
-    for words in ("(I is positive)", "known: I' = 1 I g", "attracting", "1 known", "95 %"):
+    for words in ("(I is positive)", "known: I' = 1 I g", "attracting", "1 known"):
         assert words in log
     page = (folder / "report.html").read_text()
-    for name in ("free_run", "plane", "waveform", "front"):
+    assert "intervals are not given" in " ".join(log.split())  # of smoothed states
+    assert summary["misfit"]
+    forecast = summary["forecast"]
+    assert set(forecast["nrmse"]) == {"model", "persistence", "harmonics", "autoregression"}
+    assert max(forecast["nrmse"]["model"]) < 0.3
+    assert 0.0 <= forecast["coverage_90"] <= 1.0
+    assert summary["states"]["2"]["error"] < 0.3
+    for name in ("free_run", "plane", "waveform", "front", "forecast"):
         assert (folder / "figures" / f"{name}.png").exists()
         assert f'id="figure-{name}"' in page
 
@@ -91,21 +97,32 @@ def test_a_signal_of_either_sign_can_be_taken(embedding: str, tmp_path: Path) ->
         assert "I_before" in found.log
 
 
-def test_advice_is_given_and_taken(tmp_path: Path) -> None:
+def test_fine_samples_are_averaged_by_default(tmp_path: Path) -> None:
     t, x = signal(12.0)
     fine = np.linspace(t[0], t[-1], 4 * len(t))
     path = scope(tmp_path / "scope.csv", fine, np.interp(fine, t, x))
-    offered = computed(composed(*glance(path, tmp_path, "decimate=null")))
-    assert re.search(r"21\d samples to a period are more .* decimate=2", offered.log)
-    taken = computed(composed(*glance(path, tmp_path, "decimate=auto")))
+    taken = computed(composed(*glance(path, tmp_path)))
     assert "means over 2 samples" in taken.log
     assert taken.summary["data"]["n_samples"] == len(fine) // 2
+    kept = computed(composed(*glance(path, tmp_path, "decimate=null")))
+    assert kept.summary["data"]["n_samples"] == len(fine)
+
+
+def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path: Path) -> None:
+    run = ep.lorenz().trajectory()
+    path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
+    found = computed(composed(*glance(path, tmp_path, "degree=2")))
+    assert set(found.summary["states"]) == {"2", "3"}
+    assert found.summary["signal"]["n_states"] in (2, 3)
+    set_to_two = computed(composed(*glance(path, tmp_path, "degree=2", "n_states=2")))
+    assert set(set_to_two.summary["states"]) == {"2"}
 
 
 def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
-    path = scope(tmp_path / "scope.csv", *signal(8.0))
+    path = scope(tmp_path / "scope.csv", *signal(6.4))
     found = computed(composed(*glance(path, tmp_path)))
     assert found.summary["living"]["held_out"] is False
+    assert found.summary["forecast"] is None
     assert "too short to hold out" in " ".join(found.log.split())
 
 
@@ -116,6 +133,7 @@ def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
         (lambda t, x: (t, np.random.default_rng(0).random(len(t))), [], "must oscillate"),
         (lambda t, x: (t, x - 1.0), ["embedding=log_rate"], "needs a positive signal: I falls"),
         (lambda t, x: (t, x), ["embedding=log"], "embedding must be auto, log_rate or rate or"),
+        (lambda t, x: (t, x), ["n_states=some"], "n_states must be auto or a number: 'some' came"),
         (lambda t, x: (t, x), ["decimate=0"], "decimate must be auto, null or a whole number"),
         (lambda t, x: (t, x), ["signal=V"], "has no variable 'V'"),
     ],

@@ -97,7 +97,7 @@ def test_chaos_is_judged_by_its_distribution() -> None:
     system = replace(lorenz(), duration_s=60.0, rate_Hz=100.0)
     run = system.trajectory()
     truth = free_run(system.model, run)
-    assert truth.verdict is Verdict.LIVES
+    assert truth.verdict is Verdict.ALIKE
     assert np.isnan(truth.f_error)
     still = replace(system.model, coef=system.model.coef.copy())
     coef = still.coef.copy()
@@ -105,7 +105,7 @@ def test_chaos_is_judged_by_its_distribution() -> None:
     assert free_run(replace(still, coef=coef), run).verdict is Verdict.DIES_OUT
     wide = system.model.coef.copy()
     wide[list(still.library.names).index("x"), 1] = 60.0
-    assert free_run(replace(still, coef=wide), run).verdict is Verdict.WRONG_CYCLE
+    assert free_run(replace(still, coef=wide), run).verdict is Verdict.UNLIKE
 
 
 def test_a_run_that_needs_ever_smaller_steps_stops() -> None:
@@ -127,10 +127,10 @@ SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(1, marks=SLOW), pytest.param(3, marks=SLOW)])
-def test_the_true_model_of_a_chaotic_record_lives_and_a_wrong_one_does_not(number: int) -> None:
+def test_the_true_model_of_a_chaotic_record_is_alike_and_a_wrong_one_is_not(number: int) -> None:
     """Rossler's frequency and waveform wander: no run lies closer than the data's own parts."""
     system, run = noisy("rossler", 0.05, number)
-    assert free_run(system.model, run).verdict is Verdict.LIVES
+    assert free_run(system.model, run).verdict is Verdict.ALIKE
     coef = system.model.coef
     periodic = replace(system.model, coef=np.where(coef == -5.7, -3.0, coef))
     assert free_run(periodic, run).verdict is Verdict.WRONG_CYCLE

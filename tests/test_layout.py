@@ -27,6 +27,7 @@ ROOMS = [
     "model",
     "regression",
     "estimation",
+    "forecasting",
     "systems",
     "refinement",
     "selection",

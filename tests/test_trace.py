@@ -1,11 +1,14 @@
 """One signal as states: what is known of them, what noise leaves of them, and what is refused."""
 
+import re
+
 import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.signals.embedding import DROWNED
-from ep2sindy.signals.log_smoother import ratio_bound
+from ep2sindy.signals.embedding import DROWNED, unexplained
+from ep2sindy.signals.kalman import ratio_bounds
+from ep2sindy.signals.spectrum import signal_memory_s
 
 A, B = 2.0, 1.0  # of the Toda oscillator: g' = A - B x
 
@@ -122,8 +125,10 @@ def test_units_scale_the_log_smoother():
 
 
 def test_what_is_faster_than_asked_counts_as_noise():
-    assert ratio_bound(None, 1.0) > ratio_bound(0.5, 1.0) > ratio_bound(5.0, 1.0)
-    assert ratio_bound(10.0, 1.0) == pytest.approx(-6.0)
+    assert ratio_bounds(None, None, 1.0, (-9.0, 8.0)) == (-9.0, 8.0)
+    assert ratio_bounds(10.0, 100.0, 1.0, (-14.0, 4.0)) == pytest.approx((-12.0, -6.0))
+    # The signal is followed if the bounds contradict each other.
+    assert ratio_bounds(10.0, 1.0, 1.0, (-14.0, 4.0)) == pytest.approx((0.0, 0.0))
     clean = sine(40.0, mean=3.0)
     x = clean.states[:, 0] + 0.1 * np.sin(25 * 2e3 * np.pi * clean.t)
     fine = ep.signals.LogRate(harmonics=7.0).embed(ep.signals.from_one_signal(recorded(clean.t, x)))
@@ -131,29 +136,108 @@ def test_what_is_faster_than_asked_counts_as_noise():
     assert np.abs(fine.run.states[20:-20, 0] - clean.states[20:-20, 0]).max() < 0.03
 
 
-def test_fine_samples_are_averaged_where_asked_and_offered_where_not():
+def test_fine_samples_are_averaged_unless_told_not_to():
     fine = sine(10.0, per_period=1000)
-    kept = ep.signals.from_one_signal(fine)
+    kept = ep.signals.from_one_signal(fine, decimate=None)
     assert len(kept.x) == fine.n_samples
-    assert "decimate=10" in kept.advice[0]
-    few = ep.signals.from_one_signal(fine, decimate="auto")
-    assert few.advice == ()
-    assert len(few.x) == 1000
-    assert "100 to a period" in few.done[0]
+    few = ep.signals.from_one_signal(fine)
+    assert few.done == ("means over 10 samples: 1000 are left",)
+    assert few.per_period == pytest.approx(100.0, rel=1e-3)
     assert few.x[0] == pytest.approx(fine.states[:10, 0].mean())
     assert few.period_s == pytest.approx(1e-3, rel=1e-4)
 
 
-@pytest.mark.parametrize("mean", [0.0, 20.0])
-def test_a_drift_is_offered_to_be_taken_out(mean):
+def test_a_long_record_is_averaged_after_a_look_at_its_means():
+    n, per_period = 200_000, 4000
+    x = 2.0 + np.sin(2 * np.pi * np.arange(n) / per_period)
+    found = ep.signals.from_one_signal(recorded(1e-6 * np.arange(n), x))
+    assert found.per_period == pytest.approx(100.0, rel=0.01)
+
+
+@pytest.mark.parametrize("mean", [0.0, 1.2])
+def test_a_drift_is_taken_out_and_nothing_else(mean):
     run = sine(20.0, mean=mean)
-    drifting = recorded(run.t, run.states[:, 0] + 1.5 * run.t / run.t[-1])
-    assert "detrend=true" in ep.signals.from_one_signal(drifting).advice[0]
-    straight = ep.signals.from_one_signal(drifting, detrend=True)
-    assert straight.advice == ()
-    assert straight.x.mean() == pytest.approx(drifting.states.mean())
-    line = np.polynomial.Polynomial.fit(run.t, straight.x, 1)(run.t)
-    assert abs(line[-1] - line[0]) < 0.1
+    line = 0.6 * (run.t / run.t[-1] - 0.5)
+    drifting = recorded(run.t, run.states[:, 0] + line)
+    straight = ep.signals.from_one_signal(drifting)
+    assert "a straight line taken out, which rises by 0." in straight.done[0]
+    np.testing.assert_allclose(straight.x, run.states[:, 0], atol=2e-3)
+    kept = ep.signals.from_one_signal(drifting, detrend=False)
+    assert re.search(r"x drifts by 0\.\d+ over the record", kept.advice[0])
+    np.testing.assert_array_equal(kept.x, drifting.states[:, 0])
+    assert ep.signals.from_one_signal(run).done == ()
+
+
+def test_times_rounded_to_a_few_digits_are_taken_as_equal_steps():
+    exact = 1.3e-6 * np.arange(80, 700)
+    rounded = np.array([float(f"{t:.2E}") for t in exact])
+    x = np.sin(2 * np.pi * exact / 5e-5)
+    found = ep.signals.from_one_signal(recorded(rounded, x))
+    assert found.done == ("times rounded to 3 digits taken as equal steps",)
+    np.testing.assert_allclose(np.diff(found.t), 1.3e-6, rtol=2e-3)
+    uneven = exact + 4e-7 * np.random.default_rng(0).random(len(exact))
+    np.testing.assert_array_equal(ep.signals.from_one_signal(recorded(uneven, x)).t, uneven)
+
+
+def test_a_smoother_follows_pulses_and_few_samples_to_a_period():
+    """The likelihood alone takes such signals for noise; their spectrum says that they are none."""
+    # The intensity of a laser that obeys the Lorenz equations, eight samples to a pulse.
+    run = ep.lorenz().model.simulate(0.08 * np.arange(700), [1.0, 2.0, 20.0])
+    t, x = np.arange(600.0), run.states[100:, 0] ** 2
+    column = x[:, None]
+    assert ep.signals.KalmanSmoother().estimate(t, column).noise_std[0] > 0.9 * x.std()
+    memory_s = signal_memory_s(t, x, kept=0.99)
+    held = ep.signals.KalmanSmoother(coarsest_s=memory_s).estimate(t, column)
+    assert held.noise_std[0] < 0.3 * x.std()
+    assert np.std(held.smoothed[:, 0] - x) < 0.15 * x.std()
+    # White noise has nothing to be followed.
+    noise = np.random.default_rng(0).standard_normal(600)
+    assert signal_memory_s(t, noise, kept=0.99) == t[-1]
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05, 0.2])
+def test_a_gap_does_not_change_the_frequency(share):
+    rng = np.random.default_rng(3)
+    t = 1.5e-6 * np.arange(3000)
+    x = np.exp(2.0 * np.sin(2 * np.pi * 2e4 * t)) * (1.0 + 0.2 * rng.standard_normal(3000))
+    gap = slice(1000, 1000 + round(3000 * share))
+    kept = np.delete(np.arange(3000), gap)
+    found = ep.signals.find_cycle(t[kept], x[kept, None])
+    assert found.frequency_Hz == pytest.approx(2e4, rel=1e-3)
+    assert ep.signals.dominant_frequency(t[kept], x[kept]) == pytest.approx(2e4, rel=5e-3)
+
+
+def test_three_states_of_a_signal_are_a_chain_of_derivatives():
+    t = np.linspace(0.0, 60.0, 3001)
+    two_lines = recorded(t, np.sin(t) + 0.5 * np.sin(2 * t))
+    signal = ep.signals.from_one_signal(two_lines, decimate=None)
+    chosen = ep.signals.embed(signal, n_states=3)
+    states = chosen.embedded
+    assert states.run.state_names == ("x", "v", "w")
+    assert states.run.units == {"x": "A", "v": "A s^-1", "w": "A s^-2"}
+    assert states.terms == {"x": ("v",), "v": ("w",)}
+    assert states.searched == ["w"]
+    inner = slice(100, -100)
+    bend = -np.sin(t) - 2.0 * np.sin(2 * t)
+    assert np.abs(states.run.states[:, 2] - bend)[inner].max() < 0.1
+    log = ep.signals.LogRate(n_states=3)
+    positive = ep.signals.from_one_signal(recorded(t, np.exp(np.sin(t))), decimate=None)
+    found = log.embed(positive)
+    assert found.run.state_names == ("x", "g", "h")
+    assert found.relations == ("x: x*g == 1", "g: h == 1")
+    assert np.abs(found.run.states[:, 2] + np.sin(t))[inner].max() < 0.05
+    before = ep.signals.Delays(n_states=3).embed(signal)
+    assert before.run.state_names == ("x", "x_before", "x_before2")
+
+
+def test_neighbours_tell_how_many_states_there_are():
+    lorenz = ep.lorenz().trajectory()
+    signal = ep.signals.from_one_signal(recorded(lorenz.t, lorenz.states[:, 0]))
+    assert signal.cycle is None
+    assert signal.frequency_Hz == pytest.approx(0.9, rel=0.3)  # turns of either wing
+    two, three = (unexplained(signal, ep.signals.Rate(n_states=n)) for n in (2, 3))
+    loop = ep.signals.from_one_signal(sine())
+    assert unexplained(loop, ep.signals.Rate()) < 1e-3 < 0.5 * three < two
 
 
 def test_a_signal_named_as_the_rate_keeps_its_name():
@@ -169,6 +253,10 @@ def test_a_signal_named_as_the_rate_keeps_its_name():
         (
             recorded(np.arange(2000.0), np.random.default_rng(0).standard_normal(2000)),
             "a trace must oscillate: no period explains a quarter of the variance of x",
+        ),
+        (
+            recorded(np.arange(300.0), 2.0 + np.sin(2 * np.pi * np.arange(300.0) / 4.3)),
+            r"sampled 6 times a period or more: x has 4\.3 samples .* is aliased",
         ),
         (recorded(np.arange(500.0), np.exp(-np.arange(500.0) / 100)), "if it oscillates at all"),
     ],
@@ -193,6 +281,12 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
         (lambda: ep.signals.LogRate(0.5), "harmonics must be one or more: 0.5 came"),
         (lambda: ep.signals.Delays(share=1.0), "share of the period must lie between 0 and 1"),
         (lambda: ep.signals.LogSmoother(0.0), "finest_s must be a positive time"),
+        (lambda: ep.signals.KalmanSmoother(coarsest_s=-1.0), "coarsest_s must be a positive time"),
+        (lambda: ep.signals.Rate(n_states=6), "n_states must be 2 to 5: 6 came"),
+        (
+            lambda: ep.signals.from_one_signal(sine(), detrend="yes"),
+            "detrend must be auto, true or false: 'yes' came",
+        ),
         (
             lambda: ep.signals.from_one_signal(sine(), decimate=0),
             "decimate must be auto, null or a whole number",

@@ -1,8 +1,9 @@
-"""Missing samples: rows that hold a NaN, and a message that says how many there are."""
+"""Missing samples: rows that hold a NaN, a message that says how many, and gaps in time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,12 @@ from jaxtyping import Bool, Float
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+# Longest step, in median steps, that is interpolated; a longer one is a gap. Random times have
+# such a gap once in 1000 samples, random losses of 30 % never. With a limit of 5, random times are
+# divided into stretches of about 30 samples, and Lorenz was never found.
+LONGEST_STEP = 10.0
 
 
 class MissingSamples(UserWarning):
@@ -52,6 +59,13 @@ def without_gaps(field: xr.Dataset) -> xr.Dataset:
     if not any(np.isnan(values).any() for values in alone.values()):
         return field
     return field.isel(time=np.flatnonzero(present_rows(alone)))
+
+
+def between_gaps(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
+    """First and last sample (exclusive) of every stretch of times without a gap."""
+    steps = np.diff(t)
+    cuts = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) + 1
+    return list(pairwise([0, *cuts.tolist(), len(t)]))
 
 
 def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:

@@ -84,8 +84,8 @@ class EquationFit:
 class NoiseTest:
     """Test whether a model explains the data to within their noise.
 
-    left: for each state, the residuals of its equation on rows. It is empty if no rows were tested:
-    after a trajectory search, which tests whole trajectories, and for rules that judge free runs.
+    left: for each state, the residuals of its equation on rows. It is empty if no rows were tested,
+    as after a trajectory search, which tests whole trajectories.
     misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
     tested. tested: False if nothing was tested.
     """
@@ -198,17 +198,15 @@ def noise_test(
     the model's own coefficients are tested. Otherwise the terms are fitted again to the weak rows,
     which are whitened, and that fit is tested: coefficients of a formulation that does not weigh
     its rows are not. A state without such rows, for example for a record of a few samples, is not
-    tested. Nothing is tested if a rule judged the model by running it: rows then say nothing.
+    tested.
     estimate: of states and coefficients together, which has tested whole trajectories already. It
     counts only if the chosen model is its own.
     """
     if estimate is not None and estimate.model is choice.model:
         return NoiseTest(misfit=estimate.misfit, tested=True)
-    if choice.left is None:
-        return NoiseTest()
-    states = choice.model.states
-    unknown = [state for state in states if state not in choice.left]
-    found = {**choice.left, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}
+    states, tested = choice.model.states, choice.left or {}
+    unknown = [state for state in states if state not in tested]
+    found = {**tested, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
     return NoiseTest(ordered, _misfit(ordered, choice.n_free), tested=bool(ordered))
 

@@ -133,8 +133,8 @@ def discover(
     found = method.identify(task, rng=rng, progress=watch)
     choice = found.choice
     test = noise_test(choice, trajectories, estimate=found.estimate)
-    # If the residuals of the rows exceed the noise, intervals would not cover the truth.
-    withheld = bool(test.left and test.misfit)
+    # If residuals of its rows exceed the noise, intervals would not cover the truth.
+    withheld = bool(choice.left is not None and test.left and test.misfit)
     return Discovery(
         fronts={front.equation: front for front in choice.fronts},
         chosen={each.equation: _as_in(choice.model, each) for each in choice.chosen},

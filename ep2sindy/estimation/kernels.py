@@ -153,6 +153,26 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
 
 
 @compiled
+def end_state(flow, misses, residuals, variance, process, free_start):
+    """Departure (d,) of the last state from the path given all samples, and its covariance (d, d).
+
+    Arguments as for `departures`.
+    """
+    n, d = residuals.shape
+    mean, none, cov = np.zeros(d), np.zeros((d, 0)), np.zeros((d, d))
+    gain, buffer = np.empty(d), np.empty((d, 1 + d))
+    for i in range(d):
+        cov[i, i] = free_start
+    for k in range(n):
+        for i in range(d):
+            if np.isfinite(residuals[k, i]):
+                _observe(i, residuals[k, i], variance[k, i], mean, none, cov, gain)
+        if k < n - 1:
+            _step(flow[k], misses[k], mean, none, cov, process[k], buffer)
+    return mean, cov
+
+
+@compiled
 def departures(flow, misses, residuals, variance, process, free_start):
     """Departures (n, d) of all states from the path that minimise the squares.
 

@@ -115,8 +115,19 @@ class EstimationProblem:
     required: Bool[np.ndarray, " free"]
     to_SI: Float[np.ndarray, " coefficients"]
     scale: Float[np.ndarray, " d"]
+    input_scale: Float[np.ndarray, " n_inputs"]
     step_s: float
+    inputs: tuple[str, ...] = ()
     advance: Advance = nothing
+
+    def record(self, run: Trajectory) -> ScaledRecord:
+        """A run with the same states and inputs, in the scale of this problem."""
+        return ScaledRecord(
+            times=(run.t - run.t[0]) / self.step_s,
+            samples=run.columns(self.states) / self.scale,
+            inputs=run.columns(self.inputs) / self.input_scale,
+            limits=_limits(run, self.scale),
+        )
 
     @property
     def n_samples(self) -> int:
@@ -280,11 +291,11 @@ def scale_problem(
     equation = np.array([states.index(state) for state, _ in held.coefficients])
     to_SI = size[equation] / (numbers[column] * step_s)
     known = np.isin(equation, [states.index(state) for state in terms or {}])
-    return EstimationProblem(
+    problem = EstimationProblem(
         library=scaled,
         term_names=over.names,
         states=tuple(states),
-        records=tuple(_record(run, inputs, size, step_s) for run in runs),
+        records=(),
         equation=equation,
         column=column,
         C=held.C * to_SI[held.free] / to_SI[:, None],
@@ -292,21 +303,12 @@ def scale_problem(
         required=(held.C[known] != 0.0).any(axis=0),
         to_SI=to_SI,
         scale=size[: len(states)],
+        input_scale=size[len(states) :],
         step_s=step_s,
+        inputs=tuple(inputs),
         advance=advance,
     )
-
-
-def _record(
-    run: Trajectory, inputs: Sequence[str], size: np.ndarray, step_s: float
-) -> ScaledRecord:
-    d = len(run.state_names)
-    return ScaledRecord(
-        times=(run.t - run.t[0]) / step_s,
-        samples=run.states / size[:d],
-        inputs=run.columns(inputs) / size[d:],
-        limits=_limits(run, size[:d]),
-    )
+    return replace(problem, records=tuple(problem.record(run) for run in runs))
 
 
 def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:

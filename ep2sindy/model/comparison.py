@@ -17,8 +17,10 @@ from ep2sindy.signals.attractor import (
     find_cycle,
     spectrum_distance,
     waveform_errors,
+    white_variance,
 )
 from ep2sindy.signals.oscillation import DIED_OUT, has_decayed
+from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.signals.stationarity import quarter_distances
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
@@ -32,12 +34,31 @@ SPECTRUM_WANDERS = 2.0
 BELOW_ZERO = 1e-3
 
 
+# Change of the amplitude from the first third of a record to the last from which the record grows
+# or decays.
+SPIRALS = 1.5
+
+# Error over the first period, in standard deviations, above which a run does not live that began on
+# the data; noise in the samples, in the same unit, above which it is not asked for, since the start
+# is as uncertain.
+FIRST_PERIOD, TOO_NOISY = 0.3, 0.1
+
+
 class Verdict(StrEnum):
-    """Verdict on a free run, the best first."""
+    """Verdict on a free run, the best first.
+
+    lives: it stays on the data's cycle. follows: the data grow or decay, and it does, too, at the
+    same rate. alike: the data do not repeat themselves, and it has their distributions and spectra;
+    how far it forecasts them is not said (`forecast_skill`). slips: it is on the data's cycle, but
+    out of step with it. unlike: the data have no cycle, and it is neither of the above.
+    """
 
     LIVES = "lives"
+    FOLLOWS = "follows"
+    ALIKE = "alike"
     SLIPS = "slips"
     WRONG_CYCLE = "wrong cycle"
+    UNLIKE = "unlike"
     DIES_OUT = "dies out"
     NEGATIVE = "turns negative"
     LEAVES_DOMAIN = "leaves the domain"
@@ -146,16 +167,48 @@ class ComparedRecord:
         middle = len(states) // 2
         if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
             return Comparison(Verdict.DIES_OUT, np.nan, spectrum, by_state)
+        if self._spirals:
+            verdict = Verdict.FOLLOWS if self._is_followed(states, bounds) else Verdict.UNLIKE
+            return Comparison(verdict, np.nan, spectrum, by_state)
         if not self._repeats and self._is_alike(by_state["distribution"], spectrum, bounds):
-            return Comparison(Verdict.LIVES, np.nan, spectrum, by_state)
+            return Comparison(Verdict.ALIKE, np.nan, spectrum, by_state)
         if self.cycle is None:
-            return Comparison(Verdict.WRONG_CYCLE, np.nan, spectrum, by_state)
+            return Comparison(Verdict.UNLIKE, np.nan, spectrum, by_state)
         f_error, amplitude, waveform = compare_cycles(self.cycle, self.t[half:], late)
         if np.isnan(f_error):
             return Comparison(Verdict.WRONG_CYCLE, f_error, spectrum, by_state)
         by_state |= {"amplitude_ratio": amplitude, "waveform_error": waveform}
         verdict = self._with_period(f_error, amplitude, waveform, bounds)
+        if verdict is Verdict.LIVES and self._begins_apart(states):
+            verdict = Verdict.SLIPS
         return Comparison(verdict, f_error, spectrum, by_state)
+
+    def _begins_apart(self, states: np.ndarray) -> bool:
+        """True if a run begins on the record, and misses it by much in its first period already."""
+        assert self.cycle is not None
+        if (np.abs(states[0] - self.states[0]) > FIRST_PERIOD * self.std).any():
+            return False  # a transient from elsewhere
+        first = self.t <= self.t[0] + 1.0 / self.cycle.frequency_Hz
+        off = np.square((states - self.states)[first] / self.std).mean(axis=0)
+        noise = np.array([white_variance(self.t, x) for x in self.states.T]) / np.square(self.std)
+        is_quiet = np.sqrt(noise) <= TOO_NOISY
+        return bool((np.maximum(off - noise, 0.0) > FIRST_PERIOD**2)[is_quiet].any())
+
+    @property
+    def _spirals(self) -> bool:
+        """True if every state grows or decays throughout."""
+        sizes = _sizes(self.states)
+        steps = np.diff(np.log(sizes), axis=0)
+        ratio = np.abs(np.log(sizes[-1] / sizes[0]))
+        return bool((ratio > np.log(SPIRALS)).all() and (steps[0] * steps[1] > 0.0).all())
+
+    def _is_followed(self, states: np.ndarray, bounds: FreeRunBounds) -> bool:
+        """True if a run has the envelope of the record in each third, and its frequency."""
+        off = np.abs(_sizes(states) / _sizes(self.states) - 1.0)
+        ours, theirs = (dominant_frequency(self.t, x[:, 0]) for x in (states, self.states))
+        bin_Hz = 1.0 / float(self.t[-1] - self.t[0])
+        near = abs(ours - theirs) <= max(bounds.frequency * theirs, 0.5 * bin_Hz)
+        return bool((off <= bounds.amplitude).all() and near)
 
     @property
     def _repeats(self) -> bool:
@@ -180,6 +233,11 @@ class ComparedRecord:
         near = (distribution <= np.maximum(bounds.distribution, apart)).all()
         alike = spectrum <= max(bounds.spectrum, SPECTRUM_WANDERS * apart_spectrum)
         return bool(near and alike)
+
+
+def _sizes(states: np.ndarray) -> np.ndarray:
+    """Standard deviation of every state in each third of a record, (3, n_states)."""
+    return np.array([zero_to_one(part.std(axis=0)) for part in np.array_split(states, 3)])
 
 
 def record_of(run: Trajectory, states: Sequence[str]) -> ComparedRecord:

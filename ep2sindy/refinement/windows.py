@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
+from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
@@ -82,6 +83,7 @@ def cut_windows(
 ) -> WindowBatch:
     """Cut `n_windows` windows of `window` samples; fewer if there are not that many positions.
 
+    No window crosses a gap (a step of over ten median steps), unless every position does.
     Raises ValueError for no trajectory, a window longer than every trajectory or of under five
     samples, or a missing variable.
     """
@@ -95,7 +97,9 @@ def cut_windows(
     spread, rms = joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0))
     scale = zero_to_one(np.append(spread, rms))
     step_s = float(np.mean(np.concatenate([np.diff(each.t) for each in trajectories])))
-    index, start = _places([len(v) for v in values], n_windows, window, rng)
+    stretches = _stretches(trajectories, window)
+    piece, start = _places([stop - first for _, first, stop in stretches], n_windows, window, rng)
+    index, start = stretches[piece, 0], start + stretches[piece, 1]
     cubics = [
         _cubics(each.t, v[:, n:] / scale[n:]) for each, v in zip(trajectories, values, strict=True)
     ]
@@ -164,10 +168,21 @@ def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
         )
 
 
+def _stretches(trajectories: Sequence[Trajectory], window: int) -> Int[np.ndarray, "pieces 3"]:
+    """Trajectory, first and last sample (exclusive) of every stretch without a gap.
+
+    The whole trajectories are returned if no stretch holds a window.
+    """
+    found = [(j, *each) for j, run in enumerate(trajectories) for each in between_gaps(run.t)]
+    if not any(stop - start >= window for _, start, stop in found):
+        found = [(j, 0, run.n_samples) for j, run in enumerate(trajectories)]
+    return np.array(found)
+
+
 def _places(
     lengths: Sequence[int], n_windows: int, window: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Trajectory and first sample of every window, in proportion to the room in trajectories."""
+    """Stretch and first sample of every window, in proportion to the room in the stretches."""
     room = np.array([max(n - window + 1, 0) for n in lengths])
     share = np.minimum(np.round(n_windows * np.cumsum(room) / room.sum()), np.cumsum(room))
     counts = np.minimum(np.diff(share, prepend=0.0).astype(int), room)

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
+from ep2sindy.data.gaps import LONGEST_STEP, between_gaps
 from ep2sindy.data.numbers import rounding_s
 
 # Largest deviation from an even grid, in steps, that is attributed to rounding of the recorded
 # times. The error of such a sample is a twentieth of the signal's change in a step.
 ROUNDED = 0.05
-
-# Longest step, in median steps, that is interpolated; a longer one is a gap. Random times have
-# such a gap once in 1000 samples, random losses of 30 % never. With a limit of 5, random times are
-# divided into stretches of about 30 samples, and Lorenz was never found.
-LONGEST_STEP = 10.0
 
 MIN_SAMPLES = 20  # fewest samples in a stretch between gaps; fewer do not determine their noise
 
@@ -35,18 +29,15 @@ def stretches(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
     A stretch of under 20 samples is left out, unless there is no gap.
     Raises ValueError if none is left.
     """
-    steps = np.diff(t)
-    cuts = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) + 1
-    edges = [0, *cuts.tolist(), len(t)]
-    pieces = list(pairwise(edges))
+    pieces = between_gaps(t)
     long = [(a, b) for a, b in pieces if b - a >= MIN_SAMPLES]
-    if len(cuts) and not long:
+    if len(pieces) > 1 and not long:
         raise ValueError(
-            f"a trajectory must hold {MIN_SAMPLES} samples without a gap: {len(cuts)} steps are "
-            f"over {LONGEST_STEP:g} times the median step of {np.median(steps):.4g} s; cut it at "
-            "its pauses, or interpolate it first"
+            f"a trajectory must hold {MIN_SAMPLES} samples without a gap: {len(pieces) - 1} steps "
+            f"are over {LONGEST_STEP:g} times the median step of {np.median(np.diff(t)):.4g} s; "
+            "cut it at its pauses, or interpolate it first"
         )
-    return long if len(cuts) else pieces
+    return long if len(pieces) > 1 else pieces
 
 
 def even_grid(

@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
+from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation
@@ -162,6 +163,10 @@ class RefinedScore:
         self, runs: Sequence[Trajectory], ensemble: Ensemble
     ) -> list[tuple[WindowBatch, WindowBatch]]:
         """Pairs of windows to refine on and windows to judge on; every window judges once."""
+        parts = [(run, part) for run in runs for part in between_gaps(run.t)]
+        apart = [run.window(*part) for run, part in parts if _is_wide(part)]
+        if max((run.n_samples for run in apart), default=0) >= 2 * MIN_SAMPLES:
+            runs = apart
         pieces = self._pieces(runs, self._window(runs, ensemble.states))
         n_folds = min(N_FOLDS, len(pieces))
         nothing_left_to_chance = np.random.default_rng(0)  # one window per trajectory
@@ -213,6 +218,10 @@ class RefinedScore:
                 "change window_s, or use longer records"
             )
         return window
+
+
+def _is_wide(part: tuple[int, int]) -> bool:
+    return part[1] - part[0] >= 2 * MIN_SAMPLES
 
 
 def _models(ensemble: Ensemble, places: Int[np.ndarray, " models"]) -> list[SparseModel]:

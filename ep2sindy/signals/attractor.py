@@ -11,7 +11,7 @@ from scipy import fft
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.runtime.values import read_only
-from ep2sindy.signals.spectrum import is_uniform, peak, power_spectrum
+from ep2sindy.signals.spectrum import at_mean_step, is_uniform, noise_floor, peak, power_spectrum
 
 MIN_PERIODS = 3.0  # fewest periods in a record that counts as repeating
 
@@ -156,10 +156,7 @@ def _line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
 
 
 def white_variance(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
-    """Variance of the white noise in samples of x, from the upper half of the spectrum.
-
-    The noise floor is the median power there, which spectral lines of a signal hardly change.
-    """
+    """Variance of the white noise in samples of x, from the upper half of the spectrum."""
     return _white_variance(*power_spectrum(t, x))
 
 
@@ -186,8 +183,7 @@ def mean_cycle(run: Trajectory) -> Trajectory:
 
 
 def _white_variance(frequency: np.ndarray, power: np.ndarray) -> float:
-    upper = power[len(power) // 2 :]
-    return float(np.median(upper) / np.log(2.0) * frequency[-1]) if upper.size else 0.0
+    return float(noise_floor(power) * frequency[-1]) if len(power) else 0.0
 
 
 def phase_along(
@@ -208,10 +204,7 @@ def _drift(t: np.ndarray, x: np.ndarray, straight: np.ndarray) -> np.ndarray:
     slow = (x - x.mean()) * np.exp(-1j * straight)
     even = t
     if not is_uniform(t):
-        from scipy.interpolate import make_interp_spline
-
-        even = np.linspace(t[0], t[-1], len(t))
-        slow = make_interp_spline(t, slow, k=1)(even)
+        even, slow = at_mean_step(t, slow, degree=1)
     per_period = len(t) * 2.0 * np.pi / (straight[-1] - straight[0])
     n = max(3, round(min(PERIODS_TRACKED * per_period, 0.5 * len(t))))
     drift = np.unwrap(np.angle(_moving_average(slow, np.hanning(n + 2)[1:-1])))

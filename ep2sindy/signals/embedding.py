@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -11,13 +12,23 @@ from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import unit_product
-from ep2sindy.signals.kalman import LOG10_RATIO_MIN, KalmanSmoother
-from ep2sindy.signals.log_smoother import LogSmoother, ratio_bound
+from ep2sindy.runtime.values import check_count
+from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.log_smoother import LogSmoother
+from ep2sindy.signals.spectrum import signal_memory_s
 from ep2sindy.signals.trace import Trace
 
 # Number of harmonics that the smoothers follow; faster components count as noise. Two states
 # cannot describe more. Ion-transit oscillations, ten times faster, would spoil the derivative.
 HARMONICS = 7.0
+
+# Least share of what stands out of the noise floor in the spectrum that a smoother must follow.
+KEPT = 0.99
+
+MAX_STATES = 5
+
+# Neighbours whose mean predicts the next state, samples at either end and most samples used.
+N_NEIGHBOURS, EDGE, MAX_POINTS = 4, 10, 5000
 
 # Noise level, in standard deviations of the signal, above which no derivative is taken.
 DROWNED = 0.5
@@ -47,12 +58,16 @@ class Embedding(Protocol):
     """Interface of the embeddings.
 
     says: description in words. names: names of the states made of a signal, the signal first.
+    n_states: their number.
     """
+
+    @property
+    def n_states(self) -> int: ...
 
     @property
     def says(self) -> str: ...
 
-    def names(self, signal: str) -> tuple[str, str]: ...
+    def names(self, signal: str) -> tuple[str, ...]: ...
 
     def embed(self, signal: Trace) -> Embedded: ...
 
@@ -61,24 +76,26 @@ class Embedding(Protocol):
 class LogRate:
     """A positive signal x and its growth rate g = d ln x / dt, so that x' = x g is known.
 
-    harmonics: number of harmonics of the period that the smoother follows.
+    harmonics: number of harmonics of the period that the smoother follows. n_states: 3 adds the
+    derivative of the growth rate, g' = h, and so on.
     """
 
     harmonics: float = HARMONICS
+    n_states: int = 2
 
     def __post_init__(self) -> None:
-        _check_harmonics(self.harmonics)
+        _check_settings(self)
 
     @property
     def says(self) -> str:
-        return "the signal and its growth rate"
+        return f"the signal and its growth rate{_and_derivatives(self.n_states)}"
 
-    def names(self, signal: str) -> tuple[str, str]:
-        return signal, _other(signal, "g")
+    def names(self, signal: str) -> tuple[str, ...]:
+        return _chain(signal, "ghkl"[: self.n_states - 1])
 
     def embed(self, signal: Trace) -> Embedded:
         """Raises ValueError for a signal that is not positive."""
-        x, g = self.names(signal.name)
+        x, g, *higher = self.names(signal.name)
         if not signal.is_positive:
             share = 100.0 * float((signal.x <= 0.0).mean())
             raise ValueError(
@@ -87,116 +104,135 @@ class LogRate:
                 "explain it; take its derivative instead (embedding=rate, ep.signals.Rate()), "
                 "or an offset out of it"
             )
-        found = LogSmoother(_finest_s(signal, self.harmonics)).estimate(signal.t, signal.x)
-        states = np.column_stack([found.smoothed, found.rate])
-        run = _trajectory(signal, signal.t, states, {x: signal.unit, g: "s^-1"})
-        return Embedded(run, (f"{x}: {x}*{g} == 1",), {x: (f"{x}*{g}",)}, found.noise_std)
+        smoother = LogSmoother(**_memory_bounds(signal, self.harmonics))
+        found = smoother.estimate(signal.t, signal.x)
+        states = [found.smoothed, *_derivatives(signal.t, found.log, self.n_states)[1:]]
+        units = {x: signal.unit} | _rate_units("s^-1", [g, *higher])
+        run = _trajectory(signal, signal.t, np.column_stack(states), units)
+        relations, terms = _known_chain([g, *higher])
+        relations, terms = (f"{x}: {x}*{g} == 1", *relations), {x: (f"{x}*{g}",)} | terms
+        return Embedded(run, relations, terms, found.noise_std)
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A signal x of either sign and its derivative v, so that x' = v is known."""
+    """A signal x of either sign and its derivative v, so that x' = v is known.
+
+    harmonics: number of harmonics of the period that the smoother follows. n_states: 3 adds the
+    derivative of v, v' = w, and so on.
+    """
 
     harmonics: float = HARMONICS
+    n_states: int = 2
 
     def __post_init__(self) -> None:
-        _check_harmonics(self.harmonics)
+        _check_settings(self)
 
     @property
     def says(self) -> str:
-        return "the signal and its derivative"
+        return f"the signal and its derivative{_and_derivatives(self.n_states)}"
 
-    def names(self, signal: str) -> tuple[str, str]:
-        return signal, _other(signal, "v")
+    def names(self, signal: str) -> tuple[str, ...]:
+        return _chain(signal, "vwuz"[: self.n_states - 1])
 
     def embed(self, signal: Trace) -> Embedded:
-        x, v = self.names(signal.name)
+        x, v, *higher = self.names(signal.name)
         smoothed, derivative, noise_std = _smooth(signal, self.harmonics)
-        states = np.column_stack([smoothed, derivative])
-        units = {x: signal.unit, v: unit_product([(signal.unit, 1), ("s", -1)])}
+        slopes = _derivatives(signal.t, smoothed, self.n_states)[2:]
+        rate_unit = unit_product([(signal.unit, 1), ("s", -1)])
+        units = {x: signal.unit} | _rate_units(rate_unit, [v, *higher])
+        states = np.column_stack([smoothed, derivative, *slopes])
         run = _trajectory(signal, signal.t, states, units)
-        return Embedded(run, (f"{x}: {v} == 1",), {x: (v,)}, noise_std)
+        relations, terms = _known_chain([x, v, *higher])
+        return Embedded(run, relations, terms, noise_std)
 
 
 @dataclass(frozen=True)
 class Delays:
-    """A signal and its own delayed value.
+    """A signal and its own delayed values.
 
     This embedding needs no derivative, but no equation is known beforehand either.
 
-    share: delay as a fraction of the period.
+    share: delay as a fraction of the period. n_states: 3 adds the value two delays before, and so
+    on.
     """
 
     share: float = 0.25
     harmonics: float = HARMONICS
+    n_states: int = 2
 
     def __post_init__(self) -> None:
-        _check_harmonics(self.harmonics)
+        _check_settings(self)
         if not 0.0 < self.share < 1.0:
             raise ValueError(f"share of the period must lie between 0 and 1: {self.share} came")
 
     @property
     def says(self) -> str:
-        return f"the signal and itself {self.share:g} of a period before"
+        more = "" if self.n_states == 2 else f", {self.n_states - 1} times"
+        return f"the signal and itself {self.share:g} of a period before{more}"
 
-    def names(self, signal: str) -> tuple[str, str]:
-        return signal, f"{signal}_before"
+    def names(self, signal: str) -> tuple[str, ...]:
+        return signal, *(f"{signal}_before{k}" for k in ("", *range(2, self.n_states)))
 
     def embed(self, signal: Trace) -> Embedded:
-        x, before = self.names(signal.name)
         smoothed, _, noise_std = _smooth(signal, self.harmonics)
-        lag_s = self.share * signal.period_s
-        late = signal.t >= signal.t[0] + lag_s
+        lags_s = self.share * signal.period_s * np.arange(1, self.n_states)
+        late = signal.t >= signal.t[0] + lags_s[-1]
         t = signal.t[late]
-        past = make_interp_spline(signal.t, smoothed, k=3)(t - lag_s)
-        states = np.column_stack([smoothed[late], past])
-        run = _trajectory(signal, t, states, {x: signal.unit, before: signal.unit})
+        past = make_interp_spline(signal.t, smoothed, k=3)
+        states = np.column_stack([smoothed[late], *(past(t - lag_s) for lag_s in lags_s)])
+        run = _trajectory(signal, t, states, dict.fromkeys(self.names(signal.name), signal.unit))
         return Embedded(run, (), {}, noise_std)
+
+
+AnyEmbedding = LogRate | Rate | Delays
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
     """An embedding, its result, and the reason for choosing it, in words."""
 
-    embedding: Embedding
+    embedding: AnyEmbedding
     reason: str
     embedded: Embedded = field(repr=False)
 
 
-def embed(signal: Trace, embedding: Embedding | None = None) -> Chosen:
+def embed(signal: Trace, embedding: AnyEmbedding | None = None, *, n_states: int = 2) -> Chosen:
     """Embed a signal as states; None chooses the embedding by the signal's sign and noise.
 
+    n_states: number of states if the embedding is chosen.
     Raises ValueError if the given embedding does not suit the signal.
     """
     if embedding is not None:
         return Chosen(embedding, "set", embedding.embed(signal))
     if signal.is_positive:
-        positive = LogRate()
+        positive = LogRate(n_states=n_states)
         return Chosen(positive, f"{signal.name} is positive", positive.embed(signal))
-    rate = Rate()
+    rate = Rate(n_states=n_states)
     found = rate.embed(signal)
     share = found.noise_std / float(signal.x.std())
     if share <= DROWNED:
         return Chosen(rate, f"{signal.name} takes either sign", found)
-    delays = Delays()
+    delays = Delays(n_states=n_states)
     why = f"{signal.name} takes either sign, and noise is {share:.2f} of its standard deviation"
     return Chosen(delays, why, delays.embed(signal))
 
 
 def _smooth(signal: Trace, harmonics: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Kalman-smoothed signal, its derivative, and the noise; follows at most `harmonics`."""
-    column = signal.x[:, None]
-    found = KalmanSmoother().estimate(signal.t, column)
-    step_s = float(np.ptp(signal.t)) / (len(signal.t) - 1)
-    finest = max(ratio_bound(_finest_s(signal, harmonics), step_s), LOG10_RATIO_MIN)
-    if found.log10_ratio[0] > finest:
-        found = KalmanSmoother(finest).estimate(signal.t, column)
+    smoother = KalmanSmoother(**_memory_bounds(signal, harmonics))
+    found = smoother.estimate(signal.t, signal.x[:, None])
     return found.smoothed[:, 0], found.derivative[:, 0], float(found.noise_std[0])
 
 
-def _finest_s(signal: Trace, harmonics: float) -> float:
-    """Time in which the highest harmonic advances by one radian, in s."""
-    return signal.period_s / (2.0 * np.pi * harmonics)
+def _memory_bounds(signal: Trace, harmonics: float) -> dict[str, float]:
+    """Bounds on the memory of a smoother, in s, by the period and by the spectrum of the signal.
+
+    The finest is the time in which the highest harmonic advances by one radian.
+    """
+    finest_s = signal.period_s / (2.0 * np.pi * harmonics)
+    coarsest_s = signal_memory_s(signal.t, signal.x, kept=KEPT)
+    return {"finest_s": finest_s, "coarsest_s": max(coarsest_s, finest_s)}
 
 
 def _trajectory(
@@ -212,11 +248,65 @@ def _trajectory(
     )
 
 
-def _other(signal: str, name: str) -> str:
-    """Name of the second state, changed if the signal already has that name."""
-    return name if name != signal else f"{name}_rate"
+def _chain(signal: str, letters: str) -> tuple[str, ...]:
+    """Names of the states, changed where the signal already has one."""
+    return signal, *(name if name != signal else f"{name}_rate" for name in letters)
 
 
-def _check_harmonics(harmonics: float) -> None:
-    if not harmonics >= 1.0:
-        raise ValueError(f"harmonics must be one or more: {harmonics} came")
+def _and_derivatives(n_states: int) -> str:
+    return "" if n_states == 2 else f", with {n_states - 2} more derivative{'s'[: n_states - 3]}"
+
+
+def _derivatives(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:
+    """x and its derivatives, n in all, by the quintic spline through the samples."""
+    spline = make_interp_spline(t, x, k=5)
+    return [x, *(spline.derivative(order)(t) for order in range(1, n))]
+
+
+def _rate_units(first: str, names: Sequence[str]) -> dict[str, str]:
+    """Units of a rate and its derivatives."""
+    return {name: unit_product([(first, 1), ("s", -k)]) for k, name in enumerate(names)}
+
+
+def _known_chain(names: Sequence[str]) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
+    """Relations and terms that say that each state but the last has the next as derivative."""
+    pairs = list(pairwise(names))
+    return tuple(f"{x}: {v} == 1" for x, v in pairs), {x: (v,) for x, v in pairs}
+
+
+def _check_settings(embedding: LogRate | Rate | Delays) -> None:
+    if not embedding.harmonics >= 1.0:
+        raise ValueError(f"harmonics must be one or more: {embedding.harmonics} came")
+    if not 2 <= check_count("n_states", embedding.n_states) <= MAX_STATES:
+        raise ValueError(
+            f"n_states must be 2 to {MAX_STATES}: {embedding.n_states} came; an oscillation needs "
+            "two, and higher derivatives are noise"
+        )
+
+
+def unexplained(signal: Trace, embedding: AnyEmbedding) -> float:
+    """Share of the next state's variance that neighbours in the given states do not explain.
+
+    The next state, such as a further derivative, is a function of the given ones if these are
+    enough; then neighbours agree in it. Otherwise some neighbours are false ones, which are close
+    only because a state is missing. Neighbours within half a period in time do not count.
+    Source: after Kennel, Brown & Abarbanel 1992, doi:10.1103/PhysRevA.45.3403.
+    """
+    from scipy.spatial import cKDTree  # imported only to count states
+
+    wider = replace(embedding, n_states=embedding.n_states + 1)
+    run = wider.embed(signal).run
+    inner = slice(EDGE, run.n_samples - EDGE)  # derivatives are poor at the ends
+    states = run.states[inner] - run.states[inner].mean(axis=0)
+    states = states / states.std(axis=0)
+    states = states[np.linspace(0, len(states) - 1, min(len(states), MAX_POINTS)).astype(int)]
+    apart = 0.5 * signal.period_s / (run.dt_s * run.n_samples) * len(states)
+    known, following = states[:, :-1], states[:, -1]
+    n_asked = min(len(states), N_NEIGHBOURS + 2 * int(apart) + 1)
+    _, places = cKDTree(known).query(known, k=n_asked)
+    far = np.abs(places - np.arange(len(states))[:, None]) > apart
+    order = np.cumsum(far, axis=1)
+    used = far & (order <= N_NEIGHBOURS)
+    means = (following[places] * used).sum(axis=1) / np.maximum(used.sum(axis=1), 1)
+    off = np.square(following - means).mean()
+    return float(off / (1.0 + 1.0 / N_NEIGHBOURS))  # the means themselves scatter

@@ -49,16 +49,23 @@ class KalmanSmoother:
     The mean of the process given all samples is the quintic smoothing spline. Each column has its
     own ratio of process to measurement noise: the most likely one, unless log10_ratio sets it for
     all columns. The initial state is diffuse, so a parabola passes unchanged.
-    Raises ValueError for a log10_ratio outside [-14, 4].
+    finest_s, coarsest_s: bounds on the memory of the process, in s, for the most likely ratio.
+    Components faster than `finest_s` count as noise. On pulses, or with few samples to a period,
+    the likelihood has a second maximum where the whole signal counts as noise; `coarsest_s` keeps
+    the search away from it. None sets no bound.
+    Raises ValueError for a log10_ratio outside [-14, 4], or bounds that are not positive times.
     Source: Wahba 1978, doi:10.1111/j.2517-6161.1978.tb01050.x; Durbin & Koopman 2012,
     doi:10.1093/acprof:oso/9780199641178.001.0001.
     """
 
     log10_ratio: float | None = None
+    finest_s: float | None = None
+    coarsest_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.log10_ratio is not None:
             _check_ratio(self.log10_ratio)
+        check_memory_bounds(self.finest_s, self.coarsest_s)
 
     def estimate(
         self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
@@ -78,7 +85,7 @@ class KalmanSmoother:
         noise_std, log10_ratio = np.empty((2, values.shape[1]))
         for j in range(values.shape[1]):
             column = np.ascontiguousarray(scaled[:, j])[:, None]
-            log10_ratio[j] = self._ratio(steps, column)
+            log10_ratio[j] = self._ratio(steps, column, step_s)
             ratio = 10.0 ** log10_ratio[j]
             signal[:, j : j + 1], slope[:, j : j + 1] = smooth(steps, column, ratio)
             noise_std[j] = np.sqrt(likelihood(steps, column, ratio)[1][0])
@@ -101,14 +108,37 @@ class KalmanSmoother:
         """Raises ValueError for fewer than five samples."""
         return self.estimate(t, values).derivative
 
-    def _ratio(self, steps: np.ndarray, column: np.ndarray) -> float:
-        return most_likely_ratio(steps, column) if self.log10_ratio is None else self.log10_ratio
+    def _ratio(self, steps: np.ndarray, column: np.ndarray, step_s: float) -> float:
+        if self.log10_ratio is not None:
+            return self.log10_ratio
+        bounds = ratio_bounds(
+            self.finest_s, self.coarsest_s, step_s, (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
+        )
+        return most_likely_ratio(steps, column, *bounds)
+
+
+def ratio_bounds(
+    finest_s: float | None, coarsest_s: float | None, step_s: float, limits: tuple[float, float]
+) -> tuple[float, float]:
+    """Least and largest log10_ratio at which the memory of the process lies within its bounds.
+
+    If the bounds contradict each other, the signal is followed: `coarsest_s` holds.
+    """
+    lowest, highest = limits
+    if coarsest_s is not None:
+        lowest = float(np.clip(6.0 * np.log10(step_s / coarsest_s), *limits))
+    if finest_s is not None:
+        highest = float(np.clip(6.0 * np.log10(step_s / finest_s), *limits))
+    return lowest, max(lowest, highest)
 
 
 def most_likely_ratio(
-    steps: Float[np.ndarray, " steps"], values: Float[np.ndarray, "samples 1"]
+    steps: Float[np.ndarray, " steps"],
+    values: Float[np.ndarray, "samples 1"],
+    lowest: float = LOG10_RATIO_MIN,
+    highest: float = LOG10_RATIO_MAX,
 ) -> float:
-    """log10 of the noise ratio of greatest likelihood for one column, within [-14, 4].
+    """log10 of the noise ratio of greatest likelihood for one column, within bounds.
 
     The likelihood may be flat or have several maxima: a grid of whole decades finds the
     highest one, and a bounded search between its neighbours refines it.
@@ -119,7 +149,7 @@ def most_likely_ratio(
     def misfit(log10_ratio: float) -> float:
         return -likelihood(steps, values, 10.0**log10_ratio)[0][0]
 
-    decades = np.arange(LOG10_RATIO_MIN, LOG10_RATIO_MAX + 1.0)
+    decades = np.append(np.arange(lowest, highest, 1.0), highest)
     misfits = [misfit(decade) for decade in decades]
     best = int(np.argmin(misfits))
     found = minimize_scalar(
@@ -130,6 +160,13 @@ def most_likely_ratio(
     )
     # The bounded search never tries the bounds themselves, so the grid point may be better.
     return float(found.x if found.fun < misfits[best] else decades[best])
+
+
+def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:
+    """Raise ValueError for bounds on a smoother's memory that are no positive times."""
+    for name, value in {"finest_s": finest_s, "coarsest_s": coarsest_s}.items():
+        if value is not None and not value > 0.0:
+            raise ValueError(f"{name} must be a positive time in s: {value} came")
 
 
 def _check_ratio(log10_ratio: float) -> None:

@@ -12,6 +12,7 @@ from scipy.optimize import minimize_scalar
 
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import read_only
+from ep2sindy.signals.kalman import check_memory_bounds, ratio_bounds
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
@@ -60,16 +61,16 @@ class LogSmoother:
     the noise says little about the logarithm there and has little weight; it may be zero or
     negative. The mode of the posterior is found by the Gauss-Newton method; the ratio of process
     to measurement noise is the most likely one (Laplace's approximation).
-    finest_s: least memory of the process, in s, where the signal is at its mean; faster
-    components count as noise. None leaves it to the data.
+    finest_s, coarsest_s: bounds on the memory of the process, in s, where the signal is at its
+    mean, as for `KalmanSmoother`. None leaves it to the data.
     Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 3.4.
     """
 
     finest_s: float | None = None
+    coarsest_s: float | None = None
 
     def __post_init__(self) -> None:
-        if self.finest_s is not None and not self.finest_s > 0.0:
-            raise ValueError(f"finest_s must be a positive time in s: {self.finest_s} came")
+        check_memory_bounds(self.finest_s, self.coarsest_s)
 
     def estimate(
         self, t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
@@ -82,7 +83,10 @@ class LogSmoother:
         step_s = (t[-1] - t[0]) / (len(t) - 1)
         mean = float(x.mean())
         y, penalty = x / mean, _roughness(t / step_s)
-        ratio, found = _most_likely(y, penalty, ratio_bound(self.finest_s, step_s))
+        limits = (LOG10_RATIO_MIN, LOG10_RATIO_MAX)
+        ratio, found = _most_likely(
+            y, penalty, *ratio_bounds(self.finest_s, self.coarsest_s, step_s, limits)
+        )
         log = found.log + np.log(mean)
         return LogEstimate(
             log=log,
@@ -90,14 +94,6 @@ class LogSmoother:
             noise_std=mean * float(np.sqrt(found.squares / (len(y) - 3))),
             log10_ratio=ratio,
         )
-
-
-def ratio_bound(finest_s: float | None, step_s: float) -> float:
-    """Largest log10_ratio at which the memory of the process is at least finest_s."""
-    if finest_s is None:
-        return LOG10_RATIO_MAX
-    bound = 6.0 * np.log10(step_s / finest_s)
-    return float(np.clip(bound, LOG10_RATIO_MIN, LOG10_RATIO_MAX))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +109,15 @@ class _Mode:
     misfit: float
 
 
-def _most_likely(y: np.ndarray, penalty: np.ndarray, highest: float) -> tuple[float, _Mode]:
+def _most_likely(
+    y: np.ndarray, penalty: np.ndarray, lowest: float, highest: float
+) -> tuple[float, _Mode]:
     """Ratio of greatest likelihood, and the mode of the posterior for it.
 
     A grid of decades down from the highest ratio is followed by a bounded search around the best.
     y: in units of its mean. Each search for a mode starts from the previous mode.
     """
-    decades = np.arange(highest, LOG10_RATIO_MIN - 1.0, -1.0)
+    decades = np.append(np.arange(highest, lowest, -1.0), lowest)
     modes, log = [], np.log(np.maximum(y, FLOOR))
     for decade in decades:
         modes.append(_mode(y, penalty, decade, log))

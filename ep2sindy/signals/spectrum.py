@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import fft
 
+from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.numbers import rounding_s
 
 STEP_TOLERANCE = 1e-6  # largest relative spread of steps in uniform sampling
@@ -19,19 +20,36 @@ def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
     return bool(np.ptp(steps) <= max(STEP_TOLERANCE * steps.mean(), 2 * rounding_s(t)))
 
 
+def at_mean_step(
+    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, degree: int = 3
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
+    """Samples at equal steps, the mean of the given ones, by splines of a degree between gaps.
+
+    A gap is bridged by a straight line: a spline would overshoot there.
+    """
+    from scipy.interpolate import make_interp_spline  # imported only for unequal steps
+
+    even = np.linspace(t[0], t[-1], len(t))
+    values = np.interp(even, t, x)
+    for start, stop in between_gaps(t) if degree > 1 else ():
+        own, degree_here = t[start:stop], min(degree, stop - start - 1)
+        inside = (even >= own[0]) & (even <= own[-1])
+        if degree_here > 1:
+            values[inside] = make_interp_spline(own, x[start:stop], k=degree_here)(even[inside])
+    return even, values
+
+
 def power_spectrum(
     t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
 ) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]]:
     """One-sided power spectral density of x, with the mean removed and a Hann window.
 
-    t: (samples,) in s. Samples at unequal steps are first resampled at the mean step (cubic).
+    t: (samples,) in s. Samples at unequal steps are first resampled at the mean step: by cubic
+    splines, and by straight lines across gaps.
     Returns frequencies in Hz and power density in u^2/Hz.
     """
     if not is_uniform(t):
-        from scipy.interpolate import make_interp_spline
-
-        uniform = np.linspace(t[0], t[-1], len(t))
-        x = make_interp_spline(t, x, k=min(3, len(t) - 1))(uniform)
+        x = at_mean_step(t, x)[1]
     rate_Hz = (len(t) - 1) / (t[-1] - t[0])
     return _periodogram(x, rate_Hz)
 
@@ -79,3 +97,58 @@ def peak(frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"
     curvature = left - 2 * centre + right
     shift = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
     return float(frequency[k] + np.clip(shift, -0.5, 0.5) * frequency[1])
+
+
+def noise_floor(power: Float[np.ndarray, " bins"]) -> float:
+    """Power density of white noise, from the upper half of a spectrum.
+
+    It is the median there, which spectral lines of a signal hardly change.
+    """
+    upper = power[len(power) // 2 :]
+    return float(np.median(upper) / np.log(2.0)) if upper.size else 0.0
+
+
+def _above_noise(power: Float[np.ndarray, " bins"]) -> Float[np.ndarray, " bins"]:
+    """Power density that stands out of the noise floor; zero where none does."""
+    floor = noise_floor(power)
+    # The largest of n exponential variables exceeds log n + 3 once in twenty records.
+    stands_out = power > floor * (np.log(max(len(power), 2)) + 3.0)
+    return np.where(stands_out, power - floor, 0.0)
+
+
+def crossing_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
+    """Mean rate in Hz at which a signal rises through its mean, white noise left out.
+
+    The frequency of a signal without a period, by the second moment of its spectrum. Zero for a
+    signal that does not stand out of the noise.
+    Source: Rice 1944, doi:10.1002/j.1538-7305.1944.tb00874.x.
+    """
+    frequency, power = power_spectrum(t, x)
+    excess = _above_noise(power)
+    whole = float(excess.sum())
+    return float(np.sqrt((np.square(frequency) * excess).sum() / whole)) if whole else 0.0
+
+
+def signal_memory_s(
+    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, kept: float
+) -> float:
+    """Longest memory, in s, of a twice integrated Wiener process that still follows the signal.
+
+    A smoother of memory tau passes the share 1 / (1 + (2 pi f tau)^6) of a component of frequency
+    f. What it changes may hold no more than 1 - kept of the power that stands out of the noise
+    floor.
+    """
+    frequency, power = power_spectrum(t, x)
+    excess = _above_noise(power)[1:]
+    if not excess.any():
+        return float(t[-1] - t[0])
+
+    def too_long(log_tau: float) -> float:
+        passed = 1.0 / (1.0 + (2.0 * np.pi * frequency[1:] * np.exp(log_tau)) ** 6)
+        return float((excess * np.square(1.0 - passed)).sum() / excess.sum() - (1.0 - kept))
+
+    from scipy.optimize import brentq  # imported only where a smoother is bounded
+
+    step_s = (t[-1] - t[0]) / (len(t) - 1)
+    low, high = np.log(1e-3 * step_s), np.log(t[-1] - t[0])
+    return float(np.exp(brentq(too_long, low, high) if too_long(high) > 0.0 else high))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -11,18 +11,35 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.signals.spectrum import crossing_frequency, dominant_frequency, is_uniform
 
 MIN_PERIODS = 6.0  # fewest periods in a record on which a free run can be judged
+
+# Fewest samples per period: three harmonics. A signal that is sampled more rarely is aliased.
+MIN_SAMPLES = 6.0
 
 # Samples per period that resolve a breathing mode; more samples cost time and follow the noise.
 ENOUGH_SAMPLES = 100
 
-DRIFT = 1.0  # in standard deviations over the record; a larger drift is reported
+# Samples of the first look at a long record, which finds out how many may be averaged.
+FIRST_LOOK = 50_000
 
-# Least standard deviation of the waveform, as a share of the signal's. A cycle found in white noise
-# also has some.
+# Least standard deviation of the waveform, as a share of the signal's, if there is a cycle. A cycle
+# found in white noise also has some.
 MIN_VISIBLE = 0.5
+
+# Share of white noise in the variance from which a signal without a cycle is taken for noise.
+ALL_NOISE = 0.7
+
+# A drift counts if it is certain, in standard errors, and large: as a share of the level that nine
+# of ten samples of a positive signal exceed, or of the standard deviation of any other.
+CERTAIN, DRIFT = 5.0, 0.1
+
+# Most digits of times that count as rounded, and how far off a rounded time may be, in units of its
+# last digit: half of it, and a little for the fit of the even times.
+MOST_DIGITS, ROUNDED = 9, 0.8
+
+JITTER = 0.02  # largest deviation from even times, in steps, that changes nothing
 
 # Limits for a signal that is positive apart from noise: how far a sample may lie below zero, in
 # standard deviations of the noise, and the share of samples that may.
@@ -33,15 +50,18 @@ NOISE_BELOW, SHARE_BELOW = 6.0, 0.05
 class Trace:
     """An oscillating signal of at least six periods.
 
-    x: (samples,) in `unit`. done: processing already applied to the samples, in words. advice:
-    processing that is recommended.
+    x: (samples,) in `unit`. frequency_Hz: of its cycle, or the mean rate at which it rises through
+    its mean. cycle: None for a signal that oscillates without repeating itself, such as chaos.
+    done: processing already applied to the samples, in words. advice: processing that is
+    recommended.
     """
 
     t: Float[np.ndarray, " samples"]
     x: Float[np.ndarray, " samples"]
     name: str
     unit: str
-    cycle: Cycle
+    frequency_Hz: float
+    cycle: Cycle | None = None
     done: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     clock: Clock = SECONDS
@@ -52,7 +72,26 @@ class Trace:
 
     @property
     def period_s(self) -> float:
-        return 1.0 / self.cycle.frequency_Hz
+        return 1.0 / self.frequency_Hz
+
+    def window(self, start: int, stop: int) -> Trace:
+        """Samples from `start` to `stop` (exclusive), with the frequency of the whole."""
+        return replace(self, t=self.t[start:stop], x=self.x[start:stop], done=(), advice=())
+
+    def with_samples(
+        self, t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
+    ) -> Trace:
+        """Other samples of the same signal."""
+        return replace(self, t=t, x=x, done=(), advice=())
+
+    @property
+    def n_periods(self) -> float:
+        return float(self.t[-1] - self.t[0]) * self.frequency_Hz
+
+    @property
+    def per_period(self) -> float:
+        """Mean number of samples in a period."""
+        return (len(self.t) - 1) / self.n_periods
 
     @property
     def is_positive(self) -> bool:
@@ -63,15 +102,18 @@ def from_one_signal(
     run: Trajectory,
     signal: str | None = None,
     *,
-    decimate: int | str | None = None,
-    detrend: bool = False,
+    decimate: int | str | None = "auto",
+    detrend: bool | str = "auto",
 ) -> Trace:
     """Make a trace of one variable of a run.
 
     signal: None takes the only state. decimate: number of samples that are replaced by their
-    mean; "auto" leaves a hundred per period. detrend: remove a straight line and keep the mean; a
-    positive signal is divided by the line, from any other signal the line is subtracted.
-    Raises ValueError for a signal that does not oscillate, under six periods, or a wrong setting.
+    mean; "auto" leaves a hundred per period, None leaves all. detrend: whether to subtract the
+    straight line that the signal follows beside its cycle, and keep the mean; "auto" does so if the
+    line is certain, and large beside the troughs of a positive signal or beside the standard
+    deviation of any other.
+    Raises ValueError for a signal that does not oscillate, under six periods or under six samples a
+    period, or a wrong setting.
 
     >>> t = np.linspace(0.0, 1e-3, 2001)
     >>> ep.signals.from_one_signal(ep.Trajectory(t, 3 + np.sin(6e4*t)[:, None], ["I"])).is_positive
@@ -80,35 +122,38 @@ def from_one_signal(
     name = run.state_names[0] if signal is None and len(run.state_names) == 1 else signal
     if name is None:
         raise ValueError(f"one signal must be named: this run has {list(run.names)}")
+    _check_settings(decimate, detrend)
+    t, x = run.t, run.columns([name])[:, 0]
+    t, evened = _even_within_digits(t)
+    t, x, averaged = _averaged(t, x, decimate)
+    cycle = find_cycle(t, x[:, None])
+    x, straightened, drifting = _without_drift(t, x, name, cycle, detrend)
+    cycle = find_cycle(t, x[:, None]) if straightened else cycle
+    if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
+        cycle = None
+    frequency_Hz = crossing_frequency(t, x) if cycle is None else cycle.frequency_Hz
+    found = Trace(
+        t,
+        x,
+        name,
+        run.units[name],
+        frequency_Hz,
+        cycle,
+        done=(*evened, *straightened, *averaged),
+        advice=drifting,
+        clock=run.clock,
+    )
+    _check_oscillation(found)
+    return found
+
+
+def _check_settings(decimate: object, detrend: object) -> None:
     if not (decimate is None or decimate == "auto" or (type(decimate) is int and decimate >= 1)):
         raise ValueError(
             f"decimate must be auto, null or a whole number, one or more: {decimate!r} came"
         )
-    t, x, done = run.t, run.columns([name])[:, 0], []
-    if detrend:
-        x = _without_line(t, x, name)
-        done.append("a straight line taken out")
-    cycle = _cycle(t, x, name)
-    per_period = len(t) / cycle.n_periods
-    spare = max(1, int(per_period // ENOUGH_SAMPLES))
-    factor = spare if decimate == "auto" else int(decimate or 1)
-    if factor > 1:
-        t, x = _means(t, factor), _means(x, factor)
-        cycle = _cycle(t, x, name)
-        done.append(
-            f"means over {factor} samples: {len(t)} are left, {per_period / factor:.0f} to a period"
-        )
-    advice = [] if factor > 1 or spare < 2 else [
-        f"{per_period:.0f} samples to a period are more than the dynamics need: decimate={spare}, "
-        "or decimate=auto, takes means over them, and costs less"
-    ]  # fmt: skip
-    drift = _drift(t, x)
-    if abs(drift) > DRIFT and not detrend:
-        advice.append(
-            f"{name} drifts by {drift:.1f} standard deviations over the record: detrend=true takes "
-            "a straight line out"
-        )
-    return Trace(t, x, name, run.units[name], cycle, tuple(done), tuple(advice), run.clock)
+    if not (isinstance(detrend, bool) or detrend == "auto"):
+        raise ValueError(f"detrend must be auto, true or false: {detrend!r} came")
 
 
 def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> bool:
@@ -121,28 +166,74 @@ def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples
     return bool(explained and x.mean() > 0.0 and (x <= 0.0).mean() <= SHARE_BELOW)
 
 
-def _cycle(t: np.ndarray, x: np.ndarray, name: str) -> Cycle:
-    """Cycle of a signal; ValueError if there is none or fewer than six periods."""
-    cycle = find_cycle(t, x[:, None])
-    if cycle is not None and cycle.std[0] < MIN_VISIBLE * x.std():
-        cycle = None
-    duration_s = float(t[-1] - t[0])
-    rough = dominant_frequency(t, x) * duration_s if np.ptp(x) > 0.0 else 0.0
-    n_periods = rough if cycle is None else cycle.n_periods
-    remedy = "; or take out its drift (detrend=true)" if abs(_drift(t, x)) > DRIFT else ""
+def _even_within_digits(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Even times if the recorded ones are their rounding to a few digits, and what was done."""
+    if is_uniform(t):
+        return t, ()
+    even = np.polynomial.Polynomial.fit(np.arange(len(t)), t, 1)(np.arange(len(t)))
+    if np.abs(t - even).max() <= JITTER * (even[1] - even[0]):
+        return even, ()
+    with np.errstate(divide="ignore"):
+        size = 10.0 ** np.floor(np.log10(np.where(t == 0.0, np.nan, np.abs(t))))
+    for digits in range(2, MOST_DIGITS):
+        quantum = np.nan_to_num(size * 10.0 ** (1 - digits), nan=np.nanmin(size) * 0.1)
+        if (np.abs(np.round(t / quantum) * quantum - t) <= 1e-6 * quantum).all():
+            is_even = (np.abs(t - even) <= ROUNDED * quantum).all()
+            words = f"times rounded to {digits} digits taken as equal steps"
+            return (even, (words,)) if is_even else (t, ())
+    return t, ()
+
+
+def _averaged(
+    t: np.ndarray, x: np.ndarray, decimate: int | str | None
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Samples replaced by means over neighbours, and what was done, in words."""
+    factor = _spare(t, x) if decimate == "auto" else int(decimate or 1)
+    if factor < 2:
+        return t, x, ()
+    done = f"means over {factor} samples: {len(t) // factor} are left"
+    return _means(t, factor), _means(x, factor), (done,)
+
+
+def _spare(t: np.ndarray, x: np.ndarray) -> int:
+    """Number of samples to average, so that a hundred are left in a period; 1 without a cycle.
+
+    A long record is looked at in means first. If they show too few samples to a period to decide,
+    all samples are taken.
+    """
+    for coarse in dict.fromkeys((max(1, len(t) // FIRST_LOOK), 1)):
+        rough_t, rough_x = _means(t, coarse), _means(x, coarse)
+        cycle = find_cycle(rough_t, rough_x[:, None])
+        if cycle is not None and (per_period := len(rough_t) / cycle.n_periods) > 4 * MIN_SAMPLES:
+            return max(1, int(coarse * per_period // ENOUGH_SAMPLES))
+    return 1
+
+
+def _check_oscillation(signal: Trace) -> None:
+    """Raise ValueError for a signal that does not oscillate, or not often or not finely enough."""
+    name, duration_s = signal.name, float(signal.t[-1] - signal.t[0])
+    n_periods = signal.n_periods
     if 0.5 < n_periods < MIN_PERIODS:
-        doubt = " if it oscillates at all" if cycle is None else ""
+        doubt = " if it oscillates at all" if signal.cycle is None else ""
         raise ValueError(
             f"a trace must hold {MIN_PERIODS:g} periods or more: {name} holds about "
-            f"{n_periods:.1f} in {duration_s:.4g} s{doubt}; record longer, or crop less{remedy}"
+            f"{n_periods:.1f} in {duration_s:.4g} s{doubt}; record longer, or crop less"
         )
-    if cycle is None:
+    is_noise = white_variance(signal.t, signal.x) > ALL_NOISE * signal.x.var()
+    if n_periods < MIN_PERIODS or (signal.cycle is None and is_noise):
         raise ValueError(
             f"a trace must oscillate: no period explains a quarter of the variance of {name} over "
-            f"its {duration_s:.4g} s (strongest line: {rough / duration_s:.4g} Hz); crop "
-            f"transients, prepare it with ep2sindy.prepare.low_pass, or take another signal{remedy}"
+            f"its {duration_s:.4g} s (strongest line: {signal.frequency_Hz:.4g} Hz), and most of "
+            "it is white noise; crop transients, prepare it with ep2sindy.prepare.low_pass, or "
+            "take another signal"
         )
-    return cycle
+    if signal.per_period < MIN_SAMPLES:
+        raise ValueError(
+            f"a trace must be sampled {MIN_SAMPLES:g} times a period or more: {name} has "
+            f"{signal.per_period:.1f} samples to a period of {signal.period_s:.4g} s, so that all "
+            f"above its harmonic number {signal.per_period / 2.0:.1f} is aliased to lower "
+            "frequencies; sample faster"
+        )
 
 
 def _means(values: np.ndarray, factor: int) -> np.ndarray:
@@ -151,23 +242,51 @@ def _means(values: np.ndarray, factor: int) -> np.ndarray:
     return values[: n * factor].reshape(n, factor).mean(axis=1)
 
 
-def _line(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.polynomial.Polynomial.fit(t, x, 1)(t)
+def _without_drift(
+    t: np.ndarray, x: np.ndarray, name: str, cycle: Cycle | None, detrend: bool | str
+) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
+    """The signal without its drift, what was done, and what is advised, in words."""
+    rise, error = _drift(t, x, cycle)
+    share = abs(rise) / _level(t, x)
+    counts = abs(rise) > CERTAIN * error and share > DRIFT
+    if detrend is True or (detrend == "auto" and counts and cycle is not None):
+        line = rise * ((t - t[0]) / (t[-1] - t[0]) - 0.5)
+        return x - line, (f"a straight line taken out, which rises by {rise:.3g}",), ()
+    if not counts:
+        return x, (), ()
+    advice = (
+        f"{name} drifts by {rise:.3g} over the record, {100.0 * share:.0f} % of its "
+        f"{'troughs' if is_positive(t, x) else 'standard deviation'}: detrend=true takes a "
+        "straight line out"
+    )
+    return x, (), (advice,)
 
 
-def _drift(t: np.ndarray, x: np.ndarray) -> float:
-    """Rise of the fitted straight line over the record, in standard deviations."""
-    line = _line(t, x)
-    return float((line[-1] - line[0]) / x.std())
+def _drift(t: np.ndarray, x: np.ndarray, cycle: Cycle | None) -> tuple[float, float]:
+    """Rise over the record of the line that x follows beside its cycle, and its standard error.
+
+    What remains lasts over many samples, so its means over periods are the independent data.
+    """
+    along = (t - t[0]) / (t[-1] - t[0]) - 0.5
+    rest, n = x - x.mean(), 0.0
+    if cycle is not None:
+        rest, n = x - cycle.waveform(cycle.phase)[:, 0], cycle.n_periods
+    n = n or max(dominant_frequency(t, x) * float(t[-1] - t[0]), 1.0)
+    parts = max(4, min(int(n), len(t) // 2))
+    place = np.minimum((parts * (along + 0.5)).astype(np.int64), parts - 1)
+    counts = np.bincount(place, minlength=parts)
+    kept = counts > 0
+    mean_along, mean_rest = (
+        np.bincount(place, weights=each, minlength=parts)[kept] / counts[kept]
+        for each in (along, rest)
+    )
+    away = mean_along - mean_along.mean()
+    rise = float(away @ mean_rest / (away @ away))
+    left = mean_rest - mean_rest.mean() - rise * away
+    return rise, float(np.sqrt(left @ left / max(kept.sum() - 2, 1) / (away @ away)))
 
 
-def _without_line(t: np.ndarray, x: np.ndarray, name: str) -> np.ndarray:
-    line = _line(t, x)
-    if not is_positive(t, x):
-        return x - line + x.mean()
-    if not line.min() > 0.0:
-        raise ValueError(
-            f"a positive signal is divided by the line through it, which must be positive: that of "
-            f"{name} falls to {line.min():.4g}; crop the record, or leave detrend out"
-        )
-    return x * x.mean() / line
+def _level(t: np.ndarray, x: np.ndarray) -> float:
+    """Troughs of a positive signal, or the standard deviation of any other."""
+    spread = float(x.std())
+    return max(float(np.quantile(x, 0.1)), 1e-3 * spread) if is_positive(t, x) else spread

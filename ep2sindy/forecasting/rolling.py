@@ -1,0 +1,99 @@
+"""Forecasts from many starts along one record, each from its own past."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.baselines import Baseline
+from ep2sindy.forecasting.forecast import Forecast, forecasts
+from ep2sindy.forecasting.tracking import FittedState, Tracker
+from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.signals.spectrum import is_uniform
+
+# Makes all states of a past, whose first columns are the measured ones.
+StatesOf = Callable[[Trajectory], Trajectory]
+
+
+@dataclass(frozen=True, eq=False)
+class RollingStarts:
+    """Starts of forecasts: numbers of the first samples that are forecast, `longest` from each on.
+
+    names: the measured states.
+    """
+
+    tracker: Tracker
+    record: Trajectory
+    names: Sequence[str]
+    first: Int[np.ndarray, " starts"]
+    longest: int
+
+    @property
+    def steps_s(self) -> Float[np.ndarray, " ahead"]:
+        """Horizons, in s since the last sample of the past, as from the first start."""
+        k = int(self.first[0])
+        return self.record.t[k : k + self.longest] - self.record.t[k - 1]
+
+    @property
+    def truth(self) -> Float[np.ndarray, "starts ahead measured"]:
+        samples = self.record.columns(self.names)
+        return np.stack([samples[k : k + self.longest] for k in self.first])
+
+    def ends(self, states_of: StatesOf | None, advance: Advance = nothing) -> list[FittedState]:
+        """The state before every start, from its past alone."""
+        found = []
+        for k in self.first.tolist():
+            past = self.record.window(max(0, k - 2 * self.tracker.memory), k)
+            found.append(self.tracker.end_of(past if states_of is None else states_of(past)))
+            advance(1)
+        return found
+
+    def forecasts(
+        self, states_of: StatesOf | None, n_draws: int, seed: int, advance: Advance = nothing
+    ) -> list[Forecast]:
+        return self.from_ends(self.ends(states_of, advance), n_draws, seed)
+
+    def from_ends(self, ends: Sequence[FittedState], n_draws: int, seed: int) -> list[Forecast]:
+        """Forecasts from fitted states; at equal steps, all of them are drawn together."""
+        t, begins = self.record.t, self.record.t[self.first - 1]
+        draw = partial(forecasts, self.tracker, n_draws=n_draws, clock=self.record.clock)
+        if is_uniform(t):
+            times = begins[:, None] + self.steps_s
+            return draw(ends, begins, times, seed=seed)
+        times = np.stack([t[k : k + self.longest] for k in self.first])
+        return [
+            draw([end], begin[None], own[None], seed=seed + k)[0]
+            for k, (end, begin, own) in enumerate(zip(ends, begins, times, strict=True))
+        ]
+
+    def continued(self, baseline: Baseline) -> Float[np.ndarray, "starts ahead measured"]:
+        """What a baseline forecasts from every start."""
+        samples, t = self.record.columns(self.names), self.record.t
+        return np.stack(
+            [baseline.ahead(samples[:k], t[:k], t[k : k + self.longest]) for k in self.first]
+        )
+
+    def measured(self, ahead: Sequence[Forecast]) -> Float[np.ndarray, "starts ahead measured"]:
+        return np.stack([each.states[:, self._columns] for each in ahead])
+
+    def coverage(self, ahead: Sequence[Forecast], level: float) -> float:
+        """Share of the samples that bands hold."""
+        low, high = (
+            np.stack(side)[:, :, self._columns]
+            for side in zip(*[each.band(level) for each in ahead], strict=True)
+        )
+        return float(((low <= self.truth) & (self.truth <= high)).mean())
+
+    def with_pushes(self, factor: float) -> RollingStarts:
+        """The same with pushes larger by a factor."""
+        noise = replace(self.tracker.noise, process=factor * self.tracker.noise.process)
+        return replace(self, tracker=replace(self.tracker, noise=noise))
+
+    @property
+    def _columns(self) -> list[int]:
+        return [list(self.tracker.model.states).index(name) for name in self.names]

@@ -1,0 +1,242 @@
+"""How far ahead a model forecasts a record that it has not seen, beside forecasts without it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.coerce import Run, trajectory_of
+from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence
+from ep2sindy.forecasting.calibration import calibrate
+from ep2sindy.forecasting.forecast import LEVEL, Forecast
+from ep2sindy.forecasting.rolling import RollingStarts, StatesOf
+from ep2sindy.forecasting.tracking import Tracker, track
+from ep2sindy.library.units import Clock
+from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.runtime.values import check_count
+from ep2sindy.signals.attractor import find_cycle
+from ep2sindy.signals.spectrum import dominant_frequency
+
+N_STARTS = 40
+PERIODS_AHEAD = 4.0  # longest horizon
+N_HORIZONS = 120  # most horizons at which errors are counted
+WORST = 10.0  # error, in standard deviations, that counts for a forecast that has diverged
+NEARER = 0.9  # share of the model's error below which a baseline is clearly nearer
+MODEL, PERSISTENCE, HARMONICS, AUTOREGRESSION = (
+    "model", "persistence", "harmonics", "autoregression",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastSkill:
+    """Errors of forecasts from starts all over a held-out part, by horizon and by who forecasts.
+
+    horizons_s: (horizons,). period_s: NaN for a record without an oscillation. nrmse: by `model`,
+    `persistence`, `harmonics` and `autoregression`, (horizons,): root mean square error over starts
+    and measured states, in standard deviations of the held-out samples. A baseline that the record
+    does not allow is left out. coverage_90: share of the held-out samples that the bands of 90 %
+    hold. example: the forecast from the first start. order: of the autoregression.
+    """
+
+    horizons_s: Float[np.ndarray, " horizons"]
+    period_s: float
+    nrmse: Mapping[str, Float[np.ndarray, " horizons"]]
+    coverage_90: float
+    n_starts: int
+    example: Forecast = field(repr=False)
+    order: int
+    clock: Clock = field(repr=False)
+
+    @property
+    def rival(self) -> str:
+        """The baseline that counts: the autoregression, or persistence if there is none."""
+        return AUTOREGRESSION if AUTOREGRESSION in self.nrmse else PERSISTENCE
+
+    @property
+    def better_span_s(self) -> tuple[float, float]:
+        """The longest span of horizons over which the model is better than the rival, in s.
+
+        From zero if it begins at the first horizon; (0, 0) if there is none.
+        """
+        is_better = (self.nrmse[MODEL] < self.nrmse[self.rival]).tolist()
+        best, begin = (0, 0), 0
+        for k, good in enumerate([*is_better, False]):
+            if good:
+                continue
+            if k - begin > best[1] - best[0]:
+                best = (begin, k)
+            begin = k + 1
+        if best[1] == best[0]:
+            return 0.0, 0.0
+        first = 0.0 if best[0] == 0 else float(self.horizons_s[best[0]])
+        return first, float(self.horizons_s[best[1] - 1])
+
+    @property
+    def better_until_periods(self) -> float:
+        """The end of that span in periods, or in samples for a record without an oscillation."""
+        return self._in_unit(self.better_span_s[1])
+
+    @property
+    def text(self) -> str:
+        """One sentence, such as `better than an autoregression (AR 18) for 3.1 periods`."""
+        rival = f"an autoregression (AR {self.order})" if self.order else self.rival
+        return f"{self._beside(rival)}{self._beside_the_cycle()}"
+
+    def _beside(self, rival: str) -> str:
+        begin, end = self.better_span_s
+        if not end:
+            return f"at no horizon better than {rival}"
+        unit = "periods" if np.isfinite(self.period_s) else "samples"
+        more = " and more" if end >= self.horizons_s[-1] else ""
+        until = f"{self._in_unit(end):.2g} {unit}{more}"
+        span = f"for {until}" if not begin else f"from {self._in_unit(begin):.2g} to {until} ahead"
+        return f"better than {rival} {span}"
+
+    def _beside_the_cycle(self) -> str:
+        """A remark if the mean cycle, going on, is nearer than the model at most horizons."""
+        if HARMONICS not in self.nrmse:
+            return ""
+        nearer = self.nrmse[HARMONICS] < NEARER * self.nrmse[MODEL]
+        words = "; the mean cycle, going on, is nearer at most horizons"
+        return words if nearer.mean() > 0.5 else ""
+
+    def at(self, horizon_s: float) -> dict[str, float]:
+        """Errors at the horizon nearest to the given one, by who forecasts."""
+        k = int(np.argmin(np.abs(self.horizons_s - horizon_s)))
+        return {name: float(values[k]) for name, values in self.nrmse.items()}
+
+    def summary(self) -> dict[str, object]:
+        """For `summary.json`: the errors at a few horizons."""
+        places = _few(len(self.horizons_s))
+        return {
+            "horizons_periods": [self._in_unit(h) for h in self.horizons_s[places].tolist()],
+            "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
+            "better_until_periods": self.better_until_periods,
+            "coverage_90": self.coverage_90,
+        }
+
+    def _in_unit(self, duration_s: float) -> float:
+        """A duration in periods, or in samples."""
+        unit_s = self.period_s if np.isfinite(self.period_s) else float(self.horizons_s[0])
+        return duration_s / unit_s
+
+
+def forecast_skill(
+    model: SparseModel,
+    run: Run,
+    *,
+    n_fitted: int,
+    starts: int = N_STARTS,
+    horizon_s: float | None = None,
+    measured: Sequence[str] | None = None,
+    states_of: StatesOf | None = None,
+    n_draws: int = 100,
+    tracker: Tracker | None = None,
+    seed: int = 0,
+    advance: Advance = nothing,
+) -> ForecastSkill:
+    """Forecast a held-out part again and again, each time from its own past, and count the errors.
+
+    run: a record of all states and inputs of the model; its first `n_fitted` samples were fitted,
+    and also serve the baselines. starts: number of starts, evenly spread over the rest. horizon_s:
+    the longest horizon; None takes four periods, or what half of the rest allows. measured: the
+    states that were measured; None means all. states_of: makes the states of a past whose first
+    columns are the measured ones, such as a growth rate (`ep.signals.embed`); the states of `run`
+    are then not used beyond `n_fitted`. tracker: of the model on the fitted part, if it is known
+    already. n_draws: of every forecast, for its bands.
+    Raises ValueError for a driven model, or a part that is too short.
+    """
+    record = trajectory_of(run)
+    names = list(model.states if measured is None else measured)
+    _check_skill(model, record, n_fitted)
+    fitted = record.window(0, n_fitted)
+    if tracker is None:
+        tracker = calibrate(track(model, fitted, measured=names), fitted, states_of=states_of)
+    period_s = _period_s(fitted, names)
+    longest = _longest(record, n_fitted, period_s, horizon_s)
+    places = np.linspace(n_fitted, record.n_samples - longest, check_count("starts", starts))
+    first = np.unique(places.round().astype(int))
+    rolling = RollingStarts(tracker, record, names, first, longest)
+    ahead = rolling.forecasts(states_of, check_count("n_draws", n_draws), seed, advance)
+    shown = np.unique(np.linspace(0, longest - 1, min(longest, N_HORIZONS)).round().astype(int))
+    scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
+    baselines, order = _baselines(fitted, names)
+    paths = {MODEL: rolling.measured(ahead)}
+    paths |= {name: rolling.continued(baseline) for name, baseline in baselines.items()}
+    errors = {name: _errors(path, rolling.truth, scale)[shown] for name, path in paths.items()}
+    return ForecastSkill(
+        horizons_s=rolling.steps_s[shown],
+        period_s=period_s,
+        nrmse=MappingProxyType(errors),
+        coverage_90=rolling.coverage(ahead, LEVEL),
+        n_starts=len(first),
+        example=ahead[0],
+        order=order,
+        clock=record.clock,
+    )
+
+
+def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
+    if model.inputs:
+        raise ValueError(
+            f"the skill of forecasts is counted for models without inputs: this one is driven by "
+            f"{list(model.inputs)}, whose future nobody knows; compare `model.rollout` along them"
+        )
+    if not 8 <= n_fitted <= record.n_samples - 4:
+        raise ValueError(
+            "the fitted part must have eight samples or more, and leave four: "
+            f"n_fitted={n_fitted} came for {record.n_samples} samples"
+        )
+
+
+def _period_s(run: Trajectory, names: Sequence[str]) -> float:
+    """Period of the record; NaN if it holds fewer than two."""
+    values = run.columns(names)
+    cycle = find_cycle(run.t, values)
+    frequency_Hz = dominant_frequency(run.t, values[:, 0]) if cycle is None else cycle.frequency_Hz
+    enough = frequency_Hz * float(run.t[-1] - run.t[0]) >= 2.0
+    return 1.0 / frequency_Hz if enough else float("nan")
+
+
+def _longest(record: Trajectory, n_fitted: int, period_s: float, horizon_s: float | None) -> int:
+    """Longest horizon, in samples."""
+    left = record.n_samples - n_fitted
+    wanted = PERIODS_AHEAD * period_s if horizon_s is None else horizon_s
+    if not np.isfinite(wanted):
+        return max(1, left // 2)
+    n = max(1, round(wanted / record.dt_s))
+    if horizon_s is not None and n >= left:
+        raise ValueError(
+            f"the horizon must leave room for starts: {horizon_s:g} s came, and "
+            f"{left * record.dt_s:.4g} s are held out"
+        )
+    return min(n, max(1, left // 2)) if horizon_s is None else n
+
+
+def _baselines(fitted: Trajectory, names: Sequence[str]) -> tuple[dict[str, Baseline], int]:
+    """The baselines that the record allows, by name, and the order of the autoregression."""
+    own = Trajectory(fitted.t, fitted.columns(names), tuple(names))
+    found: dict[str, Baseline] = {PERSISTENCE: Persistence()}
+    if (harmonics := Harmonics.of(own)) is not None:
+        found[HARMONICS] = harmonics
+    if (linear := Autoregression.of(own)) is not None:
+        found[AUTOREGRESSION] = linear
+    return found, 0 if linear is None else linear.order
+
+
+def _errors(forecast: np.ndarray, truth: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Root mean square error over starts and states, (horizons,), in `scale`."""
+    off = np.nan_to_num(np.abs(forecast - truth) / scale, nan=WORST, posinf=WORST)
+    return np.sqrt(np.square(np.minimum(off, WORST)).mean(axis=(0, 2)))
+
+
+def _few(n: int) -> list[int]:
+    """A few places of n, closer at the beginning."""
+    return sorted({round(share * (n - 1)) for share in (0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 1)})

@@ -1,0 +1,281 @@
+"""States of a model along a record: its start and the noise, fitted to the past alone.
+
+A model follows a record apart from two errors: the noise of the samples, and a random push of every
+state at every step (process noise), which stands for all that the model does not describe. Their
+sizes are the most likely ones for the record that the model was fitted to. States are then fitted
+to the samples of a window before any moment, by the model and under these errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.kernels import departures, eliminate, end_state
+from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, enough_substeps
+from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord, scale_problem
+from ep2sindy.model.model import SparseModel
+from ep2sindy.signals.spectrum import dominant_frequency
+
+MEMORY_PERIODS = 4.0  # length of the window that a start is fitted to
+MIN_MEMORY, MAX_MEMORY = 20, 600  # its length in samples
+
+MAX_FITTED = 3000  # samples from the end of a record that the noise is estimated from
+N_PASSES = 3  # states and noise, fitted in turn
+MAX_TRIALS = 120  # likelihoods per size of a noise in one pass
+
+# Bounds on the errors, in RMS of the states.
+LEAST_NOISE, LEAST_PUSH, MOST = 1e-5, 1e-7, 3.0
+
+# Process noise, in noise of the samples, of the fits that approach the final one. Free states find
+# their way to the samples first.
+COOLING = (3.0, 0.3, 0.03)
+MAX_STEPS, SETTLED, SHORTEST = 8, 1e-3, 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class ModelNoise:
+    """Standard deviations of the errors with which a model follows a record, in SI.
+
+    samples: (n_states,), of the samples' noise; NaN for a state that is not measured.
+    process: (n_states,), of the push of every state in a mean step.
+    """
+
+    samples: Float[np.ndarray, " n_states"]
+    process: Float[np.ndarray, " n_states"]
+
+
+@dataclass(frozen=True, eq=False)
+class FittedState:
+    """The state at the end of a window: most likely value (n_states,) and covariance, in SI."""
+
+    mean: Float[np.ndarray, " n_states"]
+    covariance: Float[np.ndarray, "n_states n_states"]
+
+
+@dataclass(frozen=True, eq=False)
+class Tracker:
+    """A model that can follow records, with the errors that it makes on one.
+
+    problem: scales and steps of that record. free: the model's coefficients, scaled. measured:
+    (n_states,), False for states that were made from the others. n_substeps: Runge-Kutta steps
+    between samples. per_period: samples to a period of the record.
+    """
+
+    model: SparseModel
+    problem: EstimationProblem
+    free: Float[np.ndarray, " free"]
+    measured: Bool[np.ndarray, " n_states"]
+    n_substeps: int
+    per_period: float
+    noise: ModelNoise
+
+    @property
+    def memory(self) -> int:
+        """Length in samples of the window that a start is fitted to."""
+        return int(np.clip(MEMORY_PERIODS * self.per_period, MIN_MEMORY, MAX_MEMORY))
+
+    def end_of(self, history: Trajectory) -> FittedState:
+        """Fit the states of the last samples of a history, and return the last state.
+
+        history: has all states of the model; those that are not measured only start the fit.
+        """
+        last = history.window(max(0, history.n_samples - self.memory), history.n_samples)
+        record = self.problem.record(_of_model(self.model, last))
+        samples, process = self.scaled_noise()
+        path = self.approach(record, record.samples.copy(), samples, process)
+        variances = _variances(len(path), samples, process)
+        mean, covariance = end_state(*self.linear(record, path), *variances, FREE_START)
+        scale = self.problem.scale
+        return FittedState(scale * (path[-1] + mean), np.outer(scale, scale) * covariance)
+
+    def scaled_noise(self) -> tuple[np.ndarray, np.ndarray]:
+        """Noise of samples and pushes, scaled; states that are not measured get the mean of others.
+
+        The noise of the latter only sets how freely the first fits may leave the flow.
+        """
+        samples, process = (
+            each / self.problem.scale for each in (self.noise.samples, self.noise.process)
+        )
+        return np.where(self.measured, samples, samples[self.measured].mean()), process
+
+    def approach(
+        self, record: ScaledRecord, path: np.ndarray, samples: np.ndarray, process: np.ndarray
+    ) -> np.ndarray:
+        """The most likely path near the given one, by way of larger pushes that fade."""
+        for share in (*COOLING, 0.0):
+            path = self._smooth(record, path, samples, np.maximum(process, share * samples))
+        return path
+
+    def linear(
+        self, record: ScaledRecord, path: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives of the flow, its misses, and residuals, NaN where nothing was measured."""
+        none = np.zeros(len(self.free), dtype=np.bool_)
+        flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
+        residuals = np.where(self.measured, record.samples - path, np.nan)
+        return np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals
+
+    def _smooth(
+        self, record: ScaledRecord, path: np.ndarray, samples: np.ndarray, process: np.ndarray
+    ) -> np.ndarray:
+        """Most likely path near the given one, by Gauss-Newton steps that are halved if needed."""
+        variances = _variances(len(path), samples, process)
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = self._total(record, path, *variances)
+            for _ in range(MAX_STEPS):
+                linear = self.linear(record, path)
+                if not all(np.isfinite(part).all() for part in linear[:2]):
+                    return path
+                move, share = departures(*linear, *variances, FREE_START), 1.0
+                while share >= SHORTEST:
+                    ahead = self._total(record, path + share * move, *variances)
+                    if ahead < total:
+                        break
+                    share *= 0.5
+                else:
+                    return path
+                gain, path, total = total - ahead, path + share * move, ahead
+                if gain < SETTLED * max(total, 1.0) and share == 1.0:
+                    break
+        return path
+
+    def _total(
+        self, record: ScaledRecord, path: np.ndarray, variance: np.ndarray, pushes: np.ndarray
+    ) -> float:
+        """The squares that the most likely path makes least."""
+        misses = self.problem.ends(record, path[:-1], self.free, self.n_substeps) - path[1:]
+        residuals = (record.samples - path)[:, self.measured]
+        total = float((np.square(residuals) / variance[:, self.measured]).sum())
+        total += float((np.square(misses) / pushes).sum())
+        return total if np.isfinite(total) else np.inf
+
+
+def track(
+    model: SparseModel,
+    run: Trajectory,
+    *,
+    measured: Sequence[str] | None = None,
+) -> Tracker:
+    """Estimate with what errors a model follows a record, usually the one that it was fitted to.
+
+    run: has all states and inputs of the model. measured: states whose samples count; the others
+    were made from them. None means all. Every state may be pushed, also one whose equation is known
+    to hold, such as x' = v: the others' errors come in through it.
+    Raises ValueError for a run without some variable, or measured states that the model lacks.
+    """
+    names = list(model.states if measured is None else measured)
+    if not names or not set(names) <= set(model.states):
+        raise ValueError(
+            f"measured must name some of the states {list(model.states)}: {names} came"
+        )
+    own = _of_model(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
+    terms = {state: list(model.terms(state)) for state in model.states}
+    problem = scale_problem([own], model.library, terms=terms)
+    path = problem.records[0].samples.copy()
+    free, is_measured = _free_of(model, problem), np.isin(model.states, names)
+    # Differences remove what is smooth; those of white noise have a variance of 20.
+    rough = np.sqrt(np.square(np.diff(path, n=3, axis=0)).mean(axis=0) / 20.0)
+    rough = np.clip(rough, LEAST_NOISE, MOST)
+    tracker = Tracker(
+        model=model,
+        problem=problem,
+        free=free,
+        measured=is_measured,
+        n_substeps=_substeps(problem, path, free, rough),
+        per_period=_per_period(own, names),
+        noise=_noise_of(problem, is_measured, rough, 0.1 * rough),
+    )
+    for _ in range(N_PASSES):
+        tracker, path = _with_likely_noise(tracker, path)
+    return tracker
+
+
+def _with_likely_noise(tracker: Tracker, path: np.ndarray) -> tuple[Tracker, np.ndarray]:
+    """The tracker with the most likely noise about the states, and these states."""
+    from scipy.optimize import minimize  # imported only to estimate noise
+
+    (record,), measured = tracker.problem.records, tracker.measured
+    samples, process = tracker.scaled_noise()
+    path = tracker.approach(record, path, samples, process)
+    linear = tracker.linear(record, path)
+    n, d = int(measured.sum()), len(measured)
+    low = np.log(np.repeat([LEAST_NOISE, LEAST_PUSH], [n, d]))
+
+    def noise(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        sizes = np.exp(np.clip(logs, low, np.log(MOST)))
+        own = np.ones(d)
+        own[measured] = sizes[:n]
+        return own, sizes[n:]
+
+    def unlikely(logs: np.ndarray) -> float:
+        least, log_spread = eliminate(*linear, *_variances(len(path), *noise(logs)), FREE_START)[2:]
+        beyond = np.square(logs - np.clip(logs, low, np.log(MOST))).sum()
+        return float(least + log_spread + beyond)
+
+    start = np.log(np.append(samples[measured], process))
+    found = minimize(
+        unlikely,
+        start,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": np.vstack([start, start + 1.5 * np.eye(len(start))]),
+            "maxfev": MAX_TRIALS * len(start),
+            "fatol": 0.1,
+            "xatol": 0.05,
+        },
+    )
+    return replace(tracker, noise=_noise_of(tracker.problem, measured, *noise(found.x))), path
+
+
+def _substeps(
+    problem: EstimationProblem, path: np.ndarray, free: np.ndarray, noise: np.ndarray
+) -> int:
+    """Number of Runge-Kutta steps from one sample to the next."""
+    level = Level((np.tile(noise, (len(path), 1)),), 1.0)
+    everything = np.ones(len(free), dtype=np.bool_)
+    fit = TrajectoryFit((path,), free, everything, np.zeros(len(noise)))
+    return enough_substeps(problem, fit, level)
+
+
+def _noise_of(
+    problem: EstimationProblem, measured: np.ndarray, samples: np.ndarray, process: np.ndarray
+) -> ModelNoise:
+    return ModelNoise(np.where(measured, samples, np.nan) * problem.scale, process * problem.scale)
+
+
+def _variances(n: int, samples: np.ndarray, process: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of n samples and of the pushes between them."""
+    return np.tile(np.square(samples), (n, 1)), np.tile(np.square(process), (n - 1, 1))
+
+
+def _of_model(model: SparseModel, run: Trajectory) -> Trajectory:
+    """The variables of a run that a model has, in its order."""
+    return Trajectory(
+        t=run.t,
+        states=run.columns(model.states),
+        state_names=tuple(model.states),
+        inputs=run.columns(model.inputs),
+        input_names=model.inputs,
+        units=run.units,
+        clock=run.clock,
+    )
+
+
+def _free_of(model: SparseModel, problem: EstimationProblem) -> Float[np.ndarray, " free"]:
+    coef = [
+        model.terms(problem.states[equation])[problem.term_names[column]]
+        for equation, column in zip(problem.equation, problem.column, strict=True)
+    ]
+    return np.array(coef) / problem.to_SI
+
+
+def _per_period(run: Trajectory, measured: Sequence[str]) -> float:
+    """Samples to a period of the fastest measured state, or in all if it holds none."""
+    frequency_Hz = max(dominant_frequency(run.t, column) for column in run.columns(measured).T)
+    periods = frequency_Hz * float(run.t[-1] - run.t[0])
+    return run.n_samples / max(periods, 1.0)

@@ -1,0 +1,161 @@
+"""Many runs of one model that differ by chance: in start, in coefficients, and by random pushes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.model.rollout import Equations, terms_in_use
+
+# Substeps between two samples: the fewest whose central run differs from that of twice as many by
+# no more than this share of its largest states.
+MAX_SUBSTEPS, ACCURATE = 64, 1e-4
+
+# A run that goes farther than this many times the largest states of start and record has diverged.
+BLOW_UP = 100.0
+
+Drive = Callable[[float], np.ndarray]
+
+
+def draw_normal(
+    mean: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"],
+    n_draws: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "draws n"]:
+    """Draws from a normal distribution, of variables whose sizes may differ by any factor."""
+    size = np.sqrt(zero_to_one(np.maximum(np.diag(covariance), 0.0)))
+    values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return mean + (rng.standard_normal((n_draws, len(mean))) @ root.T) * size
+
+
+def draw_coef(
+    model: Equations,
+    covariance: Float[np.ndarray, "_ _"] | None,
+    n_draws: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "draws terms n_states"]:
+    """Coefficients drawn with their covariance; all alike if it is None.
+
+    covariance: of the coefficients that are not zero, by equation, as in `SparseModel`.
+    """
+    coef = np.repeat(model.coef.T[None], n_draws, axis=0)
+    used = model.coef.T != 0.0
+    if covariance is not None and used.any():
+        coef[:, used] = draw_normal(model.coef.T[used], covariance, n_draws, rng)
+    return coef.transpose(0, 2, 1)
+
+
+def draw_runs(
+    model: Equations,
+    t: Float[np.ndarray, " samples"],
+    starts: Float[np.ndarray, "draws n_states"],
+    coef: Float[np.ndarray, "draws terms n_states"],
+    *,
+    drive: Drive | None = None,
+    push_std: Float[np.ndarray, " n_states"] | None = None,
+    push_step_s: float = 1.0,
+    reach: Float[np.ndarray, " n_states"] | None = None,
+    rng: np.random.Generator | None = None,
+) -> Float[np.ndarray, "draws samples n_states"]:
+    """Integrate a model once for every draw, by classical Runge-Kutta steps between the samples.
+
+    drive: inputs at a time in s. push_std: standard deviation of the random push that every state
+    receives in push_step_s; None for none. reach: largest states expected, in SI; None takes the
+    starts'. A run that goes a hundred times farther has diverged, and is NaN from there on.
+    """
+    library, _ = terms_in_use(model.library, model.coef)
+    rows = [model.library.index(name) for name in library.names]
+    coef = np.ascontiguousarray(coef[:, rows])
+    gather = [[*model.states, *model.inputs].index(name) for name in library.variables]
+
+    def rates(time: float, x: np.ndarray, c: np.ndarray) -> np.ndarray:
+        values = x if drive is None else np.column_stack([x, np.tile(drive(time), (len(x), 1))])
+        return np.einsum("nt,nts->ns", library.evaluate(values[:, gather]), c)
+
+    largest = np.abs(starts).max(axis=0) if reach is None else np.abs(reach)
+    bound = BLOW_UP * zero_to_one(largest)
+    with np.errstate(over="ignore", invalid="ignore"):
+        centre = starts.mean(axis=0)[None], coef.mean(axis=0)[None]
+        n = _enough_substeps(rates, t, *centre, largest)
+        if rng is None or push_std is None or not push_std.any():
+            return _integrate(rates, t, starts, coef, n, bound)
+        pushes = push_std * np.sqrt(np.diff(t) / push_step_s)[:, None]
+        return _integrate(rates, t, starts, coef, n, bound, pushes, rng)
+
+
+def _enough_substeps(
+    rates: Callable[..., np.ndarray],
+    t: np.ndarray,
+    start: np.ndarray,
+    coef: np.ndarray,
+    largest: np.ndarray,
+) -> int:
+    """Number of Runge-Kutta steps between samples that follow the central run."""
+    n, bound = 1, BLOW_UP * zero_to_one(largest)
+    run = _integrate(rates, t, start, coef, n, bound)
+    while n < MAX_SUBSTEPS:
+        finer = _integrate(rates, t, start, coef, 2 * n, bound)
+        # A chaotic run leaves its neighbours: steps, not whole runs, are compared.
+        steps = [
+            np.concatenate(
+                [
+                    _step(rates, t[k], t[k + 1] - t[k], finer[:, k], coef, m) - finer[:, k]
+                    for k in np.linspace(0, len(t) - 2, min(len(t) - 1, 40)).astype(int)
+                ]
+            )
+            for m in (n, 2 * n)
+        ]
+        off = np.abs(steps[0] - steps[1]) / zero_to_one(np.abs(run).max(axis=(0, 1)))
+        if not np.isfinite(run).all():
+            off = np.full(1, np.inf if np.isfinite(finer).all() or n < 8 else 0.0)
+        if off.max() <= ACCURATE:
+            break
+        n, run = 2 * n, finer
+    return n
+
+
+def _integrate(
+    rates: Callable[..., np.ndarray],
+    t: np.ndarray,
+    starts: np.ndarray,
+    coef: np.ndarray,
+    n_substeps: int,
+    bound: np.ndarray,
+    pushes: np.ndarray | None = None,
+    rng: np.random.Generator | None = None,
+) -> np.ndarray:
+    x = starts.copy()
+    runs = np.full((len(x), len(t), x.shape[1]), np.nan)
+    runs[:, 0] = x
+    for k in range(len(t) - 1):
+        x = _step(rates, t[k], t[k + 1] - t[k], x, coef, n_substeps)
+        if pushes is not None and rng is not None:
+            x = x + pushes[k] * rng.standard_normal(x.shape)
+        x = np.where((np.abs(x) <= bound).all(axis=1)[:, None], x, np.nan)
+        runs[:, k + 1] = x
+    return runs
+
+
+def _step(
+    rates: Callable[..., np.ndarray],
+    t: float,
+    duration: float,
+    x: np.ndarray,
+    coef: np.ndarray,
+    n_substeps: int,
+) -> np.ndarray:
+    """Classical Runge-Kutta steps over a duration (Hairer, Norsett & Wanner 1993, II.1)."""
+    h = duration / n_substeps
+    for k in range(n_substeps):
+        now = t + k * h
+        one = rates(now, x, coef)
+        two = rates(now + 0.5 * h, x + 0.5 * h * one, coef)
+        three = rates(now + 0.5 * h, x + 0.5 * h * two, coef)
+        four = rates(now + h, x + h * three, coef)
+        x = x + h / 6.0 * (one + 2.0 * two + 2.0 * three + four)
+    return x

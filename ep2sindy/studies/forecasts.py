@@ -1,0 +1,63 @@
+"""Forecasts in studies: the sentence, the table, the figure and the summary of a skill."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.figures.forecasts import forecast_figure
+from ep2sindy.forecasting.skill import ForecastSkill
+from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
+
+SHOWN_PERIODS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+CAPTION = (
+    "Left: forecast from the first held-out sample on, fitted to the past alone, with the band "
+    "that is to hold 90 % of the samples. Right: error of forecasts from starts all over the "
+    "held-out part, by horizon (1: no better than the mean); persistence: the last sample "
+    "stays; harmonics: the mean cycle goes on; autoregression: linear, its order by AIC."
+)
+
+
+def forecast_section(skill: ForecastSkill, name: str = "forecast") -> Section:
+    """How far ahead the model forecasts, beside baselines."""
+    blocks: list[Block] = [Text(f"forecasts: {skill.text}"), _table(skill)]
+    return Section("Forecasts", [*blocks, *pictures([name])])
+
+
+def forecast_picture(run: Trajectory, skill: ForecastSkill) -> Captioned:
+    return Captioned(partial(forecast_figure, run, skill), CAPTION)
+
+
+def forecast_errors(skill: ForecastSkill) -> pd.DataFrame:
+    """Every error by horizon, for a CSV."""
+    return pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
+
+
+def forecast_summary(skill: ForecastSkill | None) -> dict[str, Any] | None:
+    return None if skill is None else skill.summary()
+
+
+def _table(skill: ForecastSkill) -> Table:
+    """Errors at a few horizons, by who forecasts."""
+    in_periods = bool(np.isfinite(skill.period_s))
+    unit_s = skill.period_s if in_periods else float(skill.horizons_s[0])
+    last = float(skill.horizons_s[-1]) / unit_s
+    asked = SHOWN_PERIODS if in_periods else (1.0, 2.0, 4.0, 8.0, 16.0)
+    shown = [each for each in asked if each <= 1.02 * last] or [last]
+    rows = {
+        f"{each:g} {'periods' if in_periods else 'samples'} ahead": {
+            name: f"{value:.3f}" for name, value in skill.at(each * unit_s).items()
+        }
+        for each in shown
+    }
+    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("horizon").reset_index()
+    return Table(
+        table,
+        title="error of forecasts (standard deviations)",
+        note=f"{skill.n_starts} starts, each fitted to the past alone; the bands of 90 % hold "
+        f"{100.0 * skill.coverage_90:.0f} % of the samples.",
+    )

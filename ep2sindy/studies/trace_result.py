@@ -1,0 +1,388 @@
+"""Result of a trace: the attempts in several numbers of states, the chosen model, and its tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import Discovery
+from ep2sindy.figures.fronts import front_figure
+from ep2sindy.figures.living import (
+    cycle_figure,
+    free_run_figure,
+    has_waveform,
+    waveform_figure,
+)
+from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
+from ep2sindy.forecasting.tracking import track
+from ep2sindy.library.equations import equation_text
+from ep2sindy.model.comparison import Verdict
+from ep2sindy.model.free_run import FreeRun
+from ep2sindy.model.model import SparseModel
+from ep2sindy.model.rollout import Rollout
+from ep2sindy.model.stability import LimitCycle
+from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
+from ep2sindy.signals.attractor import find_cycle
+from ep2sindy.signals.embedding import (
+    Chosen,
+    Embedding,
+)
+from ep2sindy.signals.trace import Trace
+from ep2sindy.studies.forecasts import (
+    forecast_errors,
+    forecast_picture,
+    forecast_section,
+    forecast_summary,
+)
+from ep2sindy.studies.library_result import CandidateRow, candidate_rows
+from ep2sindy.studies.living import WAVEFORM, FreeCycle, runs_from
+from ep2sindy.studies.source import data_summary
+from ep2sindy.studies.views import (
+    coefficients,
+    display_equation,
+    interval_table,
+    intervals,
+    model_summary,
+    rollout_tables,
+)
+
+# Error of forecasts, as a share of that of fewer states, from which more states are taken; starts
+# from which it is counted, and draws of each.
+CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
+
+STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distance from the cycle's middle, relative to its states
+
+CAPTIONS = {
+    "free_run": "The model run freely from one sample (colour) over the record that it never saw "
+    "(grey): the first periods, and the last.",
+    "plane": "The model's cycle in the plane of both states, over the data (grey), and runs from "
+    "other starts.",
+    "waveform": WAVEFORM,
+    "front": "Error of the derivative against number of terms: every candidate that was refined "
+    "and run freely; the star is selected, by its free runs.",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """A model in a number of states.
+
+    error: of its forecasts up to a period, where it was fitted, in standard deviations. share: of
+    the next state's variance that neighbours in these states do not explain.
+    """
+
+    chosen: Chosen
+    found: Discovery
+    error: float
+    share: float
+
+    @property
+    def n_states(self) -> int:
+        return self.chosen.embedding.n_states
+
+    @property
+    def text(self) -> str:
+        return (
+            f"{self.n_states} states: forecasts up to a period err by {self.error:.3f} standard "
+            f"deviations where fitted; neighbours leave {100.0 * self.share:.2g} % of the next "
+            "derivative unexplained"
+        )
+
+
+def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
+    """The fewest states, unless more forecast clearly better where they were fitted."""
+    best = attempts[0]
+    for each in attempts[1:]:
+        if each.error < CLEARLY * best.error:
+            best = each
+    return best
+
+
+def error_where_fitted(past: Trace, chosen: Chosen, model: SparseModel) -> float:
+    """Error of forecasts up to a period from starts in the last half of the fitted part."""
+    record = with_all_states(past, chosen)
+    skill = forecast_skill(
+        model,
+        record,
+        n_fitted=len(past.t) // 2,
+        starts=N_TRIED,
+        horizon_s=past.period_s,
+        measured=[past.name],
+        states_of=partial(states_before, past, chosen.embedding),
+        n_draws=N_DRAWS_TRIED,
+        tracker=track(model, record, measured=[past.name]),
+    )
+    return float(skill.nrmse["model"].mean())
+
+
+def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
+    """Samples of the signal as measured, with the other states beside it as far as they are known.
+
+    Where a state is not known, at the beginning or beyond the fitted part, the nearest is taken;
+    forecasts there make their own.
+    """
+    known = chosen.embedded.run
+    nearest = np.clip(np.searchsorted(known.t, signal.t), 0, known.n_samples - 1)
+    states = known.states[nearest].copy()
+    states[:, 0] = signal.x
+    return replace(known, t=signal.t, states=states, inputs=np.empty((len(signal.t), 0)))
+
+
+def states_before(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
+    """The states at a time, made from samples before it alone."""
+    return embedding.embed(signal.with_samples(past.t, past.states[:, 0])).run
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The model found from one signal, and its tests.
+
+    best: the attempt that was chosen among `attempts`. states: all of the record, the signal as
+    measured. measured: the test data. free: the run of the model over them, from a start that was
+    fitted to the samples before, and its cycle. skill: of forecasts of the test data; None without
+    any. label: name of the scores.
+    """
+
+    signal: Trace
+    best: Attempt
+    attempts: Sequence[Attempt]
+    states: Trajectory
+    measured: Trajectory
+    free: FreeCycle
+    skill: ForecastSkill | None
+    label: str
+
+    @property
+    def chosen(self) -> Chosen:
+        return self.best.chosen
+
+    @property
+    def found(self) -> Discovery:
+        return self.best.found
+
+    @property
+    def run(self) -> FreeRun:
+        return self.free.run
+
+    @property
+    def cycle(self) -> LimitCycle | None:
+        return self.free.cycle
+
+    @property
+    def model(self) -> SparseModel:
+        return self.found.model
+
+    @property
+    def is_held_out(self) -> bool:
+        return self.skill is not None
+
+    @property
+    def searched(self) -> list[str]:
+        return self.chosen.embedded.searched
+
+    @property
+    def data_frequency(self) -> str:
+        cycle = find_cycle(self.measured.t, self.measured.states[:, :1])
+        frequency_Hz = cycle.frequency_Hz if cycle else float("nan")
+        return self.run.rollout.clock.frequency_text(frequency_Hz)
+
+    def models(self) -> dict[str, SparseModel]:
+        return {"trace": self.model}
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        fronts = {f"front_{state}": self._front(state).csv() for state in self.searched}
+        samples = dict(zip(self.states.state_names, self.states.states.T, strict=True))
+        return {
+            **fronts,
+            **rollout_tables(self.measured, {"trace": self.run}),
+            "states": pd.DataFrame({"t_s": self.states.t, **samples}),
+            "coefficients": coefficients(self.models(), heading="model"),
+            **({} if self.skill is None else {"forecasts": forecast_errors(self.skill)}),
+        }
+
+    def _front(self, state: str) -> ResultTable[CandidateRow]:
+        return ResultTable(candidate_rows(self.found.fronts[state]), CANDIDATES)
+
+    def figures(self) -> dict[str, Captioned]:
+        held, rollout = self.measured, self.run.rollout
+        period_s = self.signal.period_s
+        drawn: dict[str, Any] = {
+            "free_run": partial(free_run_figure, held, rollout, period_s=period_s)
+        }
+        if self.cycle is not None:
+            plane, paths = held.state_names[:2], paths_off(self.model, self.cycle)
+            drawn["plane"] = partial(
+                cycle_figure, self.states, self.cycle.states, paths, plane=plane
+            )
+        if has_waveform(held, rollout) and self.signal.cycle is not None:
+            drawn["waveform"] = partial(waveform_figure, held, rollout)
+        fronts = {state: self.found.fronts[state] for state in self.searched}
+        drawn["front"] = partial(front_figure, fronts, label=self.label)
+        pictures_of = {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()}
+        if self.skill is not None:
+            pictures_of["forecast"] = forecast_picture(self.states, self.skill)
+        return pictures_of
+
+    def sections(self) -> list[Section]:
+        forecasts = [] if self.skill is None else [forecast_section(self.skill)]
+        return [
+            self._signal_section(), self._search_section(), self._living_section(), *forecasts
+        ]  # fmt: skip
+
+    def _signal_section(self) -> Section:
+        signal, embedded = self.signal, self.chosen.embedded
+        names = self.states.state_names
+        made = f"{self.chosen.embedding.says}, {', '.join(names[:-1])} and {names[-1]}"
+        per_period = signal.period_s / self.states.dt_s
+        turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
+        blocks: list[Block] = [
+            Text(
+                f"{signal.clock.frequency_text(1.0 / signal.period_s)}, "
+                f"{signal.n_periods:.0f} {turns} of {per_period:.0f} samples"
+            ),
+            Text(f"states: {made} ({self.chosen.reason})"),
+            Text(
+                f"noise, and what is too fast to be followed: {embedded.noise_std:.3g} "
+                f"{signal.unit}, {100.0 * embedded.noise_std / signal.x.std():.2g} % of the "
+                "standard deviation"
+            ),
+            *(Text(each) for each in signal.done),
+            *(Text(each.text) for each in self.attempts),
+        ]
+        return Section(f"The signal {signal.name}", blocks)
+
+    def _search_section(self) -> Section:
+        blocks: list[Block] = []
+        for state in self.searched:
+            front = self._front(state)
+            table = front.csv()
+            shown = _best_of_sizes(table)
+            blocks.append(
+                Table(
+                    front.screen().iloc[shown].reset_index(drop=True),
+                    title=f"candidates for {state}'",
+                    bold=np.flatnonzero(table["selected"].to_numpy()[shown]).tolist(),
+                    note="Of every size the best three by score, then by R2 of the derivative; "
+                    "score: largest deviation of a free run, in units of its bound; one lives.",
+                )
+            )
+        return Section("Search", [*blocks, *pictures(["front"])])
+
+    def _living_section(self) -> Section:
+        model, clock = self.model, self.states.clock
+        blocks: list[Block] = [Text(self.found.note)] if self.found.note else []
+        for state in model.states:
+            exact = "known" if state not in self.searched else ""
+            blocks.append(display_equation(model, state, clock, lead=exact))
+        blocks += interval_table(model, self.searched, clock)
+        where = "held-out record" if self.is_held_out else "whole record, too short to hold out"
+        rows = ResultTable({"model": self}, FREE_RUN).upright("")
+        blocks.append(Table(rows, title=f"run freely from one sample over the {where}"))
+        blocks += [Text(text, warning=warn) for text, warn in self._stability()]
+        return Section("Living model", [*blocks, *pictures(["free_run", "plane", "waveform"])])
+
+    def _stability(self) -> list[tuple[str, bool]]:
+        if self.cycle is None:
+            return [("the model has no cycle near its run", True)]
+        return [(self.free.text, self.run.verdict is not Verdict.LIVES)]
+
+    def n_terms(self, *, known: bool) -> int:
+        states = [s for s in self.model.states if (s not in self.searched) == known]
+        return sum(len(self.model.terms(state)) for state in states)
+
+    def summary(self) -> dict[str, Any]:
+        name = self.signal.name
+        return {
+            "data": data_summary(self.states),
+            "signal": {
+                "name": name,
+                "unit": self.signal.unit,
+                "done": list(self.signal.done),
+                "embedding": type(self.chosen.embedding).__name__,
+                "n_states": self.best.n_states,
+                "reason": self.chosen.reason,
+                "noise_std": self.chosen.embedded.noise_std,
+                "period_s": self.signal.period_s,
+            },
+            "model": model_summary(self.model) | {"intervals": intervals(self.model)},
+            "states": {
+                str(each.n_states): {"error": each.error, "unexplained": each.share}
+                for each in self.attempts
+            },
+            "misfit": self.found.misfit,
+            "living": facts(self, FREE_RUN),
+            "forecast": forecast_summary(self.skill),
+        }
+
+    def headline(self) -> Mapping[str, float]:
+        return ResultTable([self], FREE_RUN).headline()
+
+
+COMPARED = View.JSON | View.HEADLINE
+FREE_RUN: Metrics[Outcome] = [
+    Metric("verdict", lambda o: o.run.text, View.JSON | View.SCREEN),
+    Metric("note", lambda o: o.found.note, View.JSON),
+    Metric("held_out", lambda o: o.is_held_out, View.JSON),
+    Metric("frequency of the data", lambda o: o.data_frequency, View.SCREEN),
+    Metric("f_error", lambda o: o.run.f_error, View.ALL, "frequency error", percent(2)),
+    Metric("amplitude_ratio", lambda o: o.run.amplitude_ratio[o.signal.name], COMPARED),
+    Metric(
+        "amplitude_error", lambda o: {o.signal.name: o.run.amplitude_ratio[o.signal.name] - 1.0},
+        View.SCREEN, "amplitude error of {}", percent(2),
+    ),
+    Metric("waveform_error", lambda o: o.run.waveform_error[o.signal.name], COMPARED),
+    Metric(
+        "waveform", lambda o: {o.signal.name: o.run.waveform_error[o.signal.name]},
+        View.SCREEN, "waveform error of {}", "{:.3f} std",
+    ),
+    Metric("n_terms", lambda o: o.n_terms(known=False), View.HEADLINE),
+    Metric("n_terms_searched", lambda o: o.n_terms(known=False), View.JSON),
+    Metric("n_terms_known", lambda o: o.n_terms(known=True), View.JSON),
+    Metric(
+        "terms", lambda o: f"{o.n_terms(known=False)} searched, {o.n_terms(known=True)} known",
+        View.SCREEN,
+    ),
+    Metric("stability", lambda o: o.cycle.stability if o.cycle else None, View.JSON),
+    Metric("multiplier", lambda o: o.free.multiplier, COMPARED),
+    Metric("share_reaching", lambda o: o.free.share, COMPARED),
+]  # fmt: skip
+CANDIDATES: Metrics[CandidateRow] = [
+    Metric("terms", lambda row: row.candidate.n_terms, View.SHOWN),
+    Metric("r2", lambda row: row.candidate.r2_train, View.SHOWN, "R2", "{:.3f}"),
+    Metric("score", lambda row: row.candidate.score, View.SHOWN, format="{:.3f}"),
+    Metric("selected", lambda row: row.is_selected),
+    Metric("text", lambda row: equation_text(row.candidate.equation, row.terms)),
+    Metric("model", lambda row: _marked(row), View.SCREEN),
+]
+
+
+def _marked(row: CandidateRow) -> Equation:
+    mark = "  <- selected" if row.is_selected else ""
+    return Equation(row.candidate.equation, row.terms, mark=mark)
+
+
+def _best_of_sizes(table: pd.DataFrame, most: int = 3) -> list[int]:
+    """The best rows of every size, ordered by score and then by position."""
+    order = table.sort_values(["terms", "score"], kind="stable")
+    return sorted(order.groupby("terms").head(most).index.tolist())
+
+
+def paths_off(model: SparseModel, cycle: LimitCycle) -> list[Rollout]:
+    """Runs from states off the cycle, some nearer to its middle and some farther."""
+    middle = cycle.states.mean(axis=0)
+    places = np.arange(len(STARTS)) * len(cycle.states) // len(STARTS)
+    starts = middle + np.array(STARTS)[:, None] * (cycle.states[places] - middle)
+    starts[:, 0] = [_inside(start, cycle.states[:, 0]) for start in starts[:, 0]]
+    return runs_from(starts, model, cycle)
+
+
+def _inside(value: float, states: np.ndarray) -> float:
+    """A start value with the sign that the signal has on the cycle, if that is fixed."""
+    return max(value, 0.5 * float(states.min())) if (states > 0.0).all() else value

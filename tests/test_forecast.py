@@ -1,0 +1,229 @@
+"""Forecasts: starts from the past alone, bands that hold what they say, and baselines."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.baselines import Autoregression, Harmonics, Persistence
+from ep2sindy.forecasting.forecast import quantiles
+from ep2sindy.forecasting.tracking import track
+from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
+
+LINEAR = ep.polynomial(["x", "v"], degree=1)
+SPRING = ep.SparseModel(LINEAR, ["x", "v"], ep.coef_matrix(LINEAR, [{"v": 1.0}, {"x": -1.0}]))
+LORENZ = ep.lorenz()
+
+
+@cache
+def spring(noise: float, *, push: float = 0.0, n: int = 1200, seed: int = 0) -> Trajectory:
+    """The exact spring, at steps of 0.1 s, whose speed is pushed at random at every step."""
+    rng, h = np.random.default_rng(seed), 0.1
+    turn = np.array([[np.cos(h), np.sin(h)], [-np.sin(h), np.cos(h)]])
+    states = [np.array([1.0, 0.0])]
+    for _ in range(n - 1):
+        states.append(turn @ states[-1] + [0.0, push * rng.standard_normal()])
+    samples = np.array(states) + noise * rng.standard_normal((n, 2))
+    return Trajectory(h * np.arange(n), samples, ("x", "v"))
+
+
+@pytest.mark.parametrize(("noise", "push"), [(0.1, 0.0), (0.05, 0.02)])
+def test_noise_and_pushes_are_those_of_the_record(noise, push) -> None:
+    tracker = track(SPRING, spring(noise, push=push, n=3000))
+    # The standard error of either is a hundredth or two of it.
+    assert tracker.noise.samples == pytest.approx([noise, noise], rel=0.1)
+    if push:
+        assert tracker.noise.process[1] == pytest.approx(push, rel=0.15)
+    else:
+        assert tracker.noise.process.max() < 0.1 * noise
+
+
+def test_a_start_is_the_kalman_filter_of_the_window() -> None:
+    """For a linear model the fitted state is the least-squares fit of the window's samples."""
+    run = spring(0.1)
+    tracker = track(SPRING, run)
+    end = tracker.end_of(run.window(0, 800))
+    n = tracker.memory
+    age = run.t[799] - run.t[800 - n : 800]
+    rows = np.stack(
+        [np.column_stack([np.cos(age), -np.sin(age)]), np.column_stack([np.sin(age), np.cos(age)])]
+    ).reshape(2 * n, 2)
+    fit = np.linalg.lstsq(rows, run.states[800 - n : 800].T.ravel(), rcond=None)[0]
+    assert end.mean == pytest.approx(fit, abs=2e-3)  # pushes are small, and not nothing
+    expected = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * tracker.noise.samples
+    assert np.sqrt(np.diag(end.covariance)) == pytest.approx(expected, rel=0.1)
+
+
+def test_nothing_but_the_past_enters() -> None:
+    run = LORENZ.trajectory(noise=0.05, rng=0)
+    changed = run.states.copy()
+    changed[2000:] = changed[2000:][::-1]
+    other = replace(run, states=changed)
+    ours, theirs = (
+        ep.forecast(LORENZ.model, each.window(0, 2000), 0.5, n_draws=20) for each in (run, other)
+    )
+    np.testing.assert_array_equal(ours.draws, theirs.draws)
+    skills = [
+        ep.forecast_skill(LORENZ.model, each, n_fitted=2000, starts=1, horizon_s=0.2)
+        for each in (run, other)
+    ]
+    np.testing.assert_array_equal(skills[0].example.states, skills[1].example.states)
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.2])
+@pytest.mark.parametrize("system", [ep.lorenz(), ep.lotka_volterra()], ids=lambda s: s.name)
+def test_bands_hold_what_they_say(system, noise) -> None:
+    run = system.trajectory(noise=noise, rng=1)
+    n = round(0.75 * run.n_samples)
+    skill = ep.forecast_skill(system.model, run, n_fitted=n, starts=20)
+    assert 0.85 <= skill.coverage_90 <= 0.95
+    assert (skill.nrmse["model"] < skill.nrmse["autoregression"]).mean() > 0.9
+    assert skill.better_until_periods == pytest.approx(
+        skill.horizons_s[-1] / skill.period_s, rel=1e-9
+    )
+    assert skill.text.startswith("better than an autoregression (AR ")
+    assert skill.text.endswith("periods and more")
+
+
+def test_bands_grow_where_the_record_is_pushed() -> None:
+    run = spring(0.02, push=0.05)
+    low, high = ep.forecast(SPRING, run, 30.0).band()
+    width = (high - low)[:, 0]
+    assert width[-20:].mean() > 3.0 * width[:5].mean()
+    held = [
+        ep.forecast_skill(
+            SPRING, spring(0.02, push=0.05, seed=seed), n_fitted=900, starts=30
+        ).coverage_90
+        for seed in range(4)
+    ]
+    assert 0.82 <= np.mean(held) <= 0.97  # 300 samples are few when pushes last
+
+
+def test_a_state_that_was_not_measured_is_fitted_by_the_model() -> None:
+    run = spring(0.05)
+    nothing = 0.3 + 1e-3 * np.sin(run.t)
+    blind = replace(run, states=np.column_stack([run.states[:, 0], nothing]))
+    tracker = track(SPRING, blind, measured=["x"])
+    assert np.isnan(tracker.noise.samples[1])
+    truth = [np.cos(run.t[-1]), -np.sin(run.t[-1])]
+    assert tracker.end_of(blind).mean == pytest.approx(truth, abs=0.05)
+
+
+def test_frequencies_and_amplitudes_come_with_intervals() -> None:
+    ahead = ep.forecast(SPRING, spring(0.05), 2.0 * np.pi * 20)
+    low, middle, high = ahead.frequency_Hz()
+    assert low <= middle <= high
+    assert middle == pytest.approx(0.5 / np.pi, rel=1e-3)
+    low, middle, high = ahead.amplitude("x")
+    assert low < np.sqrt(0.5) < high
+    assert ahead.diverged == 0.0
+
+
+def test_draws_have_the_covariance_that_was_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    covariance = np.array([[4e20, 1e10], [1e10, 1.0]])
+    draws = draw_normal(np.array([1e12, 0.0]), covariance, 20_000, rng)
+    np.testing.assert_allclose(np.cov(draws.T) / covariance, 1.0, atol=0.05)
+    model = replace(SPRING, covariance=np.diag([0.01, 0.04]))
+    coef = draw_coef(model, model.covariance, 5000, rng)
+    assert coef[:, LINEAR.index("v"), 0].std() == pytest.approx(0.1, rel=0.05)
+    assert coef[:, LINEAR.index("x"), 1].std() == pytest.approx(0.2, rel=0.05)
+    assert np.count_nonzero(coef[0]) == 2
+
+
+def test_drawn_runs_are_those_of_the_solver() -> None:
+    t = np.linspace(0.0, 2.0, 41)
+    start = np.array([1.0, 2.0, 20.0])
+    coef = draw_coef(LORENZ.model, None, 2, np.random.default_rng(0))
+    runs = draw_runs(LORENZ.model, t, np.stack([start, start]), coef)
+    exact = LORENZ.model.simulate(t, start).states
+    np.testing.assert_allclose(runs[0], exact, atol=2e-2)
+    np.testing.assert_array_equal(runs[0], runs[1])
+
+
+def test_a_run_that_diverges_is_not_a_number_and_counts_as_such() -> None:
+    library = ep.polynomial(["x"], degree=2)
+    model = ep.SparseModel(library, ["x"], ep.coef_matrix(library, [{"x^2": 1.0}]))
+    coef = draw_coef(model, None, 2, np.random.default_rng(0))
+    runs = draw_runs(model, np.linspace(0.0, 2.0, 21), np.array([[1.0], [0.1]]), coef)
+    assert np.isnan(runs[0, -1]).all()
+    assert runs[1, -1, 0] == pytest.approx(0.125, rel=1e-4)
+    assert quantiles(runs, [0.5])[0, -1, 0] == pytest.approx(0.125, rel=1e-4)
+
+
+def test_an_autoregression_finds_its_own_order_and_goes_on() -> None:
+    rng, x = np.random.default_rng(0), [0.0, 0.0]
+    for _ in range(3000):
+        x.append(1.6 * x[-1] - 0.9 * x[-2] + 0.1 + 0.01 * rng.standard_normal())
+    run = Trajectory(np.arange(3002.0), np.array(x)[:, None], ("x",))
+    found = Autoregression.of(run)
+    assert found.order >= 2
+    assert found.coef[:2, 0, 0] == pytest.approx([1.6, -0.9], abs=0.1)
+    level = 0.1 / (1.0 - 1.6 + 0.9)
+    far = found.ahead(run.states, run.t, np.arange(500.0))
+    assert far[-1, 0] == pytest.approx(level, abs=0.01)
+    both = Autoregression.of(spring(0.0))
+    ahead = both.ahead(spring(0.0).states[:1000], spring(0.0).t[:1000], spring(0.0).t[1000:1100])
+    np.testing.assert_allclose(ahead, spring(0.0).states[1000:1100], atol=1e-3)
+    uneven = Trajectory(np.cumsum(rng.uniform(0.5, 1.5, 500)), np.array(x)[:500, None], ("x",))
+    assert Autoregression.of(uneven) is None
+
+
+def test_the_other_baselines_go_on_as_they_say() -> None:
+    run = spring(0.01)
+    past, later = run.window(0, 900), run.t[900:960]
+    cycle = Harmonics.of(past)
+    np.testing.assert_allclose(
+        cycle.ahead(past.states, past.t, later), spring(0.0).states[900:960], atol=0.06
+    )  # 72 phases are tried
+    np.testing.assert_array_equal(
+        Persistence().ahead(past.states, past.t, later), np.tile(past.states[-1], (60, 1))
+    )
+    noise = np.random.default_rng(0).standard_normal((400, 1))
+    assert Harmonics.of(Trajectory(np.arange(400.0), noise, ("x",))) is None
+
+
+def test_where_the_mean_cycle_is_nearer_it_is_said() -> None:
+    slow = replace(SPRING, coef=0.97 * SPRING.coef)
+    skill = ep.forecast_skill(slow, spring(0.02), n_fitted=900, starts=20)
+    assert "the mean cycle, going on, is nearer" in skill.text
+    summary = skill.summary()
+    assert set(summary) == {"horizons_periods", "nrmse", "better_until_periods", "coverage_90"}
+    assert summary["horizons_periods"][-1] == pytest.approx(
+        skill.horizons_s[-1] / skill.period_s, rel=1e-9
+    )
+
+
+def test_a_gap_is_no_obstacle() -> None:
+    run = spring(0.05)
+    kept = np.delete(np.arange(1200), slice(500, 560))
+    gappy = Trajectory(run.t[kept], run.states[kept], run.state_names)
+    skill = ep.forecast_skill(SPRING, gappy, n_fitted=800, starts=10)
+    assert "autoregression" not in skill.nrmse
+    assert skill.text.startswith("better than persistence for")
+    assert 0.8 <= skill.coverage_90 <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ep.forecast(SPRING, spring(0.05), -1.0), "a positive duration in s, or incr"),
+        (lambda: ep.forecast(SPRING, spring(0.05), [5.0, 6.0]), "after the history's end at 119.9"),
+        (lambda: ep.forecast(SPRING, spring(0.05), 1.0, measured=["z"]), "measured must name some"),
+        (lambda: ep.forecast(LORENZ.model, spring(0.05), 1.0), "unknown variable 'y'"),
+        (lambda: ep.forecast(SPRING, spring(0.05), 1.0, n_draws=0), "n_draws must be a whole"),
+        (lambda: ep.forecast(SPRING, spring(0.05), 1.0).band(1.0), "level must lie between 0 and"),
+        (lambda: ep.forecast(SPRING, spring(0.05), 1.0).amplitude("z"), "unknown state 'z'"),
+        (lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=1200), "and leave four"),
+        (
+            lambda: ep.forecast_skill(SPRING, spring(0.05), n_fitted=900, horizon_s=40.0),
+            "the horizon must leave room for starts: 40 s came, and 30 s are held out",
+        ),
+    ],
+)
+def test_what_cannot_be_forecast_is_refused(call, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
