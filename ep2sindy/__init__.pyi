@@ -105,6 +105,7 @@ from ep2sindy import signals as signals
 from ep2sindy import operating as operating
 from ep2sindy import thruster as thruster
 from ep2sindy import systems as systems
+from ep2sindy import datasets as datasets
 from ep2sindy import parallel as parallel
 from ep2sindy import benchmark as benchmark
 from ep2sindy import warnings as warnings

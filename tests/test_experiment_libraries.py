@@ -157,7 +157,7 @@ def test_a_page_is_whole_and_readable_in_a_browser(breathing_run: Path, width_px
     found = seen(page, width_px, questions=questions)
     assert [url for url in found.asked if not url.startswith("data:")] == [page.as_uri()]
     assert found.console == []
-    assert (found.figures, found.empty) == (12, 0)
+    assert (found.figures, found.empty) == (13, 0)
     assert found.scroll_px <= width_px  # what is wider scrolls in itself
     assert found.answers["hovers"] > 20
     assert found.answers["first"].startswith("n_i' of 0 terms: none\n1 - R2 = ")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.data.numbers import quantiles
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.baselines import Autoregression, Harmonics, Persistence
-from ep2sindy.forecasting.forecast import quantiles
 from ep2sindy.forecasting.tracking import track
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
 
@@ -142,6 +142,22 @@ def test_drawn_runs_are_those_of_the_solver() -> None:
     exact = LORENZ.model.simulate(t, start).states
     np.testing.assert_allclose(runs[0], exact, atol=2e-2)
     np.testing.assert_array_equal(runs[0], runs[1])
+
+
+def test_a_simulation_shows_what_the_coefficients_leave_open() -> None:
+    """x'' = -k x with k known to a part: the phase after a time t is off by t / 2 of it."""
+    model = replace(SPRING, covariance=np.diag([0.0, 0.01**2]))
+    t = np.linspace(0.0, 20.0, 401)
+    run = model.simulate(t, [1.0, 0.0], draws=4000)
+    low, high = run.band(0.95)
+    zero = int(np.argmin(np.abs(t - 4.5 * np.pi)))  # where x falls through zero
+    expected = 2.0 * 1.96 * 0.5 * 0.01 * t[zero]
+    assert (high - low)[zero, 0] == pytest.approx(expected, rel=0.05)
+    np.testing.assert_array_equal(run.states, model.simulate(t, [1.0, 0.0]).states)
+    with pytest.raises(ValueError, match="draws need the covariance of the coefficients"):
+        SPRING.simulate(t, [1.0, 0.0], draws=10)
+    with pytest.raises(ValueError, match="a band needs draws"):
+        SPRING.simulate(t, [1.0, 0.0]).band()
 
 
 def test_a_run_that_diverges_is_not_a_number_and_counts_as_such() -> None:

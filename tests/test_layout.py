@@ -22,6 +22,7 @@ ROOMS = [
     "runtime",
     "library",
     "data",
+    "datasets",
     "signals",
     "thruster",
     "model",

@@ -5,6 +5,7 @@ Values without a single clear meaning as real numbers are refused.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -103,3 +104,21 @@ def column_norms(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray,
     largest = zero_to_one(columns.max(axis=1, initial=0.0))
     columns /= largest[:, None]
     return zero_to_one(largest * np.sqrt(np.einsum("cr,cr->c", columns, columns)))
+
+
+def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) -> np.ndarray:
+    """Quantiles over the draws that are finite; NaN where none is.
+
+    Between two draws of n lies the share 1 / (n + 1) of all others, so bands hold what they say.
+    """
+    kept = np.isfinite(draws).any(axis=0)
+    filled = np.where(kept, draws, 0.0)
+    of = np.nanquantile if np.isnan(filled).any() else np.quantile
+    return np.where(kept, of(filled, levels, axis=0, method="weibull"), np.nan)
+
+
+def band_of(draws: Float[np.ndarray, "draws ..."], level: float) -> np.ndarray:
+    """Lower and upper bound that hold this share of the draws. ValueError if it is no share."""
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level must lie between 0 and 1: {level} came")
+    return quantiles(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level])

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ep2sindy.data.coerce import Run, trajectory_of
+from ep2sindy.data.numbers import band_of, quantiles
 from ep2sindy.forecasting.tracking import FittedState, Tracker, track
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.draws import draw_coef, draw_normal, draw_runs
@@ -52,11 +53,9 @@ class Forecast:
 
         Draws that diverged count neither way. Raises ValueError for a level that is no share.
         """
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"level must lie between 0 and 1: {level} came")
         rng = np.random.default_rng(self.seed)
         noise = np.nan_to_num(self.noise_std) * rng.standard_normal(self.draws.shape)
-        low, high = quantiles(self.draws + noise, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
+        low, high = band_of(self.draws + noise, level)
         return low, high
 
     @property
@@ -170,17 +169,6 @@ def forecasts(
         )
         for own, draws in zip(times, runs, strict=True)
     ]
-
-
-def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) -> np.ndarray:
-    """Quantiles over the draws that are finite; NaN where none is.
-
-    Between two draws of n lies the share 1 / (n + 1) of all others, so bands hold what they say.
-    """
-    kept = np.isfinite(draws).any(axis=0)
-    filled = np.where(kept, draws, 0.0)
-    of = np.nanquantile if np.isnan(filled).any() else np.quantile
-    return np.where(kept, of(filled, levels, axis=0, method="weibull"), np.nan)
 
 
 def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarray:

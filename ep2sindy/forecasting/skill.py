@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.numbers import zero_to_one
@@ -22,7 +22,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.signals.spectrum import crossing_frequency
 
 N_STARTS = 40
 PERIODS_AHEAD = 4.0  # longest horizon
@@ -148,28 +148,25 @@ def forecast_skill(
     and also serve the baselines. starts: number of starts, evenly spread over the rest. horizon_s:
     the longest horizon; None takes four periods, or what half of the rest allows. measured: the
     states that were measured; None means all. states_of: makes the states of a past whose first
-    columns are the measured ones, such as a growth rate (`ep.signals.embed`); the states of `run`
-    are then not used beyond `n_fitted`. tracker: of the model on the fitted part, if it is known
-    already. n_draws: of every forecast, for its bands.
+    columns are the measured ones, such as a growth rate (`ep.signals.embed`). tracker: of the model
+    on the fitted part, if it is known already. n_draws: of every forecast, for its bands.
     Raises ValueError for a driven model, or a part that is too short.
     """
-    record = trajectory_of(run)
-    names = list(model.states if measured is None else measured)
+    record, names = trajectory_of(run), list(model.states if measured is None else measured)
     _check_skill(model, record, n_fitted)
     fitted = record.window(0, n_fitted)
     if tracker is None:
         tracker = calibrate(track(model, fitted, measured=names), fitted, states_of=states_of)
     period_s = _period_s(fitted, names)
     longest = _longest(record, n_fitted, period_s, horizon_s)
-    places = np.linspace(n_fitted, record.n_samples - longest, check_count("starts", starts))
-    first = np.unique(places.round().astype(int))
+    first = _spread(n_fitted, record.n_samples - longest, check_count("starts", starts))
     rolling = RollingStarts(tracker, record, names, first, longest)
     ahead = rolling.forecasts(states_of, check_count("n_draws", n_draws), seed, advance)
-    shown = np.unique(np.linspace(0, longest - 1, min(longest, N_HORIZONS)).round().astype(int))
+    shown = _spread(0, longest - 1, min(longest, N_HORIZONS))
     scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
     baselines, order = _baselines(fitted, names)
     paths = {MODEL: rolling.measured(ahead)}
-    paths |= {name: rolling.continued(baseline) for name, baseline in baselines.items()}
+    paths |= {name: rolling.continued(each) for name, each in baselines.items()}
     errors = {name: _errors(path, rolling.truth, scale)[shown] for name, path in paths.items()}
     return ForecastSkill(
         horizons_s=rolling.steps_s[shown],
@@ -197,10 +194,13 @@ def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:
 
 
 def _period_s(run: Trajectory, names: Sequence[str]) -> float:
-    """Period of the record; NaN if it holds fewer than two."""
+    """Period of the record, or mean time between crossings; NaN if it holds fewer than two."""
     values = run.columns(names)
     cycle = find_cycle(run.t, values)
-    frequency_Hz = dominant_frequency(run.t, values[:, 0]) if cycle is None else cycle.frequency_Hz
+    if cycle is None:
+        frequency_Hz = max(crossing_frequency(run.t, column) for column in values.T)
+    else:
+        frequency_Hz = cycle.frequency_Hz
     enough = frequency_Hz * float(run.t[-1] - run.t[0]) >= 2.0
     return 1.0 / frequency_Hz if enough else float("nan")
 
@@ -229,6 +229,11 @@ def _baselines(fitted: Trajectory, names: Sequence[str]) -> tuple[dict[str, Base
     if (linear := Autoregression.of(own)) is not None:
         found[AUTOREGRESSION] = linear
     return found, 0 if linear is None else linear.order
+
+
+def _spread(first: int, last: int, n: int) -> Int[np.ndarray, " _"]:
+    """At most n whole numbers, evenly spread from first to last."""
+    return np.unique(np.linspace(first, last, n).round().astype(np.int64))
 
 
 def _errors(forecast: np.ndarray, truth: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -70,6 +70,8 @@ def _latex_factor(part: Part) -> str:
         return root if part.power == 1 else f"({root})"
     if part.function == "abs":
         return rf"|{argument}|"
+    if part.function == "sign":  # a smooth one
+        return rf"\tanh({argument})"
     known = part.function in ("sin", "cos", "exp", "log")
     return (rf"\{part.function}" if known else rf"\mathrm{{{part.function}}}") + f"({argument})"
 
@@ -169,7 +171,7 @@ def _factor_sympy(part: Part) -> sympy.Expr:
     if part.function == RECIPROCAL:
         return 1 / argument
     known = {"sin": sympy.sin, "cos": sympy.cos, "exp": sympy.exp, "log": sympy.log}
-    known |= {"sqrt": sympy.sqrt, "abs": sympy.Abs}
+    known |= {"sqrt": sympy.sqrt, "abs": sympy.Abs, "sign": sympy.tanh}
     return known.get(part.function, sympy.Function(part.function))(argument)
 
 

@@ -164,6 +164,10 @@ def _half_root(x: Any) -> Any:
     return 0.5 / array_namespace(x).sqrt(x)
 
 
+def _bell(x: Any) -> Any:
+    return 1.0 - array_namespace(x).tanh(x) ** 2
+
+
 def _reciprocal(x: Any) -> Any:
     return 1.0 / x
 
@@ -181,6 +185,8 @@ _BUILT_IN = (
     Kind("log", _of("log"), _reciprocal, _POSITIVE),
     Kind("sqrt", _of("sqrt"), _half_root, _POSITIVE, degree=0.5),
     Kind("abs", _of("abs"), _of("sign"), degree=1.0),
+    # Smooth, so that it can be integrated and refined: sign(v/w) turns over a width w.
+    Kind("sign", _of("tanh"), _bell),
     Kind(RECIPROCAL, _reciprocal, _negative_square, _POLE, degree=-1.0),
 )
 _kinds = {kind.name: kind for kind in _BUILT_IN}  # register_function adds to it

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -18,13 +18,14 @@ from ep2sindy.data.coerce import Run, is_run, trajectory_of
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.model.display import model_html, model_lines
-from ep2sindy.model.inputs import inputs_at_samples
+from ep2sindy.model.draws import draw_coef, draw_runs
+from ep2sindy.model.inputs import driven, inputs_at_samples
 from ep2sindy.model.rollout import Rollout, rates, rollout, simulate
 from ep2sindy.model.scores import derivative_r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import N_LINES
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import check_count, read_only
 from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:
@@ -162,6 +163,8 @@ class SparseModel:
         blow_up: float = 1e12,
         rtol: float = 1e-8,
         limit_s: float = 300.0,
+        draws: int = 0,
+        seed: int = 0,
     ) -> Rollout:
         """Integrate freely from the state x0 at t[0]; returns the states at the times t.
 
@@ -172,9 +175,24 @@ class SparseModel:
         returns one, marked `diverged` and with a message. It ends when a state exceeds `blow_up`
         times its scale, or when the solver gives up (see `rollout`). The scale of a state is its
         initial value; if that is zero, its initial rate times the duration.
-        Raises ValueError for a missing or unknown input and for wrong shapes.
+        draws: number of further runs, from the same start, with coefficients drawn from their
+        covariance; `Rollout.band` gives their bounds. For the uncertainty of start, noise and model
+        as well, see `ep.forecast`.
+        Raises ValueError for a missing or unknown input, for wrong shapes, and for draws from a
+        model without covariance.
         """
-        return simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol, limit_s=limit_s)
+        run = simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol, limit_s=limit_s)
+        if not check_count("draws", draws, 0):
+            return run
+        if self.covariance is None:
+            raise ValueError(
+                "draws need the covariance of the coefficients: this model has none, since it was "
+                "made by hand, or does not explain the data to within their noise"
+            )
+        coef = draw_coef(self, self.covariance, draws, np.random.default_rng(seed))
+        starts = np.tile(np.asarray(x0, dtype=np.float64), (draws, 1))
+        drive, _ = driven(self.inputs, inputs, np.asarray(t, dtype=np.float64))
+        return replace(run, draws=draw_runs(self, run.t, starts, coef, drive=drive))
 
     def predict(
         self, x: ArrayLike | Run, inputs: ArrayLike | Mapping[str, Any] | None = None

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ep2sindy.data.numbers import band_of
 from ep2sindy.data.trajectory import Trajectory, check_time
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.units import SECONDS, Clock
@@ -44,7 +45,8 @@ class Rollout:
     t: (samples,) in s, states: (samples, n_states), inputs: (samples, n_inputs), all cut where
     a diverged run stopped. units: by name, of states and inputs. clock: display format of t.
     outside: the function of the model whose domain the run has left, or an empty text; such a
-    run counts as diverged.
+    run counts as diverged. draws: (draws, samples, n_states), runs with coefficients drawn from
+    their covariance, NaN where one has diverged; none unless they were asked for.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -57,6 +59,21 @@ class Rollout:
     units: Mapping[str, str]
     outside: str = ""
     clock: Clock = SECONDS
+    draws: Float[np.ndarray, "draws samples n_states"] = field(
+        default_factory=lambda: np.empty((0, 0, 0)), repr=False
+    )
+
+    def band(
+        self, level: float = 0.9
+    ) -> tuple[Float[np.ndarray, "samples n_states"], Float[np.ndarray, "samples n_states"]]:
+        """Lower and upper bound between which this share of the draws lies at each time.
+
+        Raises ValueError for a run without draws, or a level that is no share.
+        """
+        if not len(self.draws):
+            raise ValueError("a band needs draws: ask for them, simulate(..., draws=100)")
+        low, high = band_of(self.draws, level)
+        return low, high
 
     @property
     def lasted_s(self) -> float:

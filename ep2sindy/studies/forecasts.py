@@ -10,8 +10,12 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.forecasts import forecast_figure
-from ep2sindy.forecasting.skill import ForecastSkill
+from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
+from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Captioned, Section, Table, Text, pictures
+from ep2sindy.runtime.progress import SILENT, Progress
+
+LEAST_SAMPLES = 20  # of the fitted part and of the rest
 
 SHOWN_PERIODS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 CAPTION = (
@@ -22,10 +26,23 @@ CAPTION = (
 )
 
 
-def forecast_section(skill: ForecastSkill, name: str = "forecast") -> Section:
+def skill_of(
+    model: SparseModel, run: Trajectory, *, n_fitted: int, starts: int, progress: Progress = SILENT
+) -> ForecastSkill | None:
+    """Skill of a model of measured states; None for a driven or empty model, or a short record."""
+    is_short = min(n_fitted, run.n_samples - n_fitted) < LEAST_SAMPLES
+    if not starts or model.inputs or is_short or not model.coef.any():
+        return None
+    with progress.stage(starts, "start", "forecasts") as advance:
+        return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, advance=advance)
+
+
+def forecast_section(
+    skill: ForecastSkill, name: str = "forecast", *, title: str = "Forecasts"
+) -> Section:
     """How far ahead the model forecasts, beside baselines."""
     blocks: list[Block] = [Text(f"forecasts: {skill.text}"), _table(skill)]
-    return Section("Forecasts", [*blocks, *pictures([name])])
+    return Section(title, [*blocks, *pictures([name])])
 
 
 def forecast_picture(run: Trajectory, skill: ForecastSkill) -> Captioned:

@@ -16,6 +16,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.figures.fronts import front_figure
+from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.functions import function_names
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.model.free_run import FreeRun, free_run, samples_in
@@ -32,6 +33,12 @@ from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.balance import ModelBalance, inflows_of, model_balance
 from ep2sindy.studies.fits import split_in_time
+from ep2sindy.studies.forecasts import (
+    forecast_errors,
+    forecast_picture,
+    forecast_section,
+    skill_of,
+)
 from ep2sindy.studies.library_result import LibraryResult, refit, run_refitted
 from ep2sindy.studies.living import LIVING, Living, LivingSearch, living_model, living_tables
 from ep2sindy.studies.source import Sampling, Source, balances_of, data_summary, zone_sizes_of
@@ -122,7 +129,9 @@ class Study:
     end. thesis: published equations by library: state -> term -> SI coefficient. They are fitted as
     well if the library has the terms and the data can tell them from others. living: how libraries
     without inputs are searched for a model that lives; None leaves that out. held_out: the last
-    share of the record, on which such a model is tested; None means a quarter.
+    share of the record, on which such a model is tested; None means a quarter. forecasts: number of
+    starts of forecasts, over the held-out part of a living model, or else over the last quarter of
+    the record; zero leaves them out.
     Raises ValueError for held_out without living, as it would do nothing.
     """
 
@@ -136,8 +145,11 @@ class Study:
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
+    forecasts: int = 0
 
     def __post_init__(self) -> None:
+        if self.forecasts < 0:
+            raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
         if self.living is None and self.held_out is not None:
             raise ValueError(
                 "held_out would do nothing: it is for a model that lives, and living is null; give "
@@ -200,6 +212,11 @@ class Study:
             lives, beside = self._lives(
                 data, library, rows, found.model, zones, rng=rng, progress=progress
             )
+        train = split_in_time(data, self.held_out or HELD_OUT)[0]
+        skill = skill_of(
+            found.model if lives is None else lives.model, data,
+            n_fitted=train.n_samples, starts=self.forecasts, progress=progress,
+        )  # fmt: skip
         with progress.stage(None, "", "free runs"):
             return LibraryResult(
                 method=method,
@@ -211,6 +228,7 @@ class Study:
                 living=lives,
                 balance=beside,
                 elsewhere=[free_run(found.model, run, n_samples=n) for run, n in others],
+                skill=skill,
             )
 
     def _lives(
@@ -306,6 +324,10 @@ class Outcome:
         """The living models that were searched for, by library."""
         return {n: r.living for n, r in self.results.items() if r.living is not None}
 
+    @property
+    def skills(self) -> dict[str, ForecastSkill]:
+        return {n: r.skill for n, r in self.results.items() if r.skill is not None}
+
     def models(self) -> dict[str, SparseModel]:
         found = {name: result.discovery.model for name, result in self.results.items()}
         return found | {f"{name}_living": each.model for name, each in self.living.items()}
@@ -319,6 +341,8 @@ class Outcome:
         for name, result in self.results.items():
             if result.balance is not None:
                 found |= result.balance.tables(name)
+        for name, skill in self.skills.items():
+            found[f"forecast_{name}"] = forecast_errors(skill)
         found |= living_tables(self.living) | {"comparison": self.comparison.csv("model")}
         return found | ({"records": self.records.csv()} if len(self.files) > 1 else {})
 
@@ -353,6 +377,8 @@ class Outcome:
             drawn |= living.figures(name)
         for name, result in self.results.items():
             drawn |= result.balance.figures(name) if result.balance is not None else {}
+        for name, skill in self.skills.items():
+            drawn[f"forecast_{name}"] = forecast_picture(self.data, skill)
         return drawn
 
     def sections(self) -> list[Section]:
@@ -364,6 +390,10 @@ class Outcome:
                 found.append(result.living.section(name))
             if result.balance is not None:
                 found.append(result.balance.section(name))
+            if result.skill is not None:
+                where = "that it has seen" if result.living is None else "held out"
+                title = f"{name}: forecasts over time {where}"
+                found.append(forecast_section(result.skill, f"forecast_{name}", title=title))
         compared = Table(self.comparison.screen("model", by_state=True), title=INTEGRATED)
         found.append(Section("Run freely from the first sample", [compared, *pictures(FIGURES)]))
         if len(self.files) > 1:

@@ -15,6 +15,7 @@ from ep2sindy.discovery.choice import LeftOver, NoiseTest
 from ep2sindy.discovery.discover import Discovery
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.estimation.estimate import Estimate, Rival
+from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
 from ep2sindy.model.free_run import FreeRun, free_run
@@ -62,6 +63,8 @@ class LibraryResult:
     given: the published coefficients as printed, by state. living: a model that oscillates on its
     own; None if none was asked for, or if the library has inputs. balance: of its zone, beside
     the living model. elsewhere: free runs of the selected model over the records after the first.
+    skill: of forecasts by the living model over its held-out part, or else by the selected one over
+    the last quarter of the record, which it was fitted to; None if there are none.
     """
 
     method: AnyMethod
@@ -73,6 +76,7 @@ class LibraryResult:
     living: Living | None = None
     balance: ModelBalance | None = None
     elsewhere: Sequence[FreeRun] = ()
+    skill: ForecastSkill | None = None
 
     @property
     def label(self) -> str:
@@ -132,6 +136,7 @@ class LibraryResult:
             "thesis_terms": self.published and _published_summary(self.published, self.refitted),
             "living": self.living and self.living.summary(),
             "balance": self.balance and self.balance.summary(),
+            "forecast": self.skill and self.skill.summary(),
         } | ({"estimate": facts(estimate, ESTIMATE)} if estimate else {})
 
     def headline(self, name: str) -> dict[str, float]:

@@ -13,29 +13,35 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from ep2sindy.data.coerce import Task
 from ep2sindy.data.conversion import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.method import AnyMethod
+from ep2sindy.discovery.fitted_functions import fit_functions
+from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.skill import forecast_skill
 from ep2sindy.forecasting.tracking import track
-from ep2sindy.library.library import polynomial
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import REPEATS
 from ep2sindy.model.free_run import free_run
+from ep2sindy.regression.searches import BestSubset
+from ep2sindy.regression.weak import WeightedWeak
 from ep2sindy.report.run import Run
 from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.embedding import (
     AnyEmbedding,
     Chosen,
     Delays,
+    Embedded,
     LogRate,
     Rate,
     embed,
     unexplained,
 )
-from ep2sindy.signals.trace import MIN_PERIODS, Trace, from_one_signal
+from ep2sindy.signals.trace import Trace, from_one_signal
 from ep2sindy.studies.living import FreeCycle
 from ep2sindy.studies.source import Source, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
@@ -53,7 +59,7 @@ PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that
 # Candidates per equation if no equation is known, so that there are few combinations.
 DEPTH_OF_BOTH = 2
 
-MIN_FITTED = MIN_PERIODS - 1.0  # periods that a fitted part must have
+MIN_FITTED = 4.0  # periods that a fitted part must have
 MIN_JUDGED = 1.5  # periods that a held-out part must have
 
 
@@ -66,7 +72,8 @@ class Study:
     embedding: auto, log_rate, rate or delays. n_states: made of the signal, or auto: two, and three
     as well for a signal that does not repeat itself; of these the ones that forecast best where
     they were fitted. harmonics: number of harmonics of the period that the smoother follows.
-    decimate, detrend: see `from_one_signal`. degree, functions, function_degree: of the library.
+    decimate, detrend: see `from_one_signal`. degree, functions, function_degree: of the library; a
+    `?` in a function stands for a number to be fitted, as in `sign(?*v)` and `1/(?+x)`.
     held_out: the share at the end of the record that is not fitted and serves as the test.
     """
 
@@ -153,6 +160,14 @@ class Study:
             embed(signal, fitting), reason=chosen.reason
         )  # fmt: skip
 
+    def _library(self, states: Trajectory, functions: Sequence[str]) -> Library:
+        return polynomial(
+            states.state_names,
+            degree=self.degree,
+            functions=functions,
+            function_degree=self.function_degree,
+        )
+
     def _found(self, chosen: Chosen, run: Run) -> Discovery:
         method, rule, states = self.method, self.method.selection, chosen.embedded.run
         if isinstance(rule, SystemSelection):  # the measured signal is judged, not derived states
@@ -164,17 +179,17 @@ class Study:
                 method = replace(method, selection=replace(rule, judged=(self.signal,)))
         if not chosen.embedded.terms:
             method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
+        known = chosen.embedded
+        library_of = partial(self._library, states)
+        functions = fit_functions(
+            self.functions, states, library_of, partial(_misfit, method, known)
+        )
         found = discover(
             states,
-            polynomial(
-                states.state_names,
-                degree=self.degree,
-                functions=self.functions,
-                function_degree=self.function_degree,
-            ),
+            library_of(functions),
             method,
-            relations=chosen.embedded.relations,
-            terms=chosen.embedded.terms,
+            relations=known.relations,
+            terms=known.terms,
             seed=run.seed,
             progress=run.watch,
         )
@@ -182,6 +197,22 @@ class Study:
         return (
             replace(found, model=replace(found.model, covariance=None)) if found.misfit else found
         )
+
+
+def _misfit(method: AnyMethod, known: Embedded, library: Library) -> float:
+    """Share of the derivatives that the largest candidates leave, the product over equations.
+
+    Infinite for a library that cannot be used on the states.
+    """
+    if isinstance(method, TrajectorySearch):
+        method = Regression(WeightedWeak(), BestSubset(max_terms=method.max_terms))
+    try:
+        task = Task([known.run], library, relations_of(known.relations), known.terms)
+        equations = method.search_equations(task, rng=0)
+    except ValueError:
+        return float("inf")
+    fronts = [each.front for each in equations if each.front.equation in known.searched]
+    return float(np.prod([min(1.0 - c.r2_train for c in f.candidates) for f in fronts]))
 
 
 def embeddings(harmonics: float, n_states: int) -> dict[str, AnyEmbedding]:
