@@ -27,7 +27,7 @@ import pandas as pd
 import ep2sindy as ep
 
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
-N_DRAWS, N_SIMULATED = 10, 5
+N_DRAWS, N_SIMULATED = 10, 3
 DRIFT_A, GAP, N_LONG = 0.4, 0.05, 1_000_000
 SHOWN = ("verdict", "f_error", "amplitude_ratio", "waveform_error", "n_terms_searched")
 NOISE = 0.02  # of the simulator's current, as a share of its mean

@@ -57,16 +57,17 @@ def as_measured(run: Trajectory, seed: int) -> Trajectory:
 
 def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]:
     begin = time.process_time()
-    chosen = embed(from_one_signal(measured))
-    states = chosen.embedded.run
-    n = round(0.75 * states.n_samples)
+    signal = from_one_signal(measured)
+    n = round(0.75 * measured.n_samples)
+    chosen = embed(signal.window(0, n))
+    states = embed(signal, chosen.embedding).embedded.run  # starts of other runs, and figures
     bounds = ep.FreeRunBounds(frequency=0.005, amplitude=0.05)
     rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
     search = BestSubset(max_terms=5, n_best=8)
     method = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
     library = polynomial(states.state_names, degree=3)
     known = {"relations": chosen.embedded.relations, "terms": chosen.embedded.terms}
-    model = discover(states.window(0, n), library, method, **known).model
+    model = discover(chosen.embedded.run, library, method, **known).model
     seconds = time.process_time() - begin
     record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
     held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)

@@ -44,7 +44,8 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
         ax.set_ylabel(axis_label(name, run.units[name]))
         ax.set_ylim(_limits(values))
     _draw_errors(axes[0, -1], skill)
-    handles = [*axes[0, 0].get_legend_handles_labels()[0], *axes[0, -1].lines[: len(skill.nrmse)]]
+    baselines = axes[0, -1].lines[1 : len(skill.nrmse)]  # the first line is the model's
+    handles = [*axes[0, 0].get_legend_handles_labels()[0], *baselines]
     legend_above(figure, handles, size=8)
     return figure
 

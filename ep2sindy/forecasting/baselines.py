@@ -8,11 +8,14 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.spectrum import dominant_frequency, is_uniform
 
-MAX_ORDER = 40  # of an autoregression, in samples, divided by the number of states
+# Largest order of an autoregression of one state, and the sum of orders of one of several; samples
+# that it is fitted to, from the end of the record.
+MAX_ORDER, MAX_ORDERS, MAX_FITTED = 120, 40, 4000
 SAMPLES_PER_COEFFICIENT = 5  # fewest, of an autoregression
 
 
@@ -74,8 +77,9 @@ class Autoregression:
         most = _largest_order(run)
         if most < 1 or not is_uniform(run.t):
             return None
-        mean, scale = run.states.mean(axis=0), run.states.std(axis=0)
-        x = (run.states - mean) / scale
+        states = run.states[-MAX_FITTED:]
+        mean, scale = states.mean(axis=0), zero_to_one(states.std(axis=0))
+        x = (states - mean) / scale
         if d == 1:
             from statsmodels.tsa.ar_model import AutoReg, ar_select_order  # takes a second
 
@@ -111,6 +115,7 @@ def _largest_order(run: Trajectory) -> int:
     """Largest order that is tried: two periods, if there are samples enough."""
     frequency_Hz = max(dominant_frequency(run.t, column) for column in run.states.T)
     periods = frequency_Hz * float(run.t[-1] - run.t[0])
-    wanted = 2.0 * run.n_samples / periods if periods >= 1.0 else MAX_ORDER
-    room = run.n_samples / (SAMPLES_PER_COEFFICIENT * run.states.shape[1])
-    return int(min(wanted, MAX_ORDER / run.states.shape[1], room))
+    d = run.states.shape[1]
+    most = MAX_ORDER if d == 1 else MAX_ORDERS / d
+    wanted = 2.0 * run.n_samples / periods if periods >= 1.0 else most
+    return int(min(wanted, most, run.n_samples / (SAMPLES_PER_COEFFICIENT * d)))
