@@ -1,7 +1,7 @@
 """Measured records, by the settings that a user meets: `python -m benchmarks.measured`.
 
     EP2SINDY_DATA=folder python -m benchmarks.measured laser electrochemical hallthruster
-    python -m benchmarks.measured pendulum populations current hidden
+    python -m benchmarks.measured pendulum populations current bands pushes
 
 `+exp=trace` as it comes is run on every record; what differs is written with its row. Errors are
 root mean squares over starts, in standard deviations of the held-out samples, beside persistence
@@ -25,10 +25,11 @@ import numpy as np
 import pandas as pd
 
 import ep2sindy as ep
+from ep2sindy.signals.spectrum import crossing_frequency
 
 FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
 N_DRAWS, N_SIMULATED = 10, 3
-DRIFT_A, GAP, N_LONG = 0.4, 0.05, 1_000_000
+DRIFT_A, GAP, N_LONG, PUSH = 0.4, 0.05, 1_000_000, 0.05
 SHOWN = ("verdict", "f_error", "amplitude_ratio", "waveform_error", "n_terms_searched")
 NOISE = 0.02  # of the simulator's current, as a share of its mean
 
@@ -202,7 +203,7 @@ def bands() -> None:
             for seed in range(N_DRAWS):
                 run = system.trajectory(noise=noise, rng=seed)
                 n = round(0.75 * run.n_samples)
-                model = ep.discover(run.window(0, n)).model
+                model = ep.discover(run.window(0, n), library_of(system)).model
                 held.append(ep.forecast_skill(model, run, n_fitted=n, starts=20).coverage_90)
             print(
                 f"{system.name}, {100 * noise:.0f} % noise: bands of 90 % hold "
@@ -211,8 +212,54 @@ def bands() -> None:
             )
 
 
+def pushes() -> None:
+    """Laws whose states are pushed at random: supports that are right, intervals that hold."""
+    for system in (ep.systems.van_der_pol(), ep.lorenz()):
+        right = held = n = 0
+        for seed in range(2 * N_DRAWS):
+            found = ep.discover(pushed(system, PUSH, seed), library_of(system))
+            own, truth = found.model, system.model
+            if found.misfit or any(set(own.terms(s)) != set(truth.terms(s)) for s in truth.states):
+                continue
+            right += 1
+            for state in truth.states:
+                inside = [
+                    low <= truth.terms(state)[term] <= high
+                    for term, (low, high) in own.intervals(state).items()
+                ]
+                held, n = held + sum(inside), n + len(inside)
+        print(
+            f"{system.name}, pushed by {100 * PUSH:.0f} % of RMS in a period: {right} of "
+            f"{2 * N_DRAWS} right, {held} of {n} intervals hold",
+            flush=True,
+        )
+
+
+def pushed(system: ep.systems.System, share: float, seed: int) -> ep.Trajectory:
+    """A record with pushes that add up to a share of every state's RMS in a period; 1 % noise."""
+    rng, clean, n_substeps = np.random.default_rng(seed), system.trajectory(), 10
+    rms = np.sqrt(np.square(clean.states).mean(axis=0))
+    turns_Hz = max(crossing_frequency(clean.t, x) for x in clean.states.T)
+    h, none = clean.dt_s / n_substeps, np.empty(0)
+    x, states = clean.states[0], [clean.states[0]]
+    for _ in range(clean.n_samples - 1):
+        for _ in range(n_substeps):
+            half = x + 0.5 * h * system.model.derivative(x, none)
+            x = x + h * system.model.derivative(half, none)
+            x = x + share * rms * np.sqrt(h * turns_Hz) * rng.standard_normal(len(x))
+        states.append(x)
+    samples = np.array(states) + 0.01 * rms * rng.standard_normal((len(states), len(rms)))
+    return ep.Trajectory(clean.t, samples, clean.state_names)
+
+
+def library_of(system: ep.systems.System) -> ep.Library:
+    """All products up to the degree of the law, two at least."""
+    degree = max(2, int(system.model.library.degrees.max()))
+    return ep.polynomial(system.model.states, degree=degree)
+
+
 TABLES = {each.__name__: each for each in (
-    laser, electrochemical, hallthruster, pendulum, populations, current, bands
+    laser, electrochemical, hallthruster, pendulum, populations, current, bands, pushes
 )}  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import EstimationProblem, check_size, scale_problem
+from ep2sindy.estimation.pushed import push_words, solution_under_pushes, solve_pushed
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Aligned,
@@ -70,7 +71,9 @@ class Estimate:
     noise, in SI. memory: (d,), correlation of this noise from one sample to the next, 0 for white
     noise.
     flow_error: size of the deviation of the states from the model over one sampling step, as a
-    share of the noise; 0 if the residuals are nothing but noise. misfit: the reason why these
+    share of the noise; 0 if the residuals are nothing but noise. push_std: (d,), of the random push
+    that every state receives over a mean step, in SI; 0 if an exact trajectory explains the
+    samples. misfit: the reason why these
     equations do not explain the data; empty if they do. few: a remark if there are too few samples
     to decide; otherwise empty.
     supports: for each state, the best supports of every size. rivals: other plausible supports, the
@@ -96,6 +99,7 @@ class Estimate:
     kurtosis: Float[np.ndarray, " d"]
     growth: Float[np.ndarray, " d"]
     delays_s: Float[np.ndarray, " d"]
+    push_std: Float[np.ndarray, " d"]
 
     @property
     def note(self) -> str:
@@ -193,6 +197,7 @@ def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progre
         kurtosis=found.noise.kurtosis,
         growth=found.noise.growth,
         delays_s=answer.delays * problem.step_s,
+        push_std=answer.pushes * problem.scale,
     )
 
 
@@ -200,26 +205,33 @@ def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progre
 class _Reported:
     """The reported solution: of the samples as given, or of the aligned samples if asked for.
 
-    delays: (d,), in mean steps. said: remarks on how the samples were changed.
+    delays: (d,), in mean steps. pushes: (d,), scaled. said: remarks on how the samples were changed
+    or explained.
     """
 
     problem: EstimationProblem
     found: Solution
     misfit: str
     delays: Float[np.ndarray, " d"]
+    pushes: Float[np.ndarray, " d"]
     said: tuple[str, ...] = ()
 
 
 def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Reported:
-    found, late = solve(problem, max_terms=max_terms_for(problem, max_terms))
+    most, none = max_terms_for(problem, max_terms), np.zeros(len(problem.states))
+    found, late = solve(problem, max_terms=most)
     if late is None:
+        if not found.fits and (pushed := solve_pushed(problem, max_terms=most)).explains:
+            found, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
+            misfit = _at_limit(problem, found, max_terms)
+            return _Reported(problem, found, misfit, none, pushed.errors.process, (said,))
         misfit = _misfit(problem, found) or _at_limit(problem, found, max_terms)
-        return _Reported(problem, found, misfit, np.zeros(len(problem.states)))
+        return _Reported(problem, found, misfit, none, none)
     if not align:
-        return _Reported(problem, found, late_words(problem, late), late.delays)
+        return _Reported(problem, found, late_words(problem, late), late.delays, none)
     said = f"{delay_words(problem, late.delays)}: brought together with the others"
     misfit = _at_limit(late.problem, late.solution, max_terms)
-    return _Reported(late.problem, late.solution, misfit, late.delays, (said,))
+    return _Reported(late.problem, late.solution, misfit, late.delays, none, (said,))
 
 
 def check_runs(task: Task) -> None:

@@ -153,6 +153,28 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
 
 
 @compiled
+def innovations(flow, misses, residuals, variance, process, free_start):
+    """What every sample brings that the past did not tell, in its standard deviation: (n, d).
+
+    Arguments as for `departures`. NaN where nothing was measured.
+    """
+    n, d = residuals.shape
+    found = np.full((n, d), np.nan)
+    mean, none, cov = np.zeros(d), np.zeros((d, 0)), np.zeros((d, d))
+    gain, buffer = np.empty(d), np.empty((d, 1 + d))
+    for i in range(d):
+        cov[i, i] = free_start
+    for k in range(n):
+        for i in range(d):
+            if np.isfinite(residuals[k, i]):
+                value, spread = _observe(i, residuals[k, i], variance[k, i], mean, none, cov, gain)
+                found[k, i] = value / np.sqrt(spread)
+        if k < n - 1:
+            _step(flow[k], misses[k], mean, none, cov, process[k], buffer)
+    return found
+
+
+@compiled
 def end_state(flow, misses, residuals, variance, process, free_start):
     """Departure (d,) of the last state from the path given all samples, and its covariance (d, d).
 

@@ -43,12 +43,13 @@ class Level:
     """How closely states must follow the samples and the flow.
 
     noise: for each record, (samples, d), standard deviations of the samples, scaled. rho: the
-    flow's error as a share of the noise.
+    flow's error as a share of the noise. push: (d,), the flow's error itself, if it is known.
     """
 
     noise: tuple[np.ndarray, ...]
     rho: float
     n_substeps: int = 1
+    push: Float[np.ndarray, " d"] | None = None
 
     @property
     def variances(self) -> list[Float[np.ndarray, "samples d"]]:
@@ -56,6 +57,8 @@ class Level:
 
     @property
     def processes(self) -> list[Float[np.ndarray, "steps d"]]:
+        if self.push is not None:
+            return [np.tile(np.square(self.push), (len(noise) - 1, 1)) for noise in self.noise]
         return [np.square(self.rho * noise[:-1]) for noise in self.noise]
 
 

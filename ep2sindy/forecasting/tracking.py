@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.kernels import departures, eliminate, end_state
+from ep2sindy.estimation.kernels import departures, end_state
 from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, enough_substeps
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord, scale_problem
+from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
 from ep2sindy.model.model import SparseModel
 from ep2sindy.signals.spectrum import dominant_frequency
 
@@ -26,10 +27,6 @@ MIN_MEMORY, MAX_MEMORY = 20, 600  # its length in samples
 
 MAX_FITTED = 3000  # samples from the end of a record that the noise is estimated from
 N_PASSES = 3  # states and noise, fitted in turn
-MAX_TRIALS = 120  # likelihoods per size of a noise in one pass
-
-# Bounds on the errors, in RMS of the states.
-LEAST_NOISE, LEAST_PUSH, MOST = 1e-5, 1e-7, 3.0
 
 # Process noise, in noise of the samples, of the fits that approach the final one. Free states find
 # their way to the samples first.
@@ -88,7 +85,7 @@ class Tracker:
         record = self.problem.record(_of_model(self.model, last))
         samples, process = self.scaled_noise()
         path = self.approach(record, record.samples.copy(), samples, process)
-        variances = _variances(len(path), samples, process)
+        variances = error_variances(len(path), samples, process)
         mean, covariance = end_state(*self.linear(record, path), *variances, FREE_START)
         scale = self.problem.scale
         return FittedState(scale * (path[-1] + mean), np.outer(scale, scale) * covariance)
@@ -124,7 +121,7 @@ class Tracker:
         self, record: ScaledRecord, path: np.ndarray, samples: np.ndarray, process: np.ndarray
     ) -> np.ndarray:
         """Most likely path near the given one, by Gauss-Newton steps that are halved if needed."""
-        variances = _variances(len(path), samples, process)
+        variances = error_variances(len(path), samples, process)
         with np.errstate(over="ignore", invalid="ignore"):
             total = self._total(record, path, *variances)
             for _ in range(MAX_STEPS):
@@ -197,39 +194,12 @@ def track(
 
 def _with_likely_noise(tracker: Tracker, path: np.ndarray) -> tuple[Tracker, np.ndarray]:
     """The tracker with the most likely noise about the states, and these states."""
-    from scipy.optimize import minimize  # imported only to estimate noise
-
     (record,), measured = tracker.problem.records, tracker.measured
     samples, process = tracker.scaled_noise()
     path = tracker.approach(record, path, samples, process)
-    linear = tracker.linear(record, path)
-    n, d = int(measured.sum()), len(measured)
-    low = np.log(np.repeat([LEAST_NOISE, LEAST_PUSH], [n, d]))
-
-    def noise(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        sizes = np.exp(np.clip(logs, low, np.log(MOST)))
-        own = np.ones(d)
-        own[measured] = sizes[:n]
-        return own, sizes[n:]
-
-    def unlikely(logs: np.ndarray) -> float:
-        least, log_spread = eliminate(*linear, *_variances(len(path), *noise(logs)), FREE_START)[2:]
-        beyond = np.square(logs - np.clip(logs, low, np.log(MOST))).sum()
-        return float(least + log_spread + beyond)
-
-    start = np.log(np.append(samples[measured], process))
-    found = minimize(
-        unlikely,
-        start,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": np.vstack([start, start + 1.5 * np.eye(len(start))]),
-            "maxfev": MAX_TRIALS * len(start),
-            "fatol": 0.1,
-            "xatol": 0.05,
-        },
-    )
-    return replace(tracker, noise=_noise_of(tracker.problem, measured, *noise(found.x))), path
+    found = likely_errors([tracker.linear(record, path)], measured, samples, process)
+    noise = _noise_of(tracker.problem, measured, found.samples, found.process)
+    return replace(tracker, noise=noise), path
 
 
 def _substeps(
@@ -246,11 +216,6 @@ def _noise_of(
     problem: EstimationProblem, measured: np.ndarray, samples: np.ndarray, process: np.ndarray
 ) -> ModelNoise:
     return ModelNoise(np.where(measured, samples, np.nan) * problem.scale, process * problem.scale)
-
-
-def _variances(n: int, samples: np.ndarray, process: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Variances of n samples and of the pushes between them."""
-    return np.tile(np.square(samples), (n, 1)), np.tile(np.square(process), (n - 1, 1))
 
 
 def _of_model(model: SparseModel, run: Trajectory) -> Trajectory:

@@ -1,0 +1,238 @@
+"""States that leave their model: coefficients under random pushes of every state at every step.
+
+Ecology, drifting phases and all that a model leaves out push its states at random. The sizes of the
+pushes and of the samples' noise are estimated together with the coefficients, and terms are priced
+against this stochastic model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.estimation.kernels import eliminate, innovations
+from ep2sindy.estimation.likelihood import (
+    FREE_START,
+    Level,
+    TrajectoryFit,
+    enough_substeps,
+    fit_paths,
+    gram,
+    observe,
+)
+from ep2sindy.estimation.noise import noise_beside
+from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.solver import AnnealedFit, Solution, start_from_smooth
+from ep2sindy.estimation.supports import best_support, term_prices
+
+# Bounds on noise and pushes, in RMS of the states.
+LEAST_NOISE, LEAST_PUSH, MOST = 1e-5, 1e-7, 3.0
+MAX_TRIALS = 120  # likelihoods per size of an error
+SHARES = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' prices, in every round
+MAX_EXCHANGES = 4  # of supports in one round
+# Lags at which innovations are correlated with themselves; degrees above the library's, and number,
+# of the products of states that they are compared with; standard errors that random ones may have.
+LAGS, MORE_DEGREES, MAX_POWERS, MAX_ERRORS = range(1, 9), 2, 60, 6.0
+SETTLING = 5  # samples from whose start on innovations count
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Standard deviations of noise and pushes by state, scaled; deviance: -2 log likelihood."""
+
+    samples: Float[np.ndarray, " d"]
+    process: Float[np.ndarray, " d"]
+    deviance: float
+
+
+@dataclass(frozen=True, eq=False)
+class PushedFit:
+    """A fit under random pushes. prices: of the free coefficients.
+
+    lasting: (d,), largest autocorrelation of the innovations over a few lags, in standard errors.
+    systematic: (d,), how far they are explained by products of the states, in standard errors.
+    """
+
+    fit: TrajectoryFit
+    errors: Errors
+    level: Level
+    prices: Float[np.ndarray, " free"]
+    lasting: Float[np.ndarray, " d"]
+    systematic: Float[np.ndarray, " d"]
+
+    @property
+    def explains(self) -> bool:
+        """True if what the samples bring is new, as it is under random pushes.
+
+        What a model lacks is a function of its states, and lasts as long as these.
+        """
+        worst = max(self.lasting.max(), self.systematic.max())
+        return bool(worst < MAX_ERRORS and np.isfinite(self.fit.total))
+
+    @property
+    def score(self) -> float:
+        """-2 log likelihood plus the prices of the terms."""
+        return self.errors.deviance + float(self.prices[self.fit.support].sum())
+
+
+def likely_errors(
+    linear: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    measured: Bool[np.ndarray, " d"],
+    samples: Float[np.ndarray, " d"],
+    process: Float[np.ndarray, " d"],
+) -> Errors:
+    """The likeliest noise and pushes about paths, from a first guess.
+
+    linear: for each record, slopes of the flow by the state, misses, and residuals, as `eliminate`
+    takes them. measured: states whose samples count.
+    """
+    from scipy.optimize import minimize  # imported only to estimate errors
+
+    n, d = int(measured.sum()), len(measured)
+    low = np.log(np.repeat([LEAST_NOISE, LEAST_PUSH], [n, d]))
+
+    def sizes(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        held = np.exp(np.clip(logs, low, np.log(MOST)))
+        own = np.ones(d)
+        own[measured] = held[:n]
+        return own, held[n:]
+
+    def unlikely(logs: np.ndarray) -> float:
+        total = float(np.square(logs - np.clip(logs, low, np.log(MOST))).sum())
+        for each in linear:
+            variances = error_variances(len(each[2]), *sizes(logs))
+            total += float(sum(eliminate(*each, *variances, FREE_START)[2:]))
+        return total
+
+    start = np.log(np.append(samples[measured], process))
+    found = minimize(
+        unlikely,
+        start,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": np.vstack([start, start + 1.5 * np.eye(len(start))]),
+            "maxfev": MAX_TRIALS * len(start),
+            "fatol": 0.1,
+            "xatol": 0.05,
+        },
+    )
+    return Errors(*sizes(found.x), float(found.fun))
+
+
+def error_variances(
+    n: int, samples: np.ndarray, process: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of n samples and of the pushes between them."""
+    return np.tile(np.square(samples), (n, 1)), np.tile(np.square(process), (n - 1, 1))
+
+
+def solve_pushed(problem: EstimationProblem, *, max_terms: int) -> PushedFit:
+    """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
+    d = len(problem.states)
+    start, by_record = start_from_smooth(problem, None)
+    noise = by_record[0][0]
+    errors = Errors(np.maximum(noise, LEAST_NOISE), np.maximum(noise, 1e-3), np.inf)
+    prices = term_prices(problem, float(problem.n_samples))
+    fit, everything = start, np.ones(d, dtype=np.bool_)
+    for share in SHARES:
+        level = _level(problem, fit, errors)
+        fit = fit_paths(problem, fit, level)
+        for _ in range(MAX_EXCHANGES):
+            pair = gram(problem, fit, level)
+            if not pair.finite:
+                break
+            found = best_support(problem, pair, share * prices, fit.support, max_terms=max_terms)
+            same = np.array_equal(found.support, fit.support)
+            fit = fit_paths(problem, replace(fit, support=found.support, free=found.free), level)
+            if same:
+                break
+        errors = likely_errors(
+            _linear(problem, fit, level), everything, errors.samples, errors.process
+        )
+    level = _level(problem, fit, errors)
+    fit = fit_paths(problem, fit, level)
+    return PushedFit(fit, errors, level, prices, *_left_over(problem, fit, level))
+
+
+def solution_under_pushes(problem: EstimationProblem, pushed: PushedFit) -> Solution:
+    """The fit as a solution: what it leaves of the samples is noise of the estimated size."""
+    noise = noise_beside(problem, pushed.fit)
+    zero = np.zeros_like(noise.memory)
+    explained = replace(
+        noise,
+        std=pushed.errors.samples,
+        memory=zero,
+        unexplained=zero,
+        deviance=pushed.errors.deviance,
+    )
+    annealed = AnnealedFit(pushed.fit, pushed.level, pushed.score)
+    return Solution(annealed, explained, pushed.prices, 0.0)
+
+
+def push_words(problem: EstimationProblem, pushed: PushedFit) -> str:
+    """Sentence on the sizes of the pushes."""
+    sizes = zip(problem.states, (pushed.errors.process * problem.scale).tolist(), strict=True)
+    words = ", ".join(f"{name} by {size:.2g}" for name, size in sizes)
+    return (
+        f"no exact trajectory explains these samples: states are pushed at random, {words} from "
+        "one sample to the next; the intervals allow for it"
+    )
+
+
+def _left_over(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """How much innovations are like themselves before, and like functions of the states, by state.
+
+    Both in standard errors of random innovations.
+    """
+    parts = []
+    for each, path in zip(_linear(problem, fit, level), fit.paths, strict=True):
+        variances = error_variances(len(path), level.noise[0][0], np.asarray(level.push))
+        parts.append((innovations(*each, *variances, FREE_START), path))
+    new = [np.nan_to_num(own[SETTLING:]) for own, _ in parts]
+    squares = np.maximum(sum(np.square(own).sum(axis=0) for own in new), 1e-300)
+    n = sum(map(len, new))
+    products = [sum((own[lag:] * own[:-lag]).sum(axis=0) for own in new) for lag in LAGS]
+    lasting = np.sqrt(n) * np.abs(products).max(axis=0) / squares
+    before = np.concatenate([path[SETTLING - 1 : -1] for _, path in parts])
+    basis = np.linalg.qr(_powers(before, int(problem.library.degrees.max()) + MORE_DEGREES))[0]
+    explained = n * np.square(basis.T @ np.concatenate(new)).sum(axis=0) / squares
+    p = basis.shape[1]
+    return lasting, (explained - p) / np.sqrt(2.0 * p)
+
+
+def _powers(states: Float[np.ndarray, "samples d"], degree: int) -> Float[np.ndarray, "samples _"]:
+    """Products of standardised states up to a degree, the lowest first, at most MAX_POWERS."""
+    scaled = (states - states.mean(axis=0)) / zero_to_one(states.std(axis=0))
+    most = min(MAX_POWERS, len(states) // 5)
+    columns = [np.ones(len(states))]
+    for k in range(1, degree + 1):
+        for chosen in combinations_with_replacement(range(scaled.shape[1]), k):
+            if len(columns) < most:
+                columns.append(scaled[:, list(chosen)].prod(axis=1))
+    return np.stack(columns, axis=1)
+
+
+def _level(problem: EstimationProblem, fit: TrajectoryFit, errors: Errors) -> Level:
+    noise = tuple(np.tile(errors.samples, (len(path), 1)) for path in fit.paths)
+    level = Level(noise, 1.0, push=errors.process)
+    return replace(level, n_substeps=enough_substeps(problem, fit, level))
+
+
+def _linear(
+    problem: EstimationProblem, fit: TrajectoryFit, level: Level
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Slopes of the flow by the state, misses and residuals of every record."""
+    none = np.zeros_like(fit.support)
+    found = []
+    for record, path, variance in zip(problem.records, fit.paths, level.variances, strict=True):
+        flow = problem.flow(record, path[:-1], fit.free, none, level.n_substeps)
+        residuals = observe(record, path, variance).residuals
+        found.append((np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals))
+    return found

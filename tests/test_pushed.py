@@ -1,0 +1,99 @@
+"""States that are pushed at random: the law is found, and what a library lacks is no push."""
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.estimation.pushed import likely_errors, solve_pushed
+from ep2sindy.systems.systems import System
+
+N_SUBSTEPS = 10  # of the Euler-Maruyama scheme, around exact steps of the law
+
+
+def pushed(system: System, share: float, seed: int, *, noise: float = 0.01) -> Trajectory:
+    """A record whose states are pushed by a share of their RMS in ten samples."""
+    rng, clean = np.random.default_rng(seed), system.trajectory()
+    rms = np.sqrt(np.square(clean.states).mean(axis=0))
+    size = share * rms / np.sqrt(10 * N_SUBSTEPS)
+    h, none = clean.dt_s / N_SUBSTEPS, np.empty(0)
+    x, states = clean.states[0].copy(), [clean.states[0].copy()]
+    for _ in range(clean.n_samples - 1):
+        for _ in range(N_SUBSTEPS):
+            half = x + 0.5 * h * system.model.derivative(x, none)
+            x = x + h * system.model.derivative(half, none) + size * rng.standard_normal(len(x))
+        states.append(x.copy())
+    samples = np.array(states) + noise * rms * rng.standard_normal((len(states), len(x)))
+    return Trajectory(clean.t, samples, clean.state_names)
+
+
+def counted(system: System, degree: int, seeds: range) -> tuple[int, int, int]:
+    """Right supports, and intervals of them that hold the truth, of how many."""
+    right = held = n = 0
+    for seed in seeds:
+        run = pushed(system, 0.02, seed)
+        found = ep.discover(run, ep.polynomial(run.state_names, degree=degree))
+        assert found.misfit == ""
+        assert "states are pushed at random" in found.remarks[0]
+        truth = system.model
+        if any(set(found.model.terms(s)) != set(truth.terms(s)) for s in truth.states):
+            continue
+        right += 1
+        for state in truth.states:
+            for term, (low, high) in found.model.intervals(state).items():
+                held += low <= truth.terms(state)[term] <= high
+                n += 1
+    return right, held, n
+
+
+def test_a_law_is_found_under_pushes_with_intervals_that_hold() -> None:
+    right, held, n = counted(ep.systems.van_der_pol(), 3, range(2))
+    assert right == 2
+    assert held >= n - 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("system", "degree"),
+    [(ep.systems.van_der_pol(), 3), (ep.lorenz(), 2)],
+    ids=lambda x: str(x)[:6],
+)
+def test_the_law_is_found_in_most_draws(system: System, degree: int) -> None:
+    right, held, n = counted(system, degree, range(10))
+    assert right >= 9
+    assert held >= 0.85 * n
+
+
+def test_the_sizes_of_pushes_and_noise_are_found() -> None:
+    system = ep.systems.van_der_pol()
+    run = pushed(system, 0.1, 0)
+    rms = np.sqrt(np.square(run.states).mean(axis=0))
+    found = ep.estimate(run, ep.polynomial(run.state_names, degree=3))
+    assert found.push_std / rms == pytest.approx(0.1 / np.sqrt(10), rel=0.2)
+    assert found.noise_std / rms == pytest.approx(0.01, rel=0.25)
+    exact = ep.estimate(system.trajectory(noise=0.05, rng=0), ep.polynomial(["x", "y"], degree=3))
+    assert exact.push_std.tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.05])
+def test_what_a_library_lacks_is_no_push(noise: float) -> None:
+    run = ep.systems.van_der_pol().trajectory(noise=noise, rng=0)
+    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2))
+    found = solve_pushed(problem, max_terms=7)
+    assert found.systematic.max() > 10.0
+    assert not found.explains
+    assert ep.discover(run).misfit.startswith("no model of this library fits")
+
+
+def test_the_likeliest_errors_of_a_random_walk_are_exact() -> None:
+    """Of x' = 0: differences have the variance 2 r^2 + q^2, and the covariance -r^2."""
+    rng, n = np.random.default_rng(1), 20_000
+    walk = np.cumsum(0.3 * rng.standard_normal(n))
+    samples = walk + 0.5 * rng.standard_normal(n)
+    slopes, misses = np.ones((n - 1, 1, 1)), -np.diff(samples)[:, None]
+    found = likely_errors(
+        [(slopes, misses, np.zeros((n, 1)))], np.array([True]), np.array([0.1]), np.array([0.1])
+    )
+    assert found.samples[0] == pytest.approx(0.5, rel=0.05)
+    assert found.process[0] == pytest.approx(0.3, rel=0.05)
