@@ -120,7 +120,7 @@ def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path:
 
 def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
     path = scope(tmp_path / "scope.csv", *signal(6.4))
-    found = computed(composed(*glance(path, tmp_path)))
+    found = computed(composed(*glance(path, tmp_path, "held_out=0.2")))
     assert found.summary["living"]["held_out"] is False
     assert found.summary["forecast"] is None
     assert "too short to hold out" in " ".join(found.log.split())

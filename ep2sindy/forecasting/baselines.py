@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ MAX_ORDER, MAX_ORDERS, MAX_FITTED = 120, 40, 4000
 SAMPLES_PER_COEFFICIENT = 5  # fewest, of an autoregression
 
 
+@runtime_checkable
 class Baseline(Protocol):
     """Interface of the baselines: forecasts of the next samples from the past alone."""
 
