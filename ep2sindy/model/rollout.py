@@ -46,7 +46,7 @@ class Rollout:
     a diverged run stopped. units: by name, of states and inputs. clock: display format of t.
     outside: the function of the model whose domain the run has left, or an empty text; such a
     run counts as diverged. draws: (draws, samples, n_states), runs with coefficients drawn from
-    their covariance, NaN where one has diverged; none unless they were asked for.
+    their covariance, NaN where one has diverged; None unless they were asked for.
     """
 
     t: Float[np.ndarray, " samples"]
@@ -59,9 +59,7 @@ class Rollout:
     units: Mapping[str, str]
     outside: str = ""
     clock: Clock = SECONDS
-    draws: Float[np.ndarray, "draws samples n_states"] = field(
-        default_factory=lambda: np.empty((0, 0, 0)), repr=False
-    )
+    draws: Float[np.ndarray, "draws samples n_states"] | None = field(default=None, repr=False)
 
     def band(
         self, level: float = 0.9
@@ -70,7 +68,7 @@ class Rollout:
 
         Raises ValueError for a run without draws, or a level that is no share.
         """
-        if not len(self.draws):
+        if self.draws is None:
             raise ValueError("a band needs draws: ask for them, simulate(..., draws=100)")
         low, high = band_of(self.draws, level)
         return low, high
