@@ -98,7 +98,8 @@ def cut_windows(
     scale = zero_to_one(np.append(spread, rms))
     step_s = float(np.mean(np.concatenate([np.diff(each.t) for each in trajectories])))
     stretches = _stretches(trajectories, window)
-    piece, start = _places([stop - first for _, first, stop in stretches], n_windows, window, rng)
+    lengths = (stretches[:, 2] - stretches[:, 1]).tolist()
+    piece, start = _places(lengths, n_windows, window, rng)
     index, start = stretches[piece, 0], start + stretches[piece, 1]
     cubics = [
         _cubics(each.t, v[:, n:] / scale[n:]) for each, v in zip(trajectories, values, strict=True)
