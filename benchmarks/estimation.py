@@ -21,7 +21,7 @@ import numpy as np
 
 import ep2sindy as ep
 from benchmarks.known_systems import KINDS, OTHERS, noisy
-from benchmarks.living import DOWNSTREAM_MM, POINTS, parts, record
+from benchmarks.living import DOWNSTREAM, POINTS, parts, record
 from ep2sindy.studies.living import start_of
 from ep2sindy.systems.draws import DRAWS
 from ep2sindy.systems.systems import System, lorenz
@@ -117,7 +117,7 @@ def samples() -> None:
 def thruster() -> None:
     """Six operating points: the estimator's own model, and what free runs choose of its fronts."""
     for label in POINTS:
-        fitted, held = parts(record(label, DOWNSTREAM_MM), "last")
+        fitted, held = parts(record(label, DOWNSTREAM).run, "last")
         for rule in (ep.Evidence(), ep.FreeRunScore()):
             start = time.process_time()
             method = ep.TrajectorySearch(max_terms=4, selection=rule, depth=2)
