@@ -69,7 +69,7 @@ from ep2sindy.model.model import coef_matrix as coef_matrix
 
 # Forecasts
 from ep2sindy.forecasting.forecast import forecast as forecast
-from ep2sindy.forecasting.forecast import Forecast as Forecast
+from ep2sindy.forecasting.bands import Forecast as Forecast
 from ep2sindy.forecasting.skill import forecast_skill as forecast_skill
 from ep2sindy.forecasting.skill import ForecastSkill as ForecastSkill
 

@@ -72,7 +72,6 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     forecast = summary["forecast"]
     assert set(forecast["nrmse"]) == {"model", "persistence", "harmonics", "autoregression"}
     assert max(forecast["nrmse"]["model"]) < 0.3
-    assert 0.0 <= forecast["coverage_90"] <= 1.0
     assert summary["states"]["2"]["error"] < 0.3
     for name in ("free_run", "plane", "waveform", "front", "forecast"):
         assert (folder / "figures" / f"{name}.png").exists()
@@ -113,7 +112,6 @@ def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path:
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
     found = computed(composed(*glance(path, tmp_path, "degree=2")))
     assert set(found.summary["states"]) == {"2", "3"}
-    assert found.summary["signal"]["n_states"] in (2, 3)
     set_to_two = computed(composed(*glance(path, tmp_path, "degree=2", "n_states=2")))
     assert set(set_to_two.summary["states"]) == {"2"}
 

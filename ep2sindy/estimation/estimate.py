@@ -73,9 +73,8 @@ class Estimate:
     flow_error: size of the deviation of the states from the model over one sampling step, as a
     share of the noise; 0 if the residuals are nothing but noise. push_std: (d,), of the random push
     that every state receives over a mean step, in SI; 0 if an exact trajectory explains the
-    samples. misfit: the reason why these
-    equations do not explain the data; empty if they do. few: a remark if there are too few samples
-    to decide; otherwise empty.
+    samples. misfit: the reason why these equations do not explain the data; empty if they do. few:
+    a remark if there are too few samples to decide; otherwise empty.
     supports: for each state, the best supports of every size. rivals: other plausible supports, the
     most likely first.
     remarks: sentences on where the samples deviate from the assumptions: limits of sensors, noise

@@ -153,10 +153,11 @@ def eliminate(flow, misses, residuals, variance, process, free_start):
 
 
 @compiled
-def innovations(flow, misses, residuals, variance, process, free_start):
-    """What every sample brings that the past did not tell, in its standard deviation: (n, d).
+def filtered(flow, misses, residuals, variance, process, free_start):
+    """Innovations (n, d), and mean (d,) and covariance (d, d) of the last departure from the path.
 
-    Arguments as for `departures`. NaN where nothing was measured.
+    An innovation is what a sample brings that the past did not tell, in its standard deviation; NaN
+    where nothing was measured. Arguments as for `departures`.
     """
     n, d = residuals.shape
     found = np.full((n, d), np.nan)
@@ -171,27 +172,7 @@ def innovations(flow, misses, residuals, variance, process, free_start):
                 found[k, i] = value / np.sqrt(spread)
         if k < n - 1:
             _step(flow[k], misses[k], mean, none, cov, process[k], buffer)
-    return found
-
-
-@compiled
-def end_state(flow, misses, residuals, variance, process, free_start):
-    """Departure (d,) of the last state from the path given all samples, and its covariance (d, d).
-
-    Arguments as for `departures`.
-    """
-    n, d = residuals.shape
-    mean, none, cov = np.zeros(d), np.zeros((d, 0)), np.zeros((d, d))
-    gain, buffer = np.empty(d), np.empty((d, 1 + d))
-    for i in range(d):
-        cov[i, i] = free_start
-    for k in range(n):
-        for i in range(d):
-            if np.isfinite(residuals[k, i]):
-                _observe(i, residuals[k, i], variance[k, i], mean, none, cov, gain)
-        if k < n - 1:
-            _step(flow[k], misses[k], mean, none, cov, process[k], buffer)
-    return mean, cov
+    return found, mean, cov
 
 
 @compiled

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.estimation.kernels import eliminate, innovations
+from ep2sindy.estimation.kernels import eliminate, filtered
 from ep2sindy.estimation.likelihood import (
     FREE_START,
     Level,
@@ -36,8 +36,11 @@ MAX_TRIALS = 120  # likelihoods per size of an error
 SHARES = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' prices, in every round
 MAX_EXCHANGES = 4  # of supports in one round
 # Lags at which innovations are correlated with themselves; degrees above the library's, and number,
-# of the products of states that they are compared with; standard errors that random ones may have.
-LAGS, MORE_DEGREES, MAX_POWERS, MAX_ERRORS = range(1, 9), 2, 60, 6.0
+# of the products of states that they are compared with.
+LAGS, MORE_DEGREES, MAX_POWERS = range(1, 9), 2, 60
+# Standard errors that random innovations may show: see `PushedFit`.
+MOST_SHOWN = (5.0, 4.5, 6.0)
+COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
 SETTLING = 5  # samples from whose start on innovations count
 
 
@@ -54,8 +57,9 @@ class Errors:
 class PushedFit:
     """A fit under random pushes. prices: of the free coefficients.
 
-    lasting: (d,), largest autocorrelation of the innovations over a few lags, in standard errors.
-    systematic: (d,), how far they are explained by products of the states, in standard errors.
+    lasting, single, together: (d,), what innovations show that random ones would not, in standard
+    errors: the largest autocorrelation over a few lags, the largest share that one product of
+    states explains beside the terms of the equation, and the share that all of them explain.
     """
 
     fit: TrajectoryFit
@@ -63,7 +67,8 @@ class PushedFit:
     level: Level
     prices: Float[np.ndarray, " free"]
     lasting: Float[np.ndarray, " d"]
-    systematic: Float[np.ndarray, " d"]
+    single: Float[np.ndarray, " d"]
+    together: Float[np.ndarray, " d"]
 
     @property
     def explains(self) -> bool:
@@ -71,8 +76,9 @@ class PushedFit:
 
         What a model lacks is a function of its states, and lasts as long as these.
         """
-        worst = max(self.lasting.max(), self.systematic.max())
-        return bool(worst < MAX_ERRORS and np.isfinite(self.fit.total))
+        shown = (self.lasting.max(), self.single.max(), self.together.max())
+        is_random = all(value < most for value, most in zip(shown, MOST_SHOWN, strict=True))
+        return is_random and bool(np.isfinite(self.fit.total))
 
     @property
     def score(self) -> float:
@@ -186,25 +192,44 @@ def push_words(problem: EstimationProblem, pushed: PushedFit) -> str:
 
 def _left_over(
     problem: EstimationProblem, fit: TrajectoryFit, level: Level
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-    """How much innovations are like themselves before, and like functions of the states, by state.
-
-    Both in standard errors of random innovations.
-    """
-    parts = []
-    for each, path in zip(_linear(problem, fit, level), fit.paths, strict=True):
-        variances = error_variances(len(path), level.noise[0][0], np.asarray(level.push))
-        parts.append((innovations(*each, *variances, FREE_START), path))
-    new = [np.nan_to_num(own[SETTLING:]) for own, _ in parts]
-    squares = np.maximum(sum(np.square(own).sum(axis=0) for own in new), 1e-300)
-    n = sum(map(len, new))
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """What innovations show that random ones would not; see `PushedFit`."""
+    new = []
+    for each in _linear(problem, fit, level):
+        variances = error_variances(len(each[2]), level.noise[0][0], np.asarray(level.push))
+        new.append(np.nan_to_num(filtered(*each, *variances, FREE_START)[0][SETTLING:]))
+    joined = np.concatenate(new)
+    size = np.maximum(np.linalg.norm(joined, axis=0), 1e-150)
     products = [sum((own[lag:] * own[:-lag]).sum(axis=0) for own in new) for lag in LAGS]
-    lasting = np.sqrt(n) * np.abs(products).max(axis=0) / squares
-    before = np.concatenate([path[SETTLING - 1 : -1] for _, path in parts])
-    basis = np.linalg.qr(_powers(before, int(problem.library.degrees.max()) + MORE_DEGREES))[0]
-    explained = n * np.square(basis.T @ np.concatenate(new)).sum(axis=0) / squares
-    p = basis.shape[1]
-    return lasting, (explained - p) / np.sqrt(2.0 * p)
+    root = np.sqrt(len(joined))
+    lasting = root * np.abs(products).max(axis=0) / np.square(size)
+    before = np.concatenate([path[SETTLING - 1 : -1] for path in fit.paths])
+    powers = _powers(before, int(problem.library.degrees.max()) + MORE_DEGREES)
+    unit = root * joined / size
+    together = np.square(np.linalg.qr(powers)[0].T @ unit).sum(axis=0) - powers.shape[1]
+    single = _largest_share(problem, fit, before, powers, unit)
+    return lasting, single, together / np.sqrt(2.0 * powers.shape[1])
+
+
+def _largest_share(
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    before: Float[np.ndarray, "samples d"],
+    powers: Float[np.ndarray, "samples _"],
+    unit: Float[np.ndarray, "samples d"],
+) -> Float[np.ndarray, " d"]:
+    """The most that one of the powers explains of unit innovations beside an equation's terms."""
+    used, found = problem.coef(fit.free) != 0.0, np.zeros(unit.shape[1])
+    inputs = np.concatenate([r.inputs[SETTLING - 1 : -1] for r in problem.records])
+    terms = problem.library.evaluate(np.concatenate([before, inputs], axis=1))
+    for k in range(unit.shape[1]):
+        own = np.column_stack([np.ones(len(before)), terms[:, used[:, k]]])
+        basis = np.linalg.qr(own / zero_to_one(np.linalg.norm(own, axis=0)))[0]
+        beside = powers - basis @ (basis.T @ powers)
+        size = np.linalg.norm(beside, axis=0)
+        kept = size > COLLINEAR * np.linalg.norm(powers, axis=0)
+        found[k] = np.abs(unit[:, k] @ (beside[:, kept] / size[kept])).max(initial=0.0)
+    return found
 
 
 def _powers(states: Float[np.ndarray, "samples d"], degree: int) -> Float[np.ndarray, "samples _"]:

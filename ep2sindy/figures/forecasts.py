@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.style import COLOURS, DATA, GREY, axis_label, legend_above, make_panels
-from ep2sindy.forecasting.forecast import LEVEL
+from ep2sindy.forecasting.bands import LEVEL
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 
 HISTORY = 0.5  # of the horizon, shown before the start

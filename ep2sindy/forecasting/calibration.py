@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting.forecast import LEVEL
+from ep2sindy.forecasting.bands import LEVEL
 from ep2sindy.forecasting.rolling import RollingStarts, StatesOf
 from ep2sindy.forecasting.tracking import Tracker
 from ep2sindy.signals.spectrum import is_uniform

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.bands import Forecast, forecasts
 from ep2sindy.forecasting.baselines import Baseline
-from ep2sindy.forecasting.forecast import Forecast, forecasts
 from ep2sindy.forecasting.tracking import FittedState, Tracker
 from ep2sindy.runtime.progress import Advance, nothing
 from ep2sindy.signals.spectrum import is_uniform

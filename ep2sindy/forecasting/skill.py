@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.forecasting.bands import LEVEL, Forecast
 from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence
 from ep2sindy.forecasting.calibration import calibrate
-from ep2sindy.forecasting.forecast import LEVEL, Forecast
 from ep2sindy.forecasting.rolling import RollingStarts, StatesOf
 from ep2sindy.forecasting.tracking import Tracker, track
 from ep2sindy.library.units import Clock
@@ -167,7 +167,7 @@ def forecast_skill(
     baselines, order = _baselines(fitted, names)
     paths = {MODEL: rolling.measured(ahead)}
     paths |= {name: rolling.continued(each) for name, each in baselines.items()}
-    errors = {name: _errors(path, rolling.truth, scale)[shown] for name, path in paths.items()}
+    errors = {name: horizon_errors(p, rolling.truth, scale)[shown] for name, p in paths.items()}
     return ForecastSkill(
         horizons_s=rolling.steps_s[shown],
         period_s=period_s,
@@ -236,8 +236,12 @@ def _spread(first: int, last: int, n: int) -> Int[np.ndarray, " _"]:
     return np.unique(np.linspace(first, last, n).round().astype(np.int64))
 
 
-def _errors(forecast: np.ndarray, truth: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Root mean square error over starts and states, (horizons,), in `scale`."""
+def horizon_errors(
+    forecast: Float[np.ndarray, "starts ahead measured"],
+    truth: Float[np.ndarray, "starts ahead measured"],
+    scale: Float[np.ndarray, " measured"] | float,
+) -> Float[np.ndarray, " ahead"]:
+    """Root mean square error over starts and states at every horizon, in `scale`."""
     off = np.nan_to_num(np.abs(forecast - truth) / scale, nan=WORST, posinf=WORST)
     return np.sqrt(np.square(np.minimum(off, WORST)).mean(axis=(0, 2)))
 

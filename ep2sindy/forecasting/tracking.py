@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.kernels import departures, end_state
+from ep2sindy.estimation.kernels import departures, filtered
 from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, enough_substeps
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord, scale_problem
 from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
@@ -86,7 +86,7 @@ class Tracker:
         samples, process = self.scaled_noise()
         path = self.approach(record, record.samples.copy(), samples, process)
         variances = error_variances(len(path), samples, process)
-        mean, covariance = end_state(*self.linear(record, path), *variances, FREE_START)
+        _, mean, covariance = filtered(*self.linear(record, path), *variances, FREE_START)
         scale = self.problem.scale
         return FittedState(scale * (path[-1] + mean), np.outer(scale, scale) * covariance)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.model.inputs import Drive
 from ep2sindy.model.rollout import Equations, terms_in_use
 
 # Substeps between two samples: the fewest whose central run differs from that of twice as many by
@@ -16,8 +17,6 @@ MAX_SUBSTEPS, ACCURATE = 64, 1e-4
 
 # A run that goes farther than this many times the largest states of start and record has diverged.
 BLOW_UP = 100.0
-
-Drive = Callable[[float], np.ndarray]
 
 
 def draw_normal(

@@ -76,7 +76,7 @@ class Trace:
 
     def window(self, start: int, stop: int) -> Trace:
         """Samples from `start` to `stop` (exclusive), with the frequency of the whole."""
-        return replace(self, t=self.t[start:stop], x=self.x[start:stop], done=(), advice=())
+        return self.with_samples(self.t[start:stop], self.x[start:stop])
 
     def with_samples(
         self, t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -52,10 +51,6 @@ def forecast_picture(run: Trajectory, skill: ForecastSkill) -> Captioned:
 def forecast_errors(skill: ForecastSkill) -> pd.DataFrame:
     """Every error by horizon, for a CSV."""
     return pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
-
-
-def forecast_summary(skill: ForecastSkill | None) -> dict[str, Any] | None:
-    return None if skill is None else skill.summary()
 
 
 def _table(skill: ForecastSkill) -> Table:

@@ -146,9 +146,11 @@ class Study:
             chosen = self._embedded(past, n_states)
         found = self._found(chosen, run)
         with run.progress(None, "", "forecasts where it was fitted"):
-            error = error_where_fitted(past, chosen, found.model)
+            record = with_all_states(past, chosen)
+            tracker = track(found.model, record, measured=[past.name])
+            error = error_where_fitted(past, chosen, tracker)
             share = unexplained(past, chosen.embedding)
-        return Attempt(chosen, found, error, share)
+        return Attempt(chosen, found, tracker, error, share)
 
     def _embedded(self, signal: Trace, n_states: int) -> Chosen:
         known = embeddings(self.harmonics, n_states)
@@ -300,7 +302,7 @@ def evaluate(
         return Outcome(signal, best, attempts, whole, measured, FreeCycle.of(run), None, label)
     past = with_all_states(signal.window(0, n_fitted), chosen)
     before = partial(states_before, signal, chosen.embedding)
-    tracker = calibrate(track(model, past, measured=own), past, states_of=before)
+    tracker = calibrate(best.tracker, past, states_of=before)
     start = tracker.end_of(before(past)).mean
     measured = whole.window(n_fitted - 1, whole.n_samples)
     run = free_run(model, measured, initial=start, judged=own)

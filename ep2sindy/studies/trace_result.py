@@ -19,8 +19,9 @@ from ep2sindy.figures.living import (
     has_waveform,
     waveform_figure,
 )
-from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
-from ep2sindy.forecasting.tracking import track
+from ep2sindy.forecasting.rolling import RollingStarts
+from ep2sindy.forecasting.skill import ForecastSkill, horizon_errors
+from ep2sindy.forecasting.tracking import Tracker
 from ep2sindy.library.equations import equation_text
 from ep2sindy.model.comparison import Verdict
 from ep2sindy.model.free_run import FreeRun
@@ -39,7 +40,6 @@ from ep2sindy.studies.forecasts import (
     forecast_errors,
     forecast_picture,
     forecast_section,
-    forecast_summary,
 )
 from ep2sindy.studies.library_result import CandidateRow, candidate_rows
 from ep2sindy.studies.living import WAVEFORM, FreeCycle, runs_from
@@ -74,12 +74,14 @@ CAPTIONS = {
 class Attempt:
     """A model in a number of states.
 
-    error: of its forecasts up to a period, where it was fitted, in standard deviations. share: of
-    the next state's variance that neighbours in these states do not explain.
+    tracker: of its states along the fitted part. error: of its forecasts up to a period there, in
+    standard deviations. share: of the next state's variance that neighbours in these states do not
+    explain.
     """
 
     chosen: Chosen
     found: Discovery
+    tracker: Tracker
     error: float
     share: float
 
@@ -105,21 +107,15 @@ def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
     return best
 
 
-def error_where_fitted(past: Trace, chosen: Chosen, model: SparseModel) -> float:
+def error_where_fitted(past: Trace, chosen: Chosen, tracker: Tracker) -> float:
     """Error of forecasts up to a period from starts in the last half of the fitted part."""
-    record = with_all_states(past, chosen)
-    skill = forecast_skill(
-        model,
-        record,
-        n_fitted=len(past.t) // 2,
-        starts=N_TRIED,
-        horizon_s=past.period_s,
-        measured=[past.name],
-        states_of=partial(states_before, past, chosen.embedding),
-        n_draws=N_DRAWS_TRIED,
-        tracker=track(model, record, measured=[past.name]),
-    )
-    return float(skill.nrmse["model"].mean())
+    record, longest = with_all_states(past, chosen), max(2, round(past.per_period))
+    n = record.n_samples
+    first = np.unique(np.linspace(n // 2, n - longest, N_TRIED).round().astype(np.int64))
+    rolling = RollingStarts(tracker, record, [past.name], first, longest)
+    ahead = rolling.forecasts(partial(states_before, past, chosen.embedding), N_DRAWS_TRIED, seed=0)
+    scale = past.x[n // 2 :].std()
+    return float(horizon_errors(rolling.measured(ahead), rolling.truth, scale).mean())
 
 
 def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
@@ -318,7 +314,7 @@ class Outcome:
             },
             "misfit": self.found.misfit,
             "living": facts(self, FREE_RUN),
-            "forecast": forecast_summary(self.skill),
+            "forecast": self.skill and self.skill.summary(),
         }
 
     def headline(self) -> Mapping[str, float]:
