@@ -1,7 +1,7 @@
 """Measured records, by the settings that a user meets: `python -m benchmarks.measured`.
 
     EP2SINDY_DATA=folder python -m benchmarks.measured laser electrochemical hallthruster
-    python -m benchmarks.measured pendulum populations current bands pushes
+    python -m benchmarks.measured pendulum populations current bands pushes hidden
 
 `+exp=trace` as it comes is run on every record; what differs is written with its row. Errors are
 root mean squares over starts, in standard deviations of the held-out samples, beside persistence
@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
 N_DRAWS, N_SIMULATED = 10, 3
 DRIFT_A, GAP, N_LONG, PUSH = 0.4, 0.05, 1_000_000, 0.05
 SHOWN = ("verdict", "f_error", "amplitude_ratio", "waveform_error", "n_terms_searched")
+N_CYCLES = 2
+POINTS = ((300.0, 5.0), (300.0, 4.0), (300.0, 6.0), (400.0, 5.0))  # V and mg/s
 NOISE = 0.02  # of the simulator's current, as a share of its mean
 
 
@@ -259,8 +261,83 @@ def library_of(system: ep.systems.System) -> ep.Library:
     return ep.polynomial(system.model.states, degree=degree)
 
 
+# Laws as one measured state shows them, by x' = v or x' = x*g: what is not known of them.
+SHOWN_LAWS: dict[str, tuple[ep.systems.System, str, dict[str, dict[str, float]]]] = {
+    "x of Lorenz": (
+        ep.lorenz(),
+        "x",
+        {
+            "v": {"v": -11.0, "x*h": 1.0},
+            "h": {"1": 720.0, "h": -8.0 / 3.0, "x^2": -10.0, "x*v": -1.0},
+        },
+    ),
+    "prey of Lotka-Volterra": (
+        ep.lotka_volterra(),
+        "x",
+        {"g": {"1": 2.0 / 9.0, "x": -2.0 / 3.0, "g": -1.0 / 3.0, "x*g": 1.0}},
+    ),
+    "predators of Lotka-Volterra": (
+        ep.lotka_volterra(),
+        "y",
+        {"g": {"1": 2.0 / 9.0, "y": -1.0 / 3.0, "g": 2.0 / 3.0, "y*g": -1.0}},
+    ),
+}
+
+
+def hidden() -> None:
+    """One measured state, the others hidden: laws found, and forecasts over the next cycles."""
+    for words, (system, name, law) in SHOWN_LAWS.items():
+        right, nearer, inside, held = 0, 0, [], []
+        n = round(system.duration_s * system.rate_Hz)
+        longer = replace(system, duration_s=1.6 * system.duration_s)
+        for seed in range(N_DRAWS):
+            full = longer.trajectory(noise=0.05, rng=seed)
+            run = ep.Trajectory(full.t, full.columns([name]), [name])
+            found = ep.discover(run.window(0, n), hidden=list(law))
+            if all(set(found.model.terms(s)) == set(terms) for s, terms in law.items()):
+                right += 1
+                inside += [
+                    low <= law[state][term] <= high
+                    for state in law
+                    for term, (low, high) in found.model.intervals(state).items()
+                    if low < high  # the others set the scale of a hidden state
+                ]
+            cycle_s = 1.0 / crossing_frequency(run.t, run.states[:, 0])
+            skill = ep.forecast_skill(found.model, run, n_fitted=n, horizon_s=N_CYCLES * cycle_s)
+            nearer += bool(np.mean(skill.nrmse["model"]) < np.mean(skill.nrmse["autoregression"]))
+            held.append(skill.coverage_90)
+        print(
+            f"{words}, 5 % noise: law right in {right} of {N_DRAWS}, {sum(inside)} of "
+            f"{len(inside)} intervals hold; nearer than the autoregression over {N_CYCLES} "
+            f"cycles in {nearer}, bands of 90 % hold {100 * np.mean(held):.1f} % "
+            f"({100 * min(held):.0f} to {100 * max(held):.0f})",
+            flush=True,
+        )
+    for voltage, flow in POINTS:
+        neutrals(voltage, flow)
+
+
+def neutrals(voltage: float, flow: float) -> None:
+    """The simulator's ions measured, its neutrals hidden; the last quarter held out."""
+    point = ep.thruster.OperatingPoint(voltage, flow)
+    field = ep.thruster.simulate(ep.thruster.Thruster(), point, cache=".cache/simulations")
+    both = ep.zone_average(field, ep.Zone(z="channel"), states=["n_i", "n_n"])
+    run = ep.Trajectory(both.t, both.columns(["n_i"]), ["n_i"], units={"n_i": "m^-3"})
+    n = round(0.75 * run.n_samples)
+    found = ep.discover(run.window(0, n), hidden=["g"])
+    states = ep.estimate_states(found.model, run)
+    free = ep.free_run(found.model, states.window(n, run.n_samples))
+    alike = np.corrcoef(states.columns(["g"])[n:, 0], both.columns(["n_n"])[n:, 0])[0, 1]
+    print(
+        f"{voltage:g} V, {flow:g} mg/s: {free.verdict}, frequency off by {100 * free.f_error:.2f} "
+        f"%, correlation of the hidden state with n_n {alike:.3f}; "
+        f"{'a misfit' if found.misfit else 'fits'}: {found.model.text()}",
+        flush=True,
+    )
+
+
 TABLES = {each.__name__: each for each in (
-    laser, electrochemical, hallthruster, pendulum, populations, current, bands, pushes
+    laser, electrochemical, hallthruster, pendulum, populations, current, bands, pushes, hidden
 )}  # fmt: skip
 
 

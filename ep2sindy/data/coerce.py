@@ -21,6 +21,7 @@ from ep2sindy.data.gaps import MissingSamples, describe_gaps, present_rows
 from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
+from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import Relation, complete, relations_of
 from ep2sindy.library.roles import Roles
 from ep2sindy.runtime.values import check_kind, check_list
@@ -255,7 +256,7 @@ class Task:
     runs: trajectories of the same states, which agree in the units of the library's variables.
     relations: between coefficients. terms: for each state whose equation is known but for its
     coefficients, all terms of that equation; it is not searched. roles: of terms, for equations
-    that conserve what states exchange.
+    that conserve what states exchange. hidden: states that nobody measured.
     Raises ValueError for runs that do not agree or that share samples, a state that repeats
     another, a variable that a run lacks, a relation, term or role of unknown names, or roles beside
     relations or terms.
@@ -266,9 +267,11 @@ class Task:
     relations: Sequence[Relation] = ()
     terms: Mapping[str, Sequence[str]] = field(default_factory=dict)
     roles: Roles | None = None
+    hidden: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         check_kind("library", self.library, Library, "ep.polynomial(['x', 'y'], degree=2)")
+        check_list("hidden", self.hidden)
         for state, names in self.terms.items():
             check_list(f"the terms of {state!r}", names)
         terms = {state: tuple(names) for state, names in self.terms.items()}
@@ -276,16 +279,19 @@ class Task:
             "runs": tuple(trajectories_of(self.runs)),
             "relations": relations_of(self.relations),
             "terms": read_only_mapping(terms),
+            "hidden": tuple(self.hidden),
         }.items():
             object.__setattr__(self, name, value)
-        check_agreement(self.runs, self.library.variables)
+        self._check_hidden()
+        seen = [name for name in self.library.variables if name not in self.hidden]
+        check_agreement(self.runs, seen)
         check_repeats(self.runs)
         self._check_known()
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the states, one equation each."""
-        return tuple(self.runs[0].state_names)
+        """Names of the states, one equation each; hidden ones last."""
+        return (*self.runs[0].state_names, *self.hidden)
 
     def complete(
         self, equation: str, found: Sequence[Bool[np.ndarray, "_ terms"]]
@@ -298,6 +304,18 @@ class Task:
         if not self.relations:
             return list(found)
         return [complete(masks, self.library, equation, self.relations) for masks in found]
+
+    def _check_hidden(self) -> None:
+        for name in self.hidden:
+            check_state(name)
+        measured = [name for run in self.runs for name in run.names]
+        if twice := [name for name in self.hidden if name in measured]:
+            raise ValueError(
+                f"a hidden state is one that no run has: {twice} came with samples; leave them "
+                "out of hidden, or out of the runs"
+            )
+        if len(set(self.hidden)) < len(self.hidden):
+            raise ValueError(f"hidden states must differ: {list(self.hidden)} came")
 
     def _check_known(self) -> None:
         """Raise ValueError for an unknown state or term, or an equation without terms."""

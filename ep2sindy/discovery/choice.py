@@ -204,6 +204,7 @@ def noise_test(
     """
     if estimate is not None and estimate.model is choice.model:
         return NoiseTest(misfit=estimate.misfit, tested=True)
+    runs = runs if estimate is None else estimate.runs  # with hidden states
     states, tested = choice.model.states, choice.left or {}
     unknown = [state for state in states if state not in tested]
     found = {**tested, **(_left_of_weak_rows(choice, runs, unknown) if unknown else {})}

@@ -10,8 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.coerce import Runs, Task, trajectories_of
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import NoiseTest, noise_test
-from ep2sindy.discovery.method import DiscoveryMethod, TrajectorySearch, method_given
+from ep2sindy.discovery.method import (
+    DiscoveryMethod,
+    IdentifiedEquations,
+    TrajectorySearch,
+    method_given,
+)
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.relations import Constraint, Relation, relations_of
@@ -105,34 +111,42 @@ def discover(
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
     roles: Roles | None = None,
+    hidden: Sequence[str] = (),
     seed: int | np.random.Generator = 0,
     progress: Progress | bool = False,
     recipe: DiscoveryMethod | None = None,
 ) -> Discovery:
     """Find sparse equations for every state of the runs.
 
-    The method makes candidates from the runs, chooses one per equation, and fits it: a
-    `TrajectorySearch` by the likelihood of whole trajectories, a `Regression` by rows.
+    The method makes candidates, chooses one per equation, and fits it: a `TrajectorySearch` by the
+    likelihood of whole trajectories, a `Regression` by rows.
     runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`. library: None
     means every product of the variables of the first run up to degree 2. method: None means
     TrajectorySearch(), the best method we know for noisy data. relations: between coefficients,
     such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search, in the selection and in
     the model. terms: for each state whose equation is known but for its coefficients, all terms of
     that equation. roles: of terms, for equations that conserve what states exchange (`Roles`); for
-    a `Regression` by FreeRunScore or RefinedScore. progress: True shows bars. recipe: the old name
-    of method, for one more version.
+    a `Regression` by FreeRunScore or RefinedScore. hidden: names of states that nobody measured;
+    they and their equations are found with the others', by a `TrajectorySearch`. progress: True
+    shows bars. recipe: the old name of method, for one more version.
     Raises ValueError for a relation, term or role that the library or the states do not have, roles
     that the method cannot keep, runs whose states or units differ, states or samples that repeat.
     """
     method = method_given(method, recipe) or TrajectorySearch()
     trajectories = trajectories_of(runs)
-    library = polynomial(trajectories[0].names, degree=2) if library is None else library
+    names = dict.fromkeys([*trajectories[0].names, *hidden])
+    library = polynomial(list(names), degree=2) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
-    task = Task(trajectories, library, relations_of(relations), terms or {}, roles)
+    task = Task(trajectories, library, relations_of(relations), terms or {}, roles, hidden)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
-    found = method.identify(task, rng=rng, progress=watch)
+    return _discovery(method.identify(task, rng=rng, progress=watch), method, trajectories)
+
+
+def _discovery(
+    found: IdentifiedEquations, method: DiscoveryMethod, runs: Sequence[Trajectory]
+) -> Discovery:
     choice = found.choice
-    test = noise_test(choice, trajectories, estimate=found.estimate)
+    test = noise_test(choice, runs, estimate=found.estimate)
     # If residuals of its rows exceed the noise, intervals would not cover the truth.
     withheld = bool(choice.left is not None and test.left and test.misfit)
     return Discovery(

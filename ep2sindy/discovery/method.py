@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -141,6 +141,7 @@ class TrajectorySearch:
                 "Regression(selection=FreeRunScore())"
             )
         found = self._estimate(task, progress)
+        task = replace(task, runs=found.runs, hidden=())
         choice = self._choose(found, task, progress)
         return IdentifiedEquations(choice, _ambiguities_of_samples(task), found.remarks, found)
 
@@ -279,7 +280,12 @@ class Regression:
     def identify(
         self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> IdentifiedEquations:
-        """Assemble rows, search them, and choose."""
+        """Assemble rows, search them, and choose. Raises ValueError for hidden states."""
+        if task.hidden:
+            raise ValueError(
+                f"a regression needs samples of every state: {list(task.hidden)} came as hidden; "
+                "take TrajectorySearch(), or make states of a signal by ep.signals.embed"
+            )
         if task.roles is not None:
             return self._identify_under(task.roles, task, rng=rng, progress=progress)
         equations = self.search_equations(task, rng=rng, progress=progress)

@@ -6,12 +6,14 @@ Besides the model, the result holds remarks: sentences about the samples and the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import EstimationProblem, check_size, scale_problem
@@ -22,13 +24,14 @@ from ep2sindy.estimation.solver import (
     Solution,
     enough_samples,
     max_terms_for,
+    settle,
     solve,
 )
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.model import SparseModel
-from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
+from ep2sindy.runtime.progress import SILENT, Advance, Progress, as_progress, count_pieces
 from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
@@ -67,9 +70,9 @@ class Estimate:
     """Result of estimating states and coefficients together.
 
     model: carries the covariance of its coefficients, unless it is a misfit. paths: for each run,
-    the estimated states, (samples, d), in SI. noise_std: (d,), standard deviation of the samples'
-    noise, in SI. memory: (d,), correlation of this noise from one sample to the next, 0 for white
-    noise.
+    the estimated states, (samples, d), in SI. runs: that were fitted, hidden states as estimated.
+    noise_std: (d,), standard deviation of the samples' noise, in SI; NaN for hidden states. memory:
+    (d,), correlation of this noise from one sample to the next, 0 for white noise.
     flow_error: size of the deviation of the states from the model over one sampling step, as a
     share of the noise; 0 if the residuals are nothing but noise. push_std: (d,), of the random push
     that every state receives over a mean step, in SI; 0 if an exact trajectory explains the
@@ -87,6 +90,7 @@ class Estimate:
 
     model: SparseModel
     paths: tuple[Float[np.ndarray, "samples d"], ...] = field(repr=False)
+    runs: Sequence[Trajectory] = field(repr=False)
     noise_std: Float[np.ndarray, " d"]
     memory: Float[np.ndarray, " d"]
     flow_error: float
@@ -122,6 +126,7 @@ def estimate(
     align: bool = False,
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
+    hidden: Sequence[str] = (),
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     progress: Progress | bool = False,
@@ -133,12 +138,14 @@ def estimate(
     if True, channels found to be late are shifted forward; if False, late channels make the model a
     misfit, and their delays are reported.
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
-    known but for its coefficients, all terms of that equation. progress: True shows bars; see
-    `Progress`.
+    known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
+    which the library has; all ways in which they may enter are compared. progress: True shows bars;
+    see `Progress`.
     Raises ValueError for fewer than one term, a library that needs more samples than there are, or
     whatever a `Task` refuses.
     """
-    task = Task(trajectories_of(runs), library, relations_of(relations), terms or {})
+    known = trajectories_of(runs)
+    task = Task(known, library, relations_of(relations), terms or {}, hidden=hidden)
     return estimate_task(
         task,
         max_terms=max_terms,
@@ -160,18 +167,59 @@ def estimate_task(
 ) -> Estimate:
     """Answer a task by `estimate`."""
     max_terms = check_count("max_terms", max_terms)
-    check_runs(task)
     check_size(task.runs, task.library, task.terms)
     with progress.stage(None, "step", "states and coefficients") as advance:
-        problem = scale_problem(
-            task.runs, task.library, task.relations, task.terms, advance=advance
-        )
-        answer = _answer(problem, max_terms, align=align)
-    model = _model(answer, task.library, units or task.runs[0].units, provenance or {})
-    return _report(answer, model, max_terms, progress)
+        best = []
+        for group in with_guesses(task):
+            tried = [_try(task, *each, max_terms, align, advance) for each in group]
+            best.append(min(tried, key=lambda each: each[0].rank))
+            if not best[-1][0].misfit:
+                break
+        answer, runs = min(best, key=lambda each: bool(each[0].misfit))
+    if task.hidden:
+        runs = [_with_path(answer, k, run) for k, run in enumerate(runs)]
+    model = _model(answer, task.library, units or runs[0].units, provenance or {})
+    return _report(answer, model, runs, max_terms, progress)
 
 
-def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progress) -> Estimate:
+def _try(
+    task: Task,
+    known: Task,
+    ways: Sequence[Entrance],
+    max_terms: int,
+    align: bool,
+    advance: Advance,
+) -> tuple[_Reported, Sequence[Trajectory]]:
+    """Answer a task by one way in which its hidden states may enter."""
+    check_runs(known)
+    problem = scale_problem(
+        known.runs,
+        known.library,
+        known.relations,
+        known.terms,
+        measured=task.runs[0].state_names,
+        advance=advance,
+    )
+    found = _answer(problem, max_terms, align=align)
+    return replace(found, said=(*(way.words for way in ways), *found.said)), known.runs
+
+
+def _with_path(answer: _Reported, number: int, run: Trajectory) -> Trajectory:
+    """A run as it was fitted, with the estimated path of hidden states among its samples."""
+    problem, fit = answer.problem, answer.found.annealed.fit
+    record = problem.records[number]
+    states = np.where(problem.measured, record.samples, fit.paths[number]) * problem.scale
+    kept = np.searchsorted((run.t - run.t[0]) / problem.step_s, record.times - 0.5)
+    return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept])
+
+
+def _report(
+    answer: _Reported,
+    model: SparseModel,
+    runs: Sequence[Trajectory],
+    max_terms: int,
+    watch: Progress,
+) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
     problem, found = answer.problem, answer.found
     fit, few_terms = found.annealed.fit, max_terms_for(problem, max_terms)
@@ -185,7 +233,8 @@ def _report(answer: _Reported, model: SparseModel, max_terms: int, watch: Progre
     return Estimate(
         model=model,
         paths=tuple(path * problem.scale for path in fit.paths),
-        noise_std=found.noise.std * problem.scale,
+        runs=runs,
+        noise_std=np.where(problem.measured, found.noise.std * problem.scale, np.nan),
         memory=found.noise.memory,
         flow_error=found.flow_error,
         misfit=answer.misfit,
@@ -215,12 +264,20 @@ class _Reported:
     pushes: Float[np.ndarray, " d"]
     said: tuple[str, ...] = ()
 
+    @property
+    def rank(self) -> tuple[bool, bool, float]:
+        """Order between ways in which hidden states may enter: least is best."""
+        return bool(self.misfit), bool(self.pushes.any()), self.found.score
+
 
 def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Reported:
     most, none = max_terms_for(problem, max_terms), np.zeros(len(problem.states))
     found, late = solve(problem, max_terms=most)
     if late is None:
         if not found.fits and (pushed := solve_pushed(problem, max_terms=most)).explains:
+            exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=most)
+            if exact.fits:  # the pushes were needed on the way alone
+                return _Reported(problem, exact, _at_limit(problem, exact, max_terms), none, none)
             found, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
             misfit = _at_limit(problem, found, max_terms)
             return _Reported(problem, found, misfit, none, pushed.errors.process, (said,))
@@ -399,7 +456,7 @@ def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
     words = []
     error = np.sqrt(24.0 / problem.n_samples)
     for k, state in enumerate(problem.states):
-        if noise.std[k] <= FLOOR or noise.unexplained[k]:
+        if noise.std[k] <= FLOOR or noise.unexplained[k] or not problem.measured[k]:
             continue  # rounding, integration or model error, not noise
         if noise.memory[k]:
             words.append(f"noise of {state} lasts: {noise.memory[k]:.2f} from sample to sample")

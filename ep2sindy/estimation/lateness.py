@@ -95,8 +95,8 @@ def suspect_delays(
     max_terms: int,
 ) -> Float[np.ndarray, " d"] | None:
     """Delays by state, in mean steps, that make fewer or likelier terms suffice; None if none."""
-    late = np.full(len(problem.states), True)
-    late[0] = problem.driven  # inputs set the time reference; without any, the first state does
+    late = problem.measured.copy()
+    late[np.argmax(late)] = problem.driven  # without inputs the first state sets the clock
     if not (late.any() and around.of(late).freed.finite):
         return None
     best = fit_delays(problem, around, late, support, prices, max_terms=max_terms)[0]
@@ -135,8 +135,9 @@ def _those_that_show(
     delays = np.zeros(len(late))
     delays[late] = around.of(late).delays(support)[0]
     if not problem.driven:
-        reference = int(np.argsort(delays, kind="stable")[(len(delays) - 1) // 2])
-        late = np.arange(len(late)) != reference
+        measured = np.flatnonzero(problem.measured)
+        order = measured[np.argsort(delays[measured], kind="stable")]
+        late = problem.measured & (np.arange(len(late)) != order[(len(order) - 1) // 2])
     while late.any():
         delays[:] = 0.0
         delays[late], errors = around.of(late).delays(support)

@@ -73,16 +73,20 @@ class Noise:
 
 def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     """Size, shape and memory of the residuals of a fit; the memory is that of an AR(1) process."""
+    hidden = ~problem.measured
     left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
+    left = [np.where(hidden, 0.0, each) for each in left]
     n = problem.n_samples
     per_state = fit.support.sum() / len(problem.states) + len(left)
     freedom = np.sqrt(n / max(n - per_state, 1.0))
     std = freedom * np.sqrt(sum(np.square(e).sum(axis=0) for e in left) / n)
+    std[hidden] = std[~hidden].mean()  # how freely a hidden state may leave the flow
     shape, growth = _shapes(fit.paths, left)
     limited = problem.limited
+    if (limited | hidden).any():
+        shape = tuple(np.where(limited | hidden, 1.0, each) for each in shape)
+        growth = np.where(limited | hidden, 0.0, growth)
     if limited.any():
-        shape = tuple(np.where(limited, 1.0, each) for each in shape)
-        growth = np.where(limited, 0.0, growth)
         likely, between = _likeliest_std(problem, fit, std)
         std = np.where(limited, freedom * likely, std)
         left = _pulls(problem, fit, std)
@@ -92,7 +96,7 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, fit, std, memory)
     std = np.maximum(std, FLOOR)
     lasting = np.where(believed, memory, 0.0)
-    alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std).mean()
+    alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
     logs = n * np.log(alike) + sum(np.log(np.square(s)).sum(axis=0) for s in shape)
     if limited.any():
         logs = np.where(limited, between, logs)
@@ -105,7 +109,7 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
         growth=growth,
         kurtosis=kurtosis,
         outliers=outliers,
-        deviance=float((logs + n * np.log1p(-np.square(lasting))).sum()),
+        deviance=float((logs + n * np.log1p(-np.square(lasting)))[~hidden].sum()),
     )
 
 

@@ -35,20 +35,23 @@ class ScaledRecord:
 
     times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
     inputs: at the samples; between them they are interpolated by cubics, or linearly if switched.
-    limits: of samples that are clipped or rounded.
+    limits: of samples that are clipped or rounded. measured: (d,), False for hidden states, whose
+    samples are nothing but a start; None if all were measured.
     """
 
     times: Float[np.ndarray, " samples"]
     samples: Float[np.ndarray, "samples d"]
     inputs: Float[np.ndarray, "samples n_inputs"]
     limits: Bounds | None = None
+    measured: Bool[np.ndarray, " d"] | None = None
 
     @property
     def values(self) -> Float[np.ndarray, "samples d"]:
-        """The samples, with NaN in place of limits."""
-        return (
-            self.samples if self.limits is None else np.where(self.limits.at, np.nan, self.samples)
-        )
+        """The samples, with NaN in place of limits and of hidden states."""
+        values = self.samples
+        if self.limits is not None:
+            values = np.where(self.limits.at, np.nan, values)
+        return values if self.measured is None else np.where(self.measured, values, np.nan)
 
     def kept(
         self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
@@ -57,7 +60,9 @@ class ScaledRecord:
         limits, by = self.limits, samples - self.samples[kept]
         if limits is not None:
             limits = replace(limits, lower=limits.lower[kept] + by, upper=limits.upper[kept] + by)
-        return ScaledRecord(self.times[kept], samples, self.inputs[kept], limits)
+        return replace(
+            self, times=self.times[kept], samples=samples, inputs=self.inputs[kept], limits=limits
+        )
 
     @cached_property
     def steps(self) -> Float[np.ndarray, " steps"]:
@@ -101,7 +106,7 @@ class EstimationProblem:
     identity.
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
-    advance: called at every step of a fit.
+    measured: (d,), False for hidden states. advance: called at every step of a fit.
     """
 
     library: Library
@@ -117,6 +122,7 @@ class EstimationProblem:
     scale: Float[np.ndarray, " d"]
     input_scale: Float[np.ndarray, " n_inputs"]
     step_s: float
+    measured: Bool[np.ndarray, " d"]
     inputs: tuple[str, ...] = ()
     advance: Advance = nothing
 
@@ -127,6 +133,7 @@ class EstimationProblem:
             samples=run.columns(self.states) / self.scale,
             inputs=run.columns(self.inputs) / self.input_scale,
             limits=_limits(run, self.scale),
+            measured=None if self.measured.all() else self.measured,
         )
 
     @property
@@ -135,14 +142,15 @@ class EstimationProblem:
 
     @cached_property
     def limited(self) -> Bool[np.ndarray, " d"]:
-        """Mask of the states that have limits among their samples."""
+        """Mask of the measured states that have limits among their samples."""
         limits = [r.limits.at.any(axis=0) for r in self.records if r.limits is not None]
-        return np.any([np.zeros(len(self.states), dtype=np.bool_), *limits], axis=0)
+        found = np.any([np.zeros(len(self.states), dtype=np.bool_), *limits], axis=0)
+        return found & self.measured
 
     @property
     def n_squares(self) -> int:
-        """Samples times states, about the value of the squares if a model fits."""
-        return self.n_samples * len(self.states)
+        """Samples times measured states, about the value of the squares if a model fits."""
+        return self.n_samples * int(self.measured.sum())
 
     @property
     def related(self) -> bool:
@@ -269,13 +277,15 @@ def scale_problem(
     relations: Sequence[Relation] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
     *,
+    measured: Sequence[str] = (),
     advance: Advance = nothing,
 ) -> EstimationProblem:
     """Scale records and library, and collect the coefficients that may be in the model.
 
     relations: hold between coefficients. terms: for each state whose equation is known but for its
-    coefficients, all terms of that equation. Inputs that the library does not have are left out;
-    the others are taken by name, in the order of the first run.
+    coefficients, all terms of that equation. measured: names of states; empty means all. Inputs
+    that the library does not have are left out; the others are taken by name, in the order of the
+    first run.
     """
     states = runs[0].state_names
     inputs = [name for name in runs[0].input_names if name in library.variables]
@@ -305,6 +315,7 @@ def scale_problem(
         scale=size[: len(states)],
         input_scale=size[len(states) :],
         step_s=step_s,
+        measured=np.isin(states, measured or states),
         inputs=tuple(inputs),
         advance=advance,
     )

@@ -139,12 +139,11 @@ def error_variances(
 
 def solve_pushed(problem: EstimationProblem, *, max_terms: int) -> PushedFit:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
-    d = len(problem.states)
     start, by_record = start_from_smooth(problem, None)
     noise = by_record[0][0]
     errors = Errors(np.maximum(noise, LEAST_NOISE), np.maximum(noise, 1e-3), np.inf)
     prices = term_prices(problem, float(problem.n_samples))
-    fit, everything = start, np.ones(d, dtype=np.bool_)
+    fit = start
     for share in SHARES:
         level = _level(problem, fit, errors)
         fit = fit_paths(problem, fit, level)
@@ -158,7 +157,7 @@ def solve_pushed(problem: EstimationProblem, *, max_terms: int) -> PushedFit:
             if same:
                 break
         errors = likely_errors(
-            _linear(problem, fit, level), everything, errors.samples, errors.process
+            _linear(problem, fit, level), problem.measured, errors.samples, errors.process
         )
     level = _level(problem, fit, errors)
     fit = fit_paths(problem, fit, level)

@@ -118,11 +118,13 @@ def solve(problem: EstimationProblem, *, max_terms: int) -> tuple[Solution, Alig
     def rank(each: Solution) -> tuple[int, float]:
         # A crude model may score best by following one state exactly and ignoring another.
         let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
+        let_go &= problem.measured
         return int(let_go.sum()), each.score
 
     best = first = _from_start(problem, None, max_terms)
     late = _align(problem, first, max_terms)
-    for log10_ratio in OTHER_STARTS:
+    # Guesses of hidden states do not depend on how they are smoothed.
+    for log10_ratio in OTHER_STARTS if problem.measured.all() else ():
         if late or (best.fits and problem.n_samples >= ENOUGH_SAMPLES):
             break
         best = min([best, _from_start(problem, log10_ratio, max_terms)], key=rank)
@@ -158,10 +160,28 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
 
 
 def _from_start(problem: EstimationProblem, log10_ratio: float | None, max_terms: int) -> Solution:
-    """Anneal with the smoother's noise, then with the residuals', until noise and support agree."""
+    """Anneal with the smoother's noise, then with the residuals'."""
     fit, std = start_from_smooth(problem, log10_ratio)
     prices = term_prices(problem, float(problem.n_samples))
     found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)
+    return _settle(problem, found, max_terms)
+
+
+def settle(
+    problem: EstimationProblem,
+    fit: TrajectoryFit,
+    noise: tuple[np.ndarray, ...],
+    *,
+    max_terms: int,
+) -> Solution:
+    """The exact solution near a fit whose states leave the flow a little."""
+    prices = term_prices(problem, float(problem.n_samples))
+    found = anneal(problem, fit, noise, prices, COLD, max_terms=max_terms)
+    return _settle(problem, found, max_terms)
+
+
+def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> Solution:
+    """Anneal again until noise and support agree, and compare with what is nearly as likely."""
     for _ in range(MAX_PASSES):
         before, noise = found.fit.support, noise_beside(problem, found.fit)
         prices = term_prices(problem, problem.n_samples * float(noise.independent.mean()))
@@ -305,6 +325,7 @@ def start_from_smooth(
         paths, _regress(problem, theta, rates), support, np.full(len(variance), np.inf)
     )
     std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
+    std[~problem.measured] = std[problem.measured].mean()
     return fit, tuple(np.tile(std, (len(path), 1)) for path in paths)
 
 

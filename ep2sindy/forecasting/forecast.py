@@ -35,12 +35,15 @@ def forecast(
     bands hold 90 % of that record, if it is long enough (`calibrate`). The bands follow from the
     uncertainty of the start, from the covariance of the model's coefficients if it has one, from
     these pushes, and from the noise.
-    history: samples of all states and inputs of the model; a Trajectory, a table or (t, x).
+    history: samples of the measured states and of the inputs; a Trajectory, a table or (t, x).
+    States of the model that it lacks are told from the others (`estimate_states`).
     horizon: duration in s, in steps of the history; or the times (samples,) themselves, in s.
     fitted_to: the record that the model was fitted to; None takes the history. measured: states
-    that were measured; others were made from them (`ep.signals.embed`), and only start the fit.
+    that were measured; others that the history has were made from them (`ep.signals.embed`), and
+    only start the fit.
     inputs: of a driven model over the horizon, as for `simulate`.
-    Raises ValueError for a history without some variable, or a horizon that does not lie ahead.
+    Raises ValueError for a history without any state or some input of the model, or a
+    horizon that does not lie ahead.
 
     >>> run = ep.lorenz().trajectory(noise=0.05, rng=0)
     >>> ahead = ep.forecast(ep.lorenz().model, run.window(0, 2000), 0.5)

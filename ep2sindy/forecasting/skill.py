@@ -16,7 +16,7 @@ from ep2sindy.forecasting.bands import LEVEL, Forecast
 from ep2sindy.forecasting.baselines import Autoregression, Baseline, Harmonics, Persistence
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.rolling import RollingStarts, StatesOf
-from ep2sindy.forecasting.tracking import Tracker, track
+from ep2sindy.forecasting.tracking import Tracker, measured_states, track
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Advance, nothing
@@ -146,13 +146,14 @@ def forecast_skill(
 
     run: a record of all states and inputs of the model; its first `n_fitted` samples were fitted,
     and also serve the baselines. starts: number of starts, evenly spread over the rest. horizon_s:
-    the longest horizon; None takes four periods, or what half of the rest allows. measured: the
-    states that were measured; None means all. states_of: makes the states of a past whose first
-    columns are the measured ones, such as a growth rate (`ep.signals.embed`). tracker: of the model
-    on the fitted part, if it is known already. n_draws: of every forecast, for its bands.
+    the longest horizon; None takes four periods, or what half of the rest allows. measured: as for
+    `forecast`. states_of: makes the states of a past whose first columns are the measured ones
+    (`ep.signals.embed`). tracker: of the model on the fitted part, if it is known already.
+    n_draws: of every forecast.
     Raises ValueError for a driven model, or a part that is too short.
     """
-    record, names = trajectory_of(run), list(model.states if measured is None else measured)
+    record = trajectory_of(run)
+    names = measured_states(model, record) if measured is None else list(measured)
     _check_skill(model, record, n_fitted)
     fitted = record.window(0, n_fitted)
     if tracker is None:
@@ -163,21 +164,30 @@ def forecast_skill(
     rolling = RollingStarts(tracker, record, names, first, longest)
     ahead = rolling.forecasts(states_of, check_count("n_draws", n_draws), seed, advance)
     shown = _spread(0, longest - 1, min(longest, N_HORIZONS))
-    scale = zero_to_one(record.columns(names)[n_fitted:].std(axis=0))
     baselines, order = _baselines(fitted, names)
     paths = {MODEL: rolling.measured(ahead)}
     paths |= {name: rolling.continued(each) for name, each in baselines.items()}
-    errors = {name: horizon_errors(p, rolling.truth, scale)[shown] for name, p in paths.items()}
+    errors = _errors(paths, rolling.truth, record.columns(names)[n_fitted:])
     return ForecastSkill(
         horizons_s=rolling.steps_s[shown],
         period_s=period_s,
-        nrmse=MappingProxyType(errors),
+        nrmse=MappingProxyType({n: values[shown] for n, values in errors.items()}),
         coverage_90=rolling.coverage(ahead, LEVEL),
         n_starts=len(first),
         example=ahead[0],
         order=order,
         clock=record.clock,
     )
+
+
+def _errors(
+    paths: Mapping[str, Float[np.ndarray, "starts ahead measured"]],
+    truth: Float[np.ndarray, "starts ahead measured"],
+    held_out: Float[np.ndarray, "samples measured"],
+) -> dict[str, Float[np.ndarray, " ahead"]]:
+    """Errors by horizon, in standard deviations of the held-out samples."""
+    scale = zero_to_one(held_out.std(axis=0))
+    return {name: horizon_errors(path, truth, scale) for name, path in paths.items()}
 
 
 def _check_skill(model: SparseModel, record: Trajectory, n_fitted: int) -> None:

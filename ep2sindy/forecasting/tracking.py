@@ -14,9 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.hidden import with_guess_by
 from ep2sindy.estimation.kernels import departures, filtered
-from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, enough_substeps
+from ep2sindy.estimation.likelihood import (
+    FREE_START,
+    Level,
+    TrajectoryFit,
+    enough_substeps,
+    observe,
+)
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord, scale_problem
 from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
 from ep2sindy.model.model import SparseModel
@@ -58,18 +66,22 @@ class FittedState:
 class Tracker:
     """A model that can follow records, with the errors that it makes on one.
 
-    problem: scales and steps of that record. free: the model's coefficients, scaled. measured:
-    (n_states,), False for states that were made from the others. n_substeps: Runge-Kutta steps
-    between samples. per_period: samples to a period of the record.
+    problem: scales and steps of that record, and which states were measured. free: the model's
+    coefficients, scaled. n_substeps: Runge-Kutta steps between samples. per_period: samples to a
+    period of the record.
     """
 
     model: SparseModel
     problem: EstimationProblem
     free: Float[np.ndarray, " free"]
-    measured: Bool[np.ndarray, " n_states"]
     n_substeps: int
     per_period: float
     noise: ModelNoise
+
+    @property
+    def measured(self) -> Bool[np.ndarray, " n_states"]:
+        """False for states that nobody measured, or that were made from the others."""
+        return self.problem.measured
 
     @property
     def memory(self) -> int:
@@ -79,7 +91,7 @@ class Tracker:
     def end_of(self, history: Trajectory) -> FittedState:
         """Fit the states of the last samples of a history, and return the last state.
 
-        history: has all states of the model; those that are not measured only start the fit.
+        history: has the measured states of the model; others that it has only start the fit.
         """
         last = history.window(max(0, history.n_samples - self.memory), history.n_samples)
         record = self.problem.record(_of_model(self.model, last))
@@ -89,6 +101,13 @@ class Tracker:
         _, mean, covariance = filtered(*self.linear(record, path), *variances, FREE_START)
         scale = self.problem.scale
         return FittedState(scale * (path[-1] + mean), np.outer(scale, scale) * covariance)
+
+    def along(self, run: Trajectory) -> Trajectory:
+        """All states of the model along a run, fitted to the measured ones under the errors."""
+        own = _of_model(self.model, run)
+        record = self.problem.record(own)
+        path = self.approach(record, record.samples.copy(), *self.scaled_noise())
+        return replace(own, states=path * self.problem.scale)
 
     def scaled_noise(self) -> tuple[np.ndarray, np.ndarray]:
         """Noise of samples and pushes, scaled; states that are not measured get the mean of others.
@@ -114,7 +133,7 @@ class Tracker:
         """Derivatives of the flow, its misses, and residuals, NaN where nothing was measured."""
         none = np.zeros(len(self.free), dtype=np.bool_)
         flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
-        residuals = np.where(self.measured, record.samples - path, np.nan)
+        residuals = observe(record, path, np.ones_like(path)).residuals
         return np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals
 
     def _smooth(
@@ -160,21 +179,21 @@ def track(
 ) -> Tracker:
     """Estimate with what errors a model follows a record, usually the one that it was fitted to.
 
-    run: has all states and inputs of the model. measured: states whose samples count; the others
-    were made from them. None means all. Every state may be pushed, also one whose equation is known
-    to hold, such as x' = v: the others' errors come in through it.
-    Raises ValueError for a run without some variable, or measured states that the model lacks.
+    run: has the measured states and the inputs of the model. measured: states whose samples count;
+    others that the run has were made from them. None means all that it has. Every state may be
+    pushed, also one whose equation is known to hold, such as x' = v: the others' errors come in
+    through it.
+    Raises ValueError for a run without an input, or measured states that the model lacks.
     """
-    names = list(model.states if measured is None else measured)
+    names = measured_states(model, run) if measured is None else list(measured)
     if not names or not set(names) <= set(model.states):
         raise ValueError(
             f"measured must name some of the states {list(model.states)}: {names} came"
         )
     own = _of_model(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
     terms = {state: list(model.terms(state)) for state in model.states}
-    problem = scale_problem([own], model.library, terms=terms)
-    path = problem.records[0].samples.copy()
-    free, is_measured = _free_of(model, problem), np.isin(model.states, names)
+    problem = scale_problem([own], model.library, terms=terms, measured=names)
+    path, free = problem.records[0].samples.copy(), _free_of(model, problem)
     # Differences remove what is smooth; those of white noise have a variance of 20.
     rough = np.sqrt(np.square(np.diff(path, n=3, axis=0)).mean(axis=0) / 20.0)
     rough = np.clip(rough, LEAST_NOISE, MOST)
@@ -182,23 +201,44 @@ def track(
         model=model,
         problem=problem,
         free=free,
-        measured=is_measured,
         n_substeps=_substeps(problem, path, free, rough),
         per_period=_per_period(own, names),
-        noise=_noise_of(problem, is_measured, rough, 0.1 * rough),
+        noise=_noise_of(problem, rough, 0.1 * rough),
     )
     for _ in range(N_PASSES):
         tracker, path = _with_likely_noise(tracker, path)
     return tracker
 
 
+def estimate_states(
+    model: SparseModel, run: Run, *, measured: Sequence[str] | None = None
+) -> Trajectory:
+    """All states of a model along a record, those included that nobody measured.
+
+    The states follow the model but for random pushes, and the samples but for noise; the sizes of
+    both are the likeliest ones for this record (Kalman smoothing, iterated).
+    run: has the inputs and some states of the model. measured: as for `track`.
+    Raises ValueError for a run without any state of the model, or a state that the model cannot
+    tell from the others.
+
+    >>> full = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    >>> predators = ep.Trajectory(full.t, full.columns(["y"]), ["y"])
+    >>> both = ep.estimate_states(ep.lotka_volterra().model, predators)
+    >>> off = both.columns(["x"]) - full.columns(["x"])
+    >>> bool(off.std() < 0.1 * full.columns(["x"]).std())
+    True
+    """
+    record = trajectory_of(run)
+    return track(model, record, measured=measured).along(record)
+
+
 def _with_likely_noise(tracker: Tracker, path: np.ndarray) -> tuple[Tracker, np.ndarray]:
     """The tracker with the most likely noise about the states, and these states."""
-    (record,), measured = tracker.problem.records, tracker.measured
+    (record,) = tracker.problem.records
     samples, process = tracker.scaled_noise()
     path = tracker.approach(record, path, samples, process)
-    found = likely_errors([tracker.linear(record, path)], measured, samples, process)
-    noise = _noise_of(tracker.problem, measured, found.samples, found.process)
+    found = likely_errors([tracker.linear(record, path)], tracker.measured, samples, process)
+    noise = _noise_of(tracker.problem, found.samples, found.process)
     return replace(tracker, noise=noise), path
 
 
@@ -212,14 +252,26 @@ def _substeps(
     return enough_substeps(problem, fit, level)
 
 
-def _noise_of(
-    problem: EstimationProblem, measured: np.ndarray, samples: np.ndarray, process: np.ndarray
-) -> ModelNoise:
-    return ModelNoise(np.where(measured, samples, np.nan) * problem.scale, process * problem.scale)
+def _noise_of(problem: EstimationProblem, samples: np.ndarray, process: np.ndarray) -> ModelNoise:
+    shown = np.where(problem.measured, samples, np.nan)
+    return ModelNoise(shown * problem.scale, process * problem.scale)
+
+
+def measured_states(model: SparseModel, run: Trajectory) -> list[str]:
+    """States of a model that a run has. Raises ValueError if it has none."""
+    found = [name for name in model.states if name in run.state_names]
+    if not found:
+        raise ValueError(
+            f"a record must have some of the model's states {list(model.states)}: it has "
+            f"{list(run.state_names)}; name its columns as the model does"
+        )
+    return found
 
 
 def _of_model(model: SparseModel, run: Trajectory) -> Trajectory:
-    """The variables of a run that a model has, in its order."""
+    """The variables of a run that a model has, in its order; states that it lacks are guessed."""
+    if len(measured_states(model, run)) < len(model.states):
+        run = with_guess_by(model, run)
     return Trajectory(
         t=run.t,
         states=run.columns(model.states),

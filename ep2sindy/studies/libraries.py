@@ -87,9 +87,10 @@ class LibraryCase:
     function_degree: int = 1
     n_norm: str | None = None
 
-    def library(self, data: xr.Dataset, sampling: Sampling) -> Library:
+    def library(self, data: xr.Dataset, sampling: Sampling, hidden: Sequence[str] = ()) -> Library:
+        """The library over the data's variables, and over states that the data lack."""
         optional = [name for name in self.variables_if_present if name in data]
-        names = sampling.columns([*self.variables, *optional])
+        names = [*sampling.columns([*self.variables, *optional]), *hidden]
         return polynomial(
             names,
             degree=self.degree,
@@ -131,8 +132,10 @@ class Study:
     without inputs are searched for a model that lives; None leaves that out. held_out: the last
     share of the record, on which such a model is tested; None means a quarter. forecasts: number of
     starts of forecasts, over the held-out part of a living model, or else over the last quarter of
-    the record; zero leaves them out.
-    Raises ValueError for held_out without living, as it would do nothing.
+    the record; zero leaves them out. hidden: states that nobody measured, and relations between
+    coefficients, as for `discover`.
+    Raises ValueError for held_out without living, as it would do nothing, and for hidden states
+    with several libraries or with living, which need samples of all states.
     """
 
     source: Source
@@ -146,8 +149,15 @@ class Study:
     living: LivingSearch | None = None
     held_out: ShareOrNone = None
     forecasts: int = 0
+    hidden: Sequence[str] = ()
+    relations: Sequence[str] = ()
 
     def __post_init__(self) -> None:
+        if self.hidden and (self.living is not None or len(self.libraries) > 1):
+            raise ValueError(
+                f"hidden states go with one library and without living: hidden={list(self.hidden)} "
+                f"came with {len(self.libraries)} libraries; take +exp=discover"
+            )
         if self.forecasts < 0:
             raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
         if self.living is None and self.held_out is not None:
@@ -161,12 +171,15 @@ class Study:
         with run.progress(None, "", "data"):
             opened = self.source.fields()
         sampling = self.source.trajectory
-        libraries = {n: case.library(opened[0], sampling) for n, case in self.libraries.items()}
-        runs = [self.source.sampled(field, libraries.values(), run) for field in opened]
-        data = runs[0]
+        seen = [case.library(opened[0], sampling) for case in self.libraries.values()]
+        runs = [self.source.sampled(field, seen, run) for field in opened]
+        libraries = {
+            name: case.library(opened[0], sampling, self.hidden)
+            for name, case in self.libraries.items()
+        }
         if len(runs) > 1:
             run.say(f"{len(runs)} records in one search; figures show the first")
-        if hint := alone(data):
+        if not self.hidden and (hint := alone(runs[0])):
             run.warn(hint)
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(run.seed).spawn(len(libraries))
@@ -182,6 +195,9 @@ class Study:
             if result.discovery.misfit:
                 run.warn(f"{name}: {result.discovery.misfit}")
         files = [str(field.attrs.get("file", "")) for field in opened]
+        estimated = [result.discovery.estimate for result in results.values()]
+        with_hidden = [found.runs[0] for found in estimated if found and self.hidden]
+        data = (with_hidden or runs)[0]
         return Outcome(data, results, self.figures, self.formulation.smoother, files)
 
     def _result(
@@ -197,13 +213,15 @@ class Study:
     ) -> LibraryResult:
         """Discovery of one library in all records; free runs of its model and the published one.
 
-        Both run over the first record; the discovered model also runs over the other records. A
-        model that lives is searched for in the first record.
+        Both run over the first record, the discovered model over the others, too. A model that
+        lives is searched for in the first one.
         """
-        s = self.rollout_s
+        s, measured = self.rollout_s, runs[0]
+        ask = partial(discover, hidden=self.hidden, relations=self.relations, progress=progress)
+        found = ask(list(runs), library, method, seed=rng)
+        runs = runs if found.estimate is None else found.estimate.runs
         first, *others = [(run, run.n_samples if s is None else samples_in(run, s)) for run in runs]
         data, n_samples = first
-        found = discover(list(runs), library, method, seed=rng, progress=progress)
         published = self.thesis.get(name, {})
         rows = Regression(self.formulation, bootstraps=self.bootstraps)
         refitted = refit(found, published, rows, runs, rng)
@@ -214,7 +232,7 @@ class Study:
             )
         train = split_in_time(data, self.held_out or HELD_OUT)[0]
         skill = skill_of(
-            found.model if lives is None else lives.model, data,
+            found.model if lives is None else lives.model, measured,
             n_fitted=train.n_samples, starts=self.forecasts, progress=progress,
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
@@ -264,7 +282,8 @@ def alone(data: Trajectory) -> str | None:
     (name,) = data.names
     return (
         f"{name} oscillates, and one first-order equation cannot: where it rises it never falls "
-        f"again. Name a second state, or let +exp=trace signal={name} make one of the signal"
+        f"again. Name a second state, say that one was not measured (hidden=[g]), or let "
+        f"+exp=trace signal={name} make one of the signal"
     )
 
 

@@ -391,7 +391,9 @@ def noise_sizes(data: Trajectory) -> Metrics[Estimate]:
 
 
 def by_state(found: Estimate, values: np.ndarray) -> dict[str, float]:
-    return dict(zip(found.model.states, np.asarray(values).tolist(), strict=True))
+    """Values of the states that were measured."""
+    pairs = zip(found.model.states, np.asarray(values).tolist(), strict=True)
+    return dict(compress(pairs, np.isfinite(found.noise_std)))
 
 
 def odds(value: float) -> str:

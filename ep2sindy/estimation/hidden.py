@@ -1,0 +1,260 @@
+"""Hidden states: nobody measured them, and their equations are found along with the others'.
+
+A hidden state shows only in the rates of others, so its scale is free to choose. It is fixed by its
+entrance: a term with which it enters the equation of another state, and that term's coefficient.
+`x' = v` makes v the derivative of x, `x' = x*g` makes g its growth rate. Entrances lead to
+different equations, so all that a library allows are tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, product
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import make_interp_spline
+
+from ep2sindy.data.coerce import Task
+from ep2sindy.data.numbers import column_norms
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.library.library import Library
+from ep2sindy.library.relations import Relation, parse_relation
+from ep2sindy.library.units import unit_product
+from ep2sindy.model.model import SparseModel
+from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.trace import is_positive
+
+# Share of a factor's mean square that weighs a hidden state's mean against what its rate tells:
+# where the factor is small, this is little.
+LEAST_FACTOR = 0.03
+
+Columns = Mapping[str, Float[np.ndarray, " samples"]]
+
+
+@dataclass(frozen=True)
+class Entrance:
+    """A term by which a hidden state enters the equation of another state.
+
+    coefficient: of the term, in SI; it fixes the scale of the hidden state. given: True if a
+    relation of the user says so.
+    """
+
+    hidden: str
+    state: str
+    term: str
+    coefficient: float = 1.0
+    given: bool = False
+
+    @property
+    def relation(self) -> Relation:
+        return parse_relation(f"{self.state}: {self.term} == {self.coefficient!r}")
+
+    @property
+    def words(self) -> str:
+        """Sentence on how the scale of the hidden state is fixed."""
+        return (
+            f"{self.hidden} was not measured: its scale is such that {self.state}' has the term "
+            f"{self.term} with a coefficient of {self.coefficient:g}"
+        )
+
+
+def entrances(
+    library: Library, measured: Sequence[str], hidden: Sequence[str], relations: Sequence[Relation]
+) -> list[tuple[Entrance, ...]]:
+    """All ways in which hidden states may enter, one entrance for each of them.
+
+    A hidden state enters the equation of a state before it, alone or times one of these. The first
+    one of a single measured state is its rate or its growth rate, and the next one enters the
+    equation of that. A relation that fixes the coefficient of such a term leaves no choice.
+    Raises ValueError if the library has no term for a hidden state.
+    """
+    choices, before = [], list(measured)
+    for name in hidden:
+        own = _linear_in(library, name, before)
+        shown = before[1:] if len(measured) == 1 and len(before) > 1 else before
+        offered = [
+            Entrance(name, state, library.names[k])
+            for state in shown
+            for k in np.flatnonzero(own & (library.degrees <= 2)).tolist()
+        ]
+        given = [e for r in relations if (e := _fixed_by(r, name, library, own, before))]
+        if not (given or offered):
+            raise ValueError(
+                f"a hidden state must have a term in the library, alone or times one of {before}: "
+                f"{name!r} has none in {list(library.names)}; add one, or leave the state out"
+            )
+        choices.append(given[:1] or offered)
+        before.append(name)
+    return list(product(*choices))
+
+
+def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]]:
+    """Tasks without hidden states, one for every way in: guesses stand among the samples.
+
+    They come in groups, the most natural first; the next group counts if no way of it fits. A
+    single measured state that is positive has a growth rate, whose equation keeps it positive; one
+    that takes either sign has a rate. A task without hidden states is its own.
+    """
+    if not task.hidden:
+        yield [(task, ())]
+        return
+    measured = task.runs[0].state_names
+    found = entrances(task.library, measured, task.hidden, task.relations)
+    groups = [list(ways) for _, ways in groupby(found, key=lambda ways: ways[0])]
+    if len(measured) > 1:
+        groups = [found]
+    elif all(is_positive(run.t, run.states[:, 0]) for run in task.runs):
+        groups = sorted(groups, key=lambda ways: ways[0][0].term == task.hidden[0])
+    for group in groups:
+        yield [(_guessed(task, ways), ways) for ways in group]
+
+
+def _guessed(task: Task, ways: Sequence[Entrance]) -> Task:
+    """The task with guesses of its hidden states, whose scales are fixed by relations.
+
+    The equation of a single measured state has one term, unless a relation says how it is entered.
+    """
+    first, *_ = ways
+    is_rate = len(task.runs[0].state_names) == 1 and not first.given
+    return replace(
+        task,
+        runs=[with_guess(run, task.library, ways) for run in task.runs],
+        relations=(*task.relations, *(way.relation for way in ways if not way.given)),
+        terms={**({first.state: (first.term,)} if is_rate else {}), **task.terms},
+        hidden=(),
+    )
+
+
+def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> Trajectory:
+    """A run with a first guess of its hidden states.
+
+    Each one explains what a regression on the states before it leaves of the rate that it enters.
+    The rate of a single measured state is left to its hidden state as a whole.
+    """
+    known, rates = _smooth(run)
+    whole = run.state_names[0] if len(run.state_names) == 1 else ""
+    units = dict(run.units)
+    for way in ways:
+        rate, units = rates[way.state], units | {way.hidden: _unit(way, library, units)}
+        if way.state != whole:
+            terms = _evaluate(library, _linear_in(library, "", list(known)), known)
+            size = column_norms(terms)
+            rate = rate - terms @ (np.linalg.lstsq(terms / size, rate, rcond=None)[0] / size)
+        one = known | {way.hidden: np.ones(run.n_samples)}
+        row = np.arange(len(library)) == library.index(way.term)
+        factor = way.coefficient * _evaluate(library, row, one)[:, 0]
+        known, rates = _grown(run, known, rates, way.hidden, _quotient(rate, factor))
+    return _filled(run, known, units)
+
+
+def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
+    """A run with the states that it lacks, as the equations of a model tell them from its rates.
+
+    Raises ValueError for a state that shows in no equation of the states before it.
+    """
+    hidden = [name for name in model.states if name not in run.state_names]
+    known, rates = _smooth(run)
+    for name in hidden:
+        shows = model.coef[_with(model.library, name)].any(axis=0)
+        found = [s for s, shown in zip(model.states, shows, strict=True) if shown and s in known]
+        if not found:
+            raise ValueError(
+                f"a state that the record lacks must enter the equation of one that it has: "
+                f"{name!r} enters none of {list(known)}; measure it"
+            )
+        column = list(model.states).index(found[0])
+        here = {n: known.get(n, np.zeros(run.n_samples)) for n in model.library.variables}
+        values = np.stack([here[n] for n in model.library.variables], axis=1)
+        place = list(model.library.variables).index(name)
+        slope = model.library.jacobian(values)[place] @ model.coef[:, column]
+        rest = rates[found[0]] - model.library.evaluate(values) @ model.coef[:, column]
+        known, rates = _grown(run, known, rates, name, _quotient(rest, slope))
+    return _filled(run, known, dict(run.units) | {n: model.units.get(n, "1") for n in hidden})
+
+
+def _smooth(run: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Smoothed states and the inputs, by name, and the rates of the states."""
+    found = KalmanSmoother().estimate(run.t, run.states)
+    known = dict(zip(run.state_names, found.smoothed.T, strict=True))
+    inputs = dict(zip(run.input_names, run.inputs.T, strict=True))
+    return known | inputs, dict(zip(run.state_names, found.derivative.T, strict=True))
+
+
+def _grown(
+    run: Trajectory, known: Columns, rates: Columns, name: str, values: np.ndarray
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The known states and rates, and one state more."""
+    rate = make_interp_spline(run.t, values, k=3).derivative()(run.t)
+    return {**known, name: values}, {**rates, name: rate}
+
+
+def _quotient(
+    rate: Float[np.ndarray, " samples"], factor: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, " samples"]:
+    """Their quotient, drawn to its mean where the factor is small."""
+    square = np.square(factor)
+    least, mean = LEAST_FACTOR * square.mean(), (rate @ factor) / square.sum()
+    return (rate * factor + least * mean) / (square + least)
+
+
+def _filled(run: Trajectory, known: Columns, units: Mapping[str, str]) -> Trajectory:
+    """The run with more states; those that were measured as they were."""
+    more = [name for name in known if name not in run.names]
+    return replace(
+        run,
+        states=np.column_stack([run.states, *(known[name] for name in more)]),
+        state_names=(*run.state_names, *more),
+        units=units,
+    )
+
+
+def _with(library: Library, name: str) -> Bool[np.ndarray, " terms"]:
+    """Terms that hold a variable."""
+    own = [variable == name for variable in library.variables]
+    own += [function.variable == name for function in library.functions]
+    return np.asarray(library.exponents[:, own].any(axis=1))
+
+
+def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:
+    """Terms that are this variable times others alone; for no name, terms of the others."""
+    found = np.ones(len(library), dtype=np.bool_)
+    for variable in library.variables:
+        if variable not in (name, *others):
+            found &= ~_with(library, variable)
+    if name:
+        functions = [f.variable == name for f in library.functions]
+        power = library.exponents[:, [v == name for v in library.variables]].sum(axis=1)
+        found &= power == 1
+        found &= ~library.exponents[:, len(library.variables) :][:, functions].any(axis=1)
+    return found
+
+
+def _evaluate(
+    library: Library, rows: Bool[np.ndarray, " terms"], known: Columns
+) -> Float[np.ndarray, "samples rows"]:
+    own = library.take(rows).over(list(known))
+    return own.evaluate(np.stack(list(known.values()), axis=1))
+
+
+def _fixed_by(
+    relation: Relation,
+    hidden: str,
+    library: Library,
+    own: Bool[np.ndarray, " terms"],
+    before: Sequence[str],
+) -> Entrance | None:
+    """The entrance whose coefficient a relation fixes; None if it fixes none."""
+    if len(relation.factors) != 1 or not relation.value:
+        return None
+    factor, state, term = relation.factors[0]
+    if state not in before or not own[library.index(term)]:
+        return None
+    return Entrance(hidden, state, term, relation.value / factor, given=True)
+
+
+def _unit(way: Entrance, library: Library, units: Mapping[str, str]) -> str:
+    """Unit of a hidden state whose term has a coefficient without unit."""
+    factor = library.terms[library.index(way.term)].unit({**units, way.hidden: "1"})
+    return unit_product([(units[way.state], 1), ("s", -1), (factor, -1)])

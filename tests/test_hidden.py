@@ -1,0 +1,196 @@
+"""Hidden states: laws of states that nobody measured, found from those that were."""
+
+import json
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from ep2sindy.app.runner import run_config
+from ep2sindy.data.coerce import Task
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
+from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian, observe
+from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.library.relations import relations_of
+from tests.programs import composed
+
+PLANE = ep.lotka_volterra()
+# Of the prey alone, with its growth rate g = 2/3 - y: insert y = 2/3 - g into the second equation.
+GROWTH = {"1": 2.0 / 9.0, "x": -2.0 / 3.0, "g": -1.0 / 3.0, "x*g": 1.0}
+
+
+def only(name: str, *, noise: float = 0.05, system: ep.systems.System = PLANE) -> Trajectory:
+    full = system.trajectory(noise=noise, rng=0)
+    return Trajectory(full.t, full.columns([name]), [name], units={name: "m^-3"})
+
+
+@pytest.fixture(scope="module")
+def found() -> ep.Discovery:
+    return ep.discover(only("x"), hidden=["g"])
+
+
+def test_the_law_of_one_species_alone(found: ep.Discovery) -> None:
+    assert found.misfit == ""
+    assert found.model.terms("x") == {"x*g": 1.0}
+    own = found.model.terms("g")
+    assert set(own) == set(GROWTH)
+    assert own == pytest.approx(GROWTH, rel=0.05)
+    held = [low <= GROWTH[term] <= high for term, (low, high) in found.model.intervals("g").items()]
+    assert sum(held) >= 3
+    assert "g was not measured: its scale is such that x' has the term x*g" in found.remarks[0]
+
+
+def test_the_hidden_state_is_what_it_stands_for(found: ep.Discovery) -> None:
+    (run,) = found.estimate.runs
+    truth = 2.0 / 3.0 - PLANE.trajectory().columns(["y"])
+    assert run.state_names == ("x", "g")
+    assert run.columns(["x"]) == pytest.approx(only("x").states, rel=1e-12)
+    assert np.abs(run.columns(["g"]) - truth).max() < 0.05 * truth.std()
+    assert run.units["g"] == "s^-1"
+    assert np.isnan(found.estimate.noise_std[1])
+    assert found.estimate.noise_std[0] == pytest.approx(0.05 * 0.464, rel=0.1)
+
+
+def test_a_signal_of_either_sign_shows_its_derivative() -> None:
+    run = only("x", system=ep.systems.van_der_pol())  # as Lienard writes it: y' = x / 2
+    model = ep.discover(run, ep.polynomial(["x", "w"], degree=3), hidden=["w"]).model
+    assert model.terms("x") == {"w": 1.0}
+    law = {"x": -1.0, "w": 2.0, "x^2*w": -2.0}  # the second derivative of x
+    assert dict(model.terms("w")) == pytest.approx(law, rel=0.05)
+
+
+def test_the_model_tells_the_hidden_states_of_a_record() -> None:
+    system = ep.lorenz()
+    truth, states = (
+        system.trajectory(),
+        ep.estimate_states(system.model, only("x", system=system).window(0, 1500)),
+    )
+    assert states.state_names == ("x", "y", "z")
+    for name in "yz":
+        clean = truth.columns([name])[:1500]
+        assert np.abs(states.columns([name]) - clean).std() < 0.02 * clean.std()
+
+
+def test_forecasts_need_the_measured_states_alone(found: ep.Discovery) -> None:
+    run = only("x")
+    ahead = ep.forecast(found.model, run.window(0, 800), 10.0)
+    low, high = (side[:, 0] for side in ahead.band())
+    after = run.states[800 : 800 + len(low), 0]
+    assert 0.8 < np.mean((low <= after) & (after <= high)) <= 1.0
+    assert np.isnan(ahead.noise_std[1])
+    skill = ep.forecast_skill(found.model, run, n_fitted=750, starts=10)
+    assert np.mean(skill.nrmse["model"]) < 0.5 * np.mean(skill.nrmse["persistence"])
+    assert 0.75 <= skill.coverage_90 <= 1.0
+
+
+def test_the_experiment_finds_it_too(tmp_path) -> None:
+    path, run = tmp_path / "prey.csv", only("x")
+    table = np.column_stack([run.t, run.states])
+    np.savetxt(path, table, delimiter=",", header="time,x", comments="")
+    given = ["+exp=discover", "data=recognised", f"data.path={path}", "trajectory.states=[x]"]
+    folder = run_config(composed(*given, "hidden=[g]", "forecasts=4", f"output={tmp_path}")).folder
+    summary = json.loads((folder / "summary.json").read_text())["models"]["model"]
+    assert set(summary["equations"]["g"]["terms"]) == set(GROWTH)
+    assert list(summary["estimate"]["noise_std"]) == ["x"]
+    with pytest.raises(ValueError, match="one library and without living"):
+        run_config(composed("+exp=breathing", "+hidden=[g]", f"output={tmp_path}"))
+
+
+# How hidden states may enter.
+
+
+def test_ways_in_from_one_state() -> None:
+    library = ep.polynomial(["x", "v", "h"], degree=2)
+    ways = entrances(library, ["x"], ["v", "h"], ())
+    assert {way.term for way, _ in ways} == {"v", "x*v"}
+    assert {(way.state, way.term) for _, way in ways} == {("v", "h"), ("v", "x*h"), ("v", "v*h")}
+    assert len(ways) == 6
+
+
+def test_ways_in_from_two_states_and_by_a_relation() -> None:
+    library = ep.polynomial(["x", "y", "z"], degree=2)
+    ways = entrances(library, ["x", "y"], ["z"], ())
+    terms = {"z", "x*z", "y*z"}
+    assert {(w.state, w.term) for (w,) in ways} == {(s, t) for s in "xy" for t in terms}
+    fixed = relations_of(["2 * y: x*z == -4"])
+    assert entrances(library, ["x", "y"], ["z"], fixed) == [
+        (Entrance("z", "y", "x*z", -2.0, given=True),)
+    ]
+    with pytest.raises(ValueError, match="'z' has none in"):
+        entrances(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"], ())
+
+
+def test_growth_rates_come_first_where_a_state_is_positive() -> None:
+    library = ep.polynomial(["x", "g"], degree=2)
+    for shift, first in ((0.0, "x*g"), (-1.0, "g")):
+        run = only("x")
+        moved = Trajectory(run.t, run.states + shift, ["x"])
+        groups = list(with_guesses(Task([moved], library, hidden=["g"])))
+        ((known, ways),) = groups[0]
+        assert ways[0].term == first
+        assert known.terms == {"x": (first,)}
+        assert known.hidden == ()
+
+
+def test_guesses_are_exact_without_noise() -> None:
+    run, library = only("x", noise=0.0), ep.polynomial(["x", "g"], degree=2)
+    truth = 2.0 / 3.0 - PLANE.trajectory().columns(["y"])[:, 0]
+    guess = with_guess(run, library, [Entrance("g", "x", "x*g")]).columns(["g"])[:, 0]
+    inner = slice(20, -20)
+    # The division is held back a little where the factor is small.
+    assert np.corrcoef(guess[inner], truth[inner])[0, 1] > 0.98
+    other = with_guess_by(PLANE.model, run)
+    assert np.corrcoef(other.columns(["y"])[inner, 0], truth[inner])[0, 1] < -0.98
+
+
+# The likelihood without the samples of a state.
+
+
+def test_what_was_not_measured_counts_nothing() -> None:
+    run = PLANE.trajectory(noise=0.05, rng=0).window(0, 40)
+    library = ep.polynomial(["x", "y"], degree=2)
+    problem = scale_problem([run], library, measured=["x"])
+    (record,) = problem.records
+    path, ones = record.samples + 0.1, np.ones((40, 2))
+    seen = observe(record, path, ones)
+    assert np.isnan(seen.residuals[:, 1]).all()
+    assert seen.squares[:, 0] == pytest.approx(0.01)
+    assert not seen.squares[:, 1].any()
+    assert problem.n_squares == 40
+    free = np.zeros(problem.C.shape[1])
+    fit = TrajectoryFit((path,), free, np.ones(len(free), dtype=bool), np.zeros(2))
+    level = Level((0.1 * ones,), 1.0)
+    everything = np.ones(len(free), dtype=bool)
+
+    def flow(record, path):
+        return problem.flow(record, path[:-1], free, everything, 1)
+
+    least = hessian(problem, fit, level, flow)[2]
+    moved = scale_problem([run], library, measured=["x"])
+    far = moved.records[0].samples.copy()
+    far[:, 1] += 5.0  # the guess of a hidden state is no sample
+    object.__setattr__(moved.records[0], "samples", far)
+    assert hessian(moved, fit, level, flow)[2] == pytest.approx(least)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has: .'x'. came with"),
+        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "hidden states must differ"),
+        (lambda: ep.discover(only("x"), hidden="g"), "hidden"),
+        (
+            lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
+            "a regression needs samples of every state",
+        ),
+        (
+            lambda: ep.estimate_states(PLANE.model, Trajectory(np.arange(30.0), [[k % 7.0] for k in
+                                                               range(30)], ["a"])),
+            "some of the model's states",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_hidden_is_refused(call, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
