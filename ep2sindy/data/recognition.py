@@ -119,6 +119,13 @@ def _axis(
         options = [each for each in rising if is_of(each.unit, unit)]
         if not options and source.is_table and rising and rising[0] is held[0]:
             options = rising[:1]  # an increasing first column of a table is its time
+    if not options and axis == "time":
+        questions += [
+            f"{each.name!r} does not increase ({each.falls}): sort the rows, drop what repeats, or "
+            "give dt_s if the steps are equal and the times rounded"
+            for each in held
+            if each.falls and axis in meant_by(each.name)
+        ]
     exact = [each for each in options if each.name == axis] or options
     if len(exact) > 1:
         names = " or ".join(repr(each.name) for each in exact)
@@ -366,8 +373,8 @@ class ArrayInfo:
 
     unit: "" if the file states none. low, high: range of the finite values. size: median magnitude
     of the nonzero values. n_missing: number of NaN or infinite values. step: mean step of an
-    increasing vector, else None. even: True if the steps are equal. problem: reason why the array
-    cannot be used, or "".
+    increasing vector, else None. even: True if the steps are equal. falls: where a vector first
+    does not increase, in words. problem: reason why the array cannot be used, or "".
     """
 
     name: str
@@ -381,6 +388,7 @@ class ArrayInfo:
     n_missing: int = 0
     step: float | None = None
     even: bool = False
+    falls: str = ""
     problem: str = ""
 
     @property
@@ -404,12 +412,20 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
-        typical(values), int(values.size - finite.size), step, even,
+        typical(values), int(values.size - finite.size), step, even, _fall(finite, step),
     )  # fmt: skip
 
 
 def _short(text: str) -> str:
     return TEXT if "real numbers" in text else text
+
+
+def _fall(points: np.ndarray, step: float | None) -> str:
+    """Where points first do not increase, in words; empty if they do."""
+    if step is not None or not (np.diff(points) <= 0.0).any():
+        return ""
+    k = int(np.argmax(np.diff(points) <= 0.0))
+    return f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
 
 
 def _step(points: np.ndarray) -> tuple[float | None, bool]:

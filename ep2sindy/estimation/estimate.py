@@ -170,7 +170,7 @@ def estimate_task(
     check_size(task.runs, task.library, task.terms)
     with progress.stage(None, "step", "states and coefficients") as advance:
         best = []
-        for group in with_guesses(task):
+        for group in with_guesses(task) if task.hidden else [[(task, ())]]:
             tried = [_try(task, *each, max_terms, align, advance) for each in group]
             best.append(min(tried, key=lambda each: each[0].rank))
             if not best[-1][0].misfit:

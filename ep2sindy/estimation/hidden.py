@@ -72,7 +72,9 @@ def entrances(
     """
     choices, before = [], list(measured)
     for name in hidden:
-        own = _linear_in(library, name, before)
+        own = np.zeros(len(library), dtype=np.bool_)
+        if name in library.variables:
+            own = _linear_in(library, name, before)
         shown = before[1:] if len(measured) == 1 and len(before) > 1 else before
         offered = [
             Entrance(name, state, library.names[k])
@@ -95,11 +97,8 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
 
     They come in groups, the most natural first; the next group counts if no way of it fits. A
     single measured state that is positive has a growth rate, whose equation keeps it positive; one
-    that takes either sign has a rate. A task without hidden states is its own.
+    that takes either sign has a rate.
     """
-    if not task.hidden:
-        yield [(task, ())]
-        return
     measured = task.runs[0].state_names
     found = entrances(task.library, measured, task.hidden, task.relations)
     groups = [list(ways) for _, ways in groupby(found, key=lambda ways: ways[0])]
@@ -212,9 +211,14 @@ def _filled(run: Trajectory, known: Columns, units: Mapping[str, str]) -> Trajec
 
 def _with(library: Library, name: str) -> Bool[np.ndarray, " terms"]:
     """Terms that hold a variable."""
-    own = [variable == name for variable in library.variables]
-    own += [function.variable == name for function in library.functions]
+    own = [library.variables.index(name), *_functions_of(library, name)]
     return np.asarray(library.exponents[:, own].any(axis=1))
+
+
+def _functions_of(library: Library, name: str) -> list[int]:
+    """Columns of a library's exponents that are functions of a variable."""
+    n = len(library.variables)
+    return [n + k for k, function in enumerate(library.functions) if function.variable == name]
 
 
 def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:
@@ -224,10 +228,8 @@ def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.nd
         if variable not in (name, *others):
             found &= ~_with(library, variable)
     if name:
-        functions = [f.variable == name for f in library.functions]
-        power = library.exponents[:, [v == name for v in library.variables]].sum(axis=1)
-        found &= power == 1
-        found &= ~library.exponents[:, len(library.variables) :][:, functions].any(axis=1)
+        found &= library.exponents[:, library.variables.index(name)] == 1
+        found &= ~library.exponents[:, _functions_of(library, name)].any(axis=1)
     return found
 
 
