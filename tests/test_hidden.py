@@ -11,6 +11,7 @@ from ep2sindy.data.coerce import Task
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian, observe
+from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.library.relations import relations_of
 from tests.programs import composed
@@ -95,6 +96,21 @@ def test_the_experiment_finds_it_too(tmp_path) -> None:
     assert list(summary["estimate"]["noise_std"]) == ["x"]
     with pytest.raises(ValueError, match="one library and without living"):
         run_config(composed("+exp=breathing", "+hidden=[g]", f"output={tmp_path}"))
+
+
+def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
+    run = PLANE.trajectory(noise=0.05, rng=0)
+    problem = scale_problem([run], ep.polynomial(["x", "y"], degree=2), measured=["x"])
+    sizes = []
+    for factor in (1.0, 1e-6):
+        path = problem.records[0].samples * [1.0, factor]
+        free = np.zeros(problem.C.shape[1])
+        fit = TrajectoryFit((path + np.array([0.05, 0.0]),), free, free != 0.0, np.zeros(2))
+        noise = noise_beside(problem, fit)
+        sizes.append(noise.white[0][0])
+        assert noise.kurtosis[1] != noise.kurtosis[1]  # NaN: there is no noise of it
+    assert sizes[1][0] == sizes[0][0]
+    assert sizes[1][1] == pytest.approx(1e-6 * sizes[0][1])
 
 
 # How hidden states may enter.

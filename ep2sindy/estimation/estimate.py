@@ -183,23 +183,13 @@ def estimate_task(
 
 
 def _try(
-    task: Task,
-    known: Task,
-    ways: Sequence[Entrance],
-    max_terms: int,
-    align: bool,
-    advance: Advance,
+    task: Task, known: Task, ways: Sequence[Entrance], max_terms: int, align: bool, advance: Advance
 ) -> tuple[_Reported, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
-    problem = scale_problem(
-        known.runs,
-        known.library,
-        known.relations,
-        known.terms,
-        measured=task.runs[0].state_names,
-        advance=advance,
-    )
+    given = known.runs, known.library, known.relations, known.terms
+    measured = task.runs[0].state_names
+    problem = scale_problem(*given, measured=measured, advance=advance)
     found = _answer(problem, max_terms, align=align)
     return replace(found, said=(*(way.words for way in ways), *found.said)), known.runs
 
@@ -209,7 +199,7 @@ def _with_path(answer: _Reported, number: int, run: Trajectory) -> Trajectory:
     problem, fit = answer.problem, answer.found.annealed.fit
     record = problem.records[number]
     states = np.where(problem.measured, record.samples, fit.paths[number]) * problem.scale
-    kept = np.searchsorted((run.t - run.t[0]) / problem.step_s, record.times - 0.5)
+    kept = np.isin((run.t - run.t[0]) / problem.step_s, record.times)
     return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept])
 
 
@@ -273,21 +263,33 @@ class _Reported:
 def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Reported:
     most, none = max_terms_for(problem, max_terms), np.zeros(len(problem.states))
     found, late = solve(problem, max_terms=most)
+    if late is None and found.fits:
+        return _Reported(problem, found, _at_limit(problem, found, max_terms), none, none)
     if late is None:
-        if not found.fits and (pushed := solve_pushed(problem, max_terms=most)).explains:
-            exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=most)
-            if exact.fits:  # the pushes were needed on the way alone
-                return _Reported(problem, exact, _at_limit(problem, exact, max_terms), none, none)
-            found, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
-            misfit = _at_limit(problem, found, max_terms)
-            return _Reported(problem, found, misfit, none, pushed.errors.process, (said,))
-        misfit = _misfit(problem, found) or _at_limit(problem, found, max_terms)
-        return _Reported(problem, found, misfit, none, none)
+        return _under_pushes(problem, found, max_terms)
     if not align:
         return _Reported(problem, found, late_words(problem, late), late.delays, none)
     said = f"{delay_words(problem, late.delays)}: brought together with the others"
     misfit = _at_limit(late.problem, late.solution, max_terms)
     return _Reported(late.problem, late.solution, misfit, late.delays, none, (said,))
+
+
+def _under_pushes(problem: EstimationProblem, found: Solution, max_terms: int) -> _Reported:
+    """What random pushes explain; the exact solution near it, or the one that did not fit."""
+    none = np.zeros(len(problem.states))
+    misfit = _Reported(problem, found, _misfit(problem, found), none, none)
+    most = max_terms_for(problem, max_terms)
+    pushed = solve_pushed(problem, max_terms=most)
+    if not pushed.explains:
+        return misfit
+    exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=most)
+    if exact.fits:  # the pushes were needed on the way alone
+        return _Reported(problem, exact, _at_limit(problem, exact, max_terms), none, none)
+    if not problem.measured.all():  # a hidden state that is pushed explains whatever there is
+        return misfit
+    found, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
+    limit = _at_limit(problem, found, max_terms)
+    return _Reported(problem, found, limit, none, pushed.errors.process, (said,))
 
 
 def check_runs(task: Task) -> None:

@@ -58,7 +58,8 @@ class Noise:
     @property
     def white(self) -> tuple[np.ndarray, ...]:
         """Standard deviations, for each record (samples, d)."""
-        return tuple(np.maximum(self.std * shape, FLOOR) for shape in self.shape)
+        least = np.minimum(self.std, FLOOR)  # a hidden state may be smaller
+        return tuple(np.maximum(self.std * shape, least) for shape in self.shape)
 
     @property
     def effective(self) -> tuple[np.ndarray, ...]:
@@ -80,7 +81,9 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     per_state = fit.support.sum() / len(problem.states) + len(left)
     freedom = np.sqrt(n / max(n - per_state, 1.0))
     std = freedom * np.sqrt(sum(np.square(e).sum(axis=0) for e in left) / n)
-    std[hidden] = std[~hidden].mean()  # how freely a hidden state may leave the flow
+    # How freely hidden states may leave the flow: as others do, however small they have become.
+    sizes = np.sqrt(np.mean([np.square(path).mean(axis=0) for path in fit.paths], axis=0))
+    std[hidden] = std[~hidden].mean() * sizes[hidden]
     shape, growth = _shapes(fit.paths, left)
     limited = problem.limited
     if (limited | hidden).any():
@@ -94,7 +97,7 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     memory = _memory(unit)
     shows = (memory > SIGNIFICANT / np.sqrt(n)) & (std > FLOOR)
     believed = shows & _forgets(unit, memory) & _shown_by_samples(problem, fit, std, memory)
-    std = np.maximum(std, FLOOR)
+    std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
     alike = np.square(std) + ALIKE_SAMPLES / n * np.square(std[~hidden]).mean()
     logs = n * np.log(alike) + sum(np.log(np.square(s)).sum(axis=0) for s in shape)
