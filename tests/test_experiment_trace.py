@@ -112,6 +112,7 @@ def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path:
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
     found = computed(composed(*glance(path, tmp_path, "degree=2")))
     assert set(found.summary["states"]) == {"2", "3"}
+    assert "+exp=discover 'trajectory.states=[I]' 'hidden=[v,h]'" in " ".join(found.log.split())
     set_to_two = computed(composed(*glance(path, tmp_path, "degree=2", "n_states=2")))
     assert set(set_to_two.summary["states"]) == {"2"}
 

@@ -201,12 +201,13 @@ def test_what_was_not_measured_counts_nothing() -> None:
             "a regression needs samples of every state",
         ),
         (
-            lambda: ep.estimate_states(PLANE.model, Trajectory(np.arange(30.0), [[k % 7.0] for k in
-                                                               range(30)], ["a"])),
+            lambda: ep.estimate_states(
+                PLANE.model, Trajectory(np.arange(30.0), np.arange(30.0)[:, None] % 7, ["a"])
+            ),
             "some of the model's states",
         ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_hidden_is_refused(call, message) -> None:
     with pytest.raises(ValueError, match=message):
         call()

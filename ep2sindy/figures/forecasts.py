@@ -46,7 +46,7 @@ def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
     _draw_errors(axes[0, -1], skill)
     baselines = axes[0, -1].lines[1 : len(skill.nrmse)]  # the first line is the model's
     handles = [*axes[0, 0].get_legend_handles_labels()[0], *baselines]
-    legend_above(figure, handles, size=8)
+    legend_above(figure, handles, size=8.0)
     return figure
 
 

@@ -118,6 +118,8 @@ class Study:
             run.warn(hint)
         if best.found.misfit:
             run.warn(best.found.misfit)
+        if not repeats(signal):
+            run.say(other_way(signal))
         with run.progress(None, "", "forecasts, free run and limit cycle"):
             return evaluate(signal, n_fitted, best, attempts, label=self.method.selection.label)
 
@@ -138,8 +140,7 @@ class Study:
         """Numbers of states to try; a signal of two states either repeats itself or spirals."""
         if self.n_states != "auto":
             return [int(self.n_states)]
-        repeats = signal.cycle is not None and signal.cycle.share >= REPEATS
-        return [2] if repeats else [2, 3]
+        return [2] if repeats(signal) else [2, 3]
 
     def _attempt(self, past: Trace, n_states: int, run: Run) -> Attempt:
         with run.progress(None, "", f"{n_states} states of the signal"):
@@ -223,6 +224,21 @@ def embeddings(harmonics: float, n_states: int) -> dict[str, AnyEmbedding]:
         "rate": Rate(harmonics, n_states),
         "delays": Delays(harmonics=harmonics, n_states=n_states),
     }
+
+
+def repeats(signal: Trace) -> bool:
+    """True if most of the signal is one cycle, again and again."""
+    return signal.cycle is not None and signal.cycle.share >= REPEATS
+
+
+def other_way(signal: Trace) -> str:
+    """What else to try with a signal that does not repeat itself, as chaos does not."""
+    first = "g" if signal.is_positive else "v"
+    return (
+        f"{signal.name} does not repeat itself: if little noise is in it, equations of states that "
+        f"nobody measured may explain all of it: +exp=discover 'trajectory.states=[{signal.name}]' "
+        f"'hidden=[{first},h]'"
+    )
 
 
 def lost_mean(signal: Trace) -> str | None:
