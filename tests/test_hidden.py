@@ -206,6 +206,10 @@ def test_what_was_not_measured_counts_nothing() -> None:
             ),
             "some of the model's states",
         ),
+        (
+            lambda: ep.estimate_states(ep.lorenz().model, only("z", system=ep.lorenz())),
+            "none of .'x', 'y'. does in those of .'z'.; measure one",
+        ),
     ],
 )
 def test_what_cannot_be_hidden_is_refused(call, message) -> None:

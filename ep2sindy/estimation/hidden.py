@@ -151,26 +151,42 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> T
 def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
     """A run with the states that it lacks, as the equations of a model tell them from its rates.
 
-    Raises ValueError for a state that shows in no equation of the states before it.
+    Raises ValueError if no equation of the known states tells one of the others alone.
     """
-    hidden = [name for name in model.states if name not in run.state_names]
     known, rates = _smooth(run)
-    for name in hidden:
-        shows = model.coef[_with(model.library, name)].any(axis=0)
-        found = [s for s, shown in zip(model.states, shows, strict=True) if shown and s in known]
-        if not found:
+    lacking = [name for name in model.states if name not in run.state_names]
+    units = dict(run.units) | {name: model.units.get(name, "1") for name in lacking}
+    while lacking:
+        told = (
+            (name, v) for name in lacking if (v := _told(model, name, known, rates)) is not None
+        )
+        name, values = next(told, ("", None))
+        if values is None:
             raise ValueError(
-                f"a state that the record lacks must enter the equation of one that it has: "
-                f"{name!r} enters none of {list(known)}; measure it"
+                f"states that a record lacks must show in the equations of those that it has, one "
+                f"at a time: none of {lacking} does in those of {list(rates)}; measure one of them"
             )
-        column = list(model.states).index(found[0])
-        here = {n: known.get(n, np.zeros(run.n_samples)) for n in model.library.variables}
-        values = np.stack([here[n] for n in model.library.variables], axis=1)
-        place = list(model.library.variables).index(name)
-        slope = model.library.jacobian(values)[place] @ model.coef[:, column]
-        rest = rates[found[0]] - model.library.evaluate(values) @ model.coef[:, column]
-        known, rates = _grown(run, known, rates, name, _quotient(rest, slope))
-    return _filled(run, known, dict(run.units) | {n: model.units.get(n, "1") for n in hidden})
+        known, rates = _grown(run, known, rates, name, values)
+        lacking.remove(name)
+    return _filled(run, known, units)
+
+
+def _told(
+    model: SparseModel, name: str, known: Columns, rates: Columns
+) -> Float[np.ndarray, " samples"] | None:
+    """A state by the first equation of a known state that it enters; None if it enters none.
+
+    States that are not known yet count as zero; the equation is linearised there.
+    """
+    variables = list(model.library.variables)
+    none = np.zeros(len(next(iter(known.values()))))
+    values = np.stack([known.get(variable, none) for variable in variables], axis=1)
+    slopes = model.library.jacobian(values)[variables.index(name)] @ model.coef
+    rest = model.library.evaluate(values) @ model.coef
+    for k, state in enumerate(model.states):
+        if state in rates and slopes[:, k].any():
+            return _quotient(rates[state] - rest[:, k], slopes[:, k])
+    return None
 
 
 def _smooth(run: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
