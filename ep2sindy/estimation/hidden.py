@@ -157,15 +157,14 @@ def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
     lacking = [name for name in model.states if name not in run.state_names]
     units = dict(run.units) | {name: model.units.get(name, "1") for name in lacking}
     while lacking:
-        told = (
-            (name, v) for name in lacking if (v := _told(model, name, known, rates)) is not None
-        )
-        name, values = next(told, ("", None))
-        if values is None:
+        told = {name: _told(model, name, known, rates) for name in lacking}
+        shown = [(name, values) for name, values in told.items() if values is not None]
+        if not shown:
             raise ValueError(
                 f"states that a record lacks must show in the equations of those that it has, one "
                 f"at a time: none of {lacking} does in those of {list(rates)}; measure one of them"
             )
+        name, values = shown[0]
         known, rates = _grown(run, known, rates, name, values)
         lacking.remove(name)
     return _filled(run, known, units)
