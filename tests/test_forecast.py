@@ -243,3 +243,13 @@ def test_a_gap_is_no_obstacle() -> None:
 def test_what_cannot_be_forecast_is_refused(call, message) -> None:
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_model_that_runs_away_forecasts_without_breaking() -> None:
+    wild = replace(LORENZ.model, coef=1e6 * LORENZ.model.coef)
+    run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 300)
+    end = track(wild, run).end_of(run)
+    assert np.isfinite(end.mean).all()
+    assert np.isfinite(end.covariance).all()
+    ahead = ep.forecast(wild, run, 0.05, n_draws=10)
+    assert ahead.diverged > 0.5

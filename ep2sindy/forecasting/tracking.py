@@ -99,8 +99,11 @@ class Tracker:
         path = self.approach(record, record.samples.copy(), samples, process)
         variances = error_variances(len(path), samples, process)
         _, mean, covariance = filtered(*self.linear(record, path), *variances, FREE_START)
-        scale = self.problem.scale
-        return FittedState(scale * (path[-1] + mean), np.outer(scale, scale) * covariance)
+        end, scale = path[-1] + mean, self.problem.scale
+        if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
+            # The model runs away between two samples: they tell no more than a guess does.
+            end, covariance = record.samples[-1], FREE_START * np.eye(len(scale))
+        return FittedState(scale * end, np.outer(scale, scale) * covariance)
 
     def along(self, run: Trajectory) -> Trajectory:
         """All states of the model along a run, fitted to the measured ones under the errors."""
@@ -132,7 +135,8 @@ class Tracker:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Derivatives of the flow, its misses, and residuals, NaN where nothing was measured."""
         none = np.zeros(len(self.free), dtype=np.bool_)
-        flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
+        with np.errstate(over="ignore", invalid="ignore"):
+            flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
         residuals = observe(record, path, np.ones_like(path)).residuals
         return np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals
 
