@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -287,13 +288,15 @@ SHOWN_LAWS: dict[str, tuple[ep.systems.System, str, dict[str, dict[str, float]]]
 def hidden() -> None:
     """One measured state, the others hidden: laws found, and forecasts over the next cycles."""
     for words, (system, name, law) in SHOWN_LAWS.items():
-        right, nearer, inside, held = 0, 0, [], []
+        right, nearer, inside, held, cpu_s = 0, 0, [], [], []
         n = round(system.duration_s * system.rate_Hz)
         longer = replace(system, duration_s=1.6 * system.duration_s)
         for seed in range(N_DRAWS):
             full = longer.trajectory(noise=0.05, rng=seed)
             run = ep.Trajectory(full.t, full.columns([name]), [name])
+            begin_s = time.process_time()
             found = ep.discover(run.window(0, n), hidden=list(law))
+            cpu_s.append(time.process_time() - begin_s)
             if all(set(found.model.terms(s)) == set(terms) for s, terms in law.items()):
                 right += 1
                 inside += [
@@ -310,7 +313,8 @@ def hidden() -> None:
             f"{words}, 5 % noise: law right in {right} of {N_DRAWS}, {sum(inside)} of "
             f"{len(inside)} intervals hold; nearer than the autoregression over {N_CYCLES} "
             f"cycles in {nearer}, bands of 90 % hold {100 * np.mean(held):.1f} % "
-            f"({100 * min(held):.0f} to {100 * max(held):.0f})",
+            f"({100 * min(held):.0f} to {100 * max(held):.0f}); a search takes "
+            f"{np.median(cpu_s):.2g} CPU-s",
             flush=True,
         )
     for voltage, flow in POINTS:

@@ -253,3 +253,16 @@ def test_a_model_that_runs_away_forecasts_without_breaking() -> None:
     assert np.isfinite(end.covariance).all()
     ahead = ep.forecast(wild, run, 0.05, n_draws=10)
     assert ahead.diverged > 0.5
+
+
+def test_rounded_samples_are_compared_as_they_are() -> None:
+    run = spring(0.0)
+    step = 0.2 * run.states.std()
+    rounded = Trajectory(run.t, step * np.round(run.states / step), run.state_names)
+    tracker = track(SPRING, rounded)
+    (record,) = tracker.problem.records
+    assert record.limits is not None
+    path = record.samples + 0.1
+    assert tracker.linear(record, path)[2] == pytest.approx(-0.1)
+    skill = ep.forecast_skill(SPRING, rounded, n_fitted=900, starts=10)
+    assert np.mean(skill.nrmse["model"]) < 0.1

@@ -287,3 +287,15 @@ def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> N
     found = ep.inspect_file(tmp_path / "a.npz")
     signals = [name for name, variable in found.variables.items() if found.is_trace(variable)]
     assert signals == ["I_d"]
+
+
+def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
+    back = tmp_path / "back.csv"
+    back.write_text("time,x\n0,1\n1,2\n2,0\n1.5,3\n2.5,1\n")
+    with pytest.raises(ValueError, match=r"'time' does not increase \(1.5 follows 2 at row 4\)"):
+        ep.open_field(back)
+    rounded = tmp_path / "rounded.csv"
+    rounded.write_text("time,x\n99.9,1\n100,2\n100,0\n100,3\n101,1\n")
+    with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3\).*give dt_s"):
+        ep.open_field(rounded)
+    assert list(ep.open_field(rounded, dt_s=0.1)["x"].values) == [1, 2, 0, 3, 1]

@@ -407,12 +407,14 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     finite = values[np.isfinite(values)]
     stated = counted_in(str(array.attrs.get("units", "") or source.units.get(name, "")))
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
-    step, even = _step(values.ravel()) if values.size in values.shape else (None, False)
+    is_vector = values.size in values.shape
+    step, even = _step(values.ravel()) if is_vector else (None, False)
     return ArrayInfo(
         name, values.shape, str(array.dtype), stated, dims,
         float(finite.min()) if finite.size else np.nan,
         float(finite.max()) if finite.size else np.nan,
-        typical(values), int(values.size - finite.size), step, even, _fall(finite, step),
+        typical(values), int(values.size - finite.size), step, even,
+        _fall(values.ravel()) if is_vector else "",
     )  # fmt: skip
 
 
@@ -420,11 +422,12 @@ def _short(text: str) -> str:
     return TEXT if "real numbers" in text else text
 
 
-def _fall(points: np.ndarray, step: float | None) -> str:
+def _fall(points: np.ndarray) -> str:
     """Where points first do not increase, in words; empty if they do."""
-    if step is not None or not (np.diff(points) <= 0.0).any():
+    falls = np.flatnonzero(np.diff(points) <= 0.0)
+    if not falls.size:
         return ""
-    k = int(np.argmax(np.diff(points) <= 0.0))
+    k = int(falls[0])
     return f"{points[k + 1]:.9g} follows {points[k]:.9g} at row {k + 2}"
 
 

@@ -121,14 +121,15 @@ def discover(
     The method makes candidates, chooses one per equation, and fits it: a `TrajectorySearch` by the
     likelihood of whole trajectories, a `Regression` by rows.
     runs: one run or a list: Trajectory, DataFrame or (t, x), see `trajectories_of`. library: None
-    means every product of the variables of the first run up to degree 2. method: None means
-    TrajectorySearch(), the best method we know for noisy data. relations: between coefficients,
-    such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search, in the selection and in
-    the model. terms: for each state whose equation is known but for its coefficients, all terms of
-    that equation. roles: of terms, for equations that conserve what states exchange (`Roles`); for
-    a `Regression` by FreeRunScore or RefinedScore. hidden: names of states that nobody measured;
-    they and their equations are found with the others', by a `TrajectorySearch`. progress: True
-    shows bars. recipe: the old name of method, for one more version.
+    means every product of the first run's variables and of hidden states up to degree 2. method:
+    None means TrajectorySearch(), the best method we know for noisy data. relations: between
+    coefficients, such as "x: x*y == -1 * y: x*y" or "x: y == 1"; they hold in the search, in the
+    selection and in the model. terms: for each state whose equation is known but for its
+    coefficients, all terms of that equation. roles: of terms, for equations that conserve what
+    states exchange (`Roles`); for a `Regression` by FreeRunScore or RefinedScore. hidden: names of
+    states that nobody measured; they and their equations are found with the others', by a
+    `TrajectorySearch`. progress: True shows bars. recipe: the old name of method, for one more
+    version.
     Raises ValueError for a relation, term or role that the library or the states do not have, roles
     that the method cannot keep, runs whose states or units differ, states or samples that repeat.
     """

@@ -473,25 +473,26 @@ def _of_noise(problem: EstimationProblem, noise: Noise) -> list[str]:
 
 
 def _of_collinear_states(problem: EstimationProblem, noise: Noise) -> list[str]:
-    """Remark on states of which a linear combination varies no more than their noise."""
-    d, n = len(problem.states), problem.n_samples
-    if d < 2 or noise.unexplained.any():
+    """Remark on measured states of which a linear combination varies no more than their noise."""
+    own, n = np.flatnonzero(problem.measured), problem.n_samples
+    if len(own) < 2 or noise.unexplained.any():
         return []  # the residuals then hold model error, perhaps as large as the states
-    samples = np.concatenate([record.samples for record in problem.records])
-    variance, directions = np.linalg.eigh(np.cov(samples / noise.std, rowvar=False))
+    samples = np.concatenate([record.samples for record in problem.records])[:, own]
+    std, scale = noise.std[own], problem.scale[own]
+    variance, directions = np.linalg.eigh(np.cov(samples / std, rowvar=False))
     if variance[0] > 1.0 + COLLINEAR * np.sqrt(2.0 / n):
         return []
     # Weights in SI, and each state's part in the sum by its spread.
-    weights = directions[:, 0] / noise.std / problem.scale
-    parts = np.abs(weights) * samples.std(axis=0) * problem.scale
-    held = [k for k in range(d) if parts[k] > PART * parts.max()]
+    weights = directions[:, 0] / std / scale
+    parts = np.abs(weights) * samples.std(axis=0) * scale
+    held = [k for k in range(len(own)) if parts[k] > PART * parts.max()]
     if len(held) < 2:
         return []
-    names = _listed([problem.states[k] for k in held])
-    total = " ".join(f"{weights[k] / weights[held[0]]:+.3g} {problem.states[k]}" for k in held)
+    states = {k: problem.states[own[k]] for k in held}
+    total = " ".join(f"{weights[k] / weights[held[0]]:+.3g} {name}" for k, name in states.items())
     return [
-        f"{names} hang together: {total.removeprefix('+')} varies no more than their noise, so "
-        "terms in one may stand for terms in the others"
+        f"{_listed(list(states.values()))} hang together: {total.removeprefix('+')} varies no "
+        "more than their noise, so terms in one may stand for terms in the others"
     ]
 
 

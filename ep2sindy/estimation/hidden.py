@@ -113,10 +113,10 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
 def _guessed(task: Task, ways: Sequence[Entrance]) -> Task:
     """The task with guesses of its hidden states, whose scales are fixed by relations.
 
-    The equation of a single measured state has one term, unless a relation says how it is entered.
+    The equation of a single measured state has one term, unless others of it are known.
     """
     first, *_ = ways
-    is_rate = len(task.runs[0].state_names) == 1 and not first.given
+    is_rate = len(task.runs[0].state_names) == 1
     return replace(
         task,
         runs=[with_guess(run, task.library, ways) for run in task.runs],

@@ -42,8 +42,8 @@ def forecast(
     that were measured; others that the history has were made from them (`ep.signals.embed`), and
     only start the fit.
     inputs: of a driven model over the horizon, as for `simulate`.
-    Raises ValueError for a history without any state or some input of the model, or a
-    horizon that does not lie ahead.
+    Raises ValueError for a history without any state or some input of the model, or a horizon that
+    does not lie ahead.
 
     >>> run = ep.lorenz().trajectory(noise=0.05, rng=0)
     >>> ahead = ep.forecast(ep.lorenz().model, run.window(0, 2000), 0.5)

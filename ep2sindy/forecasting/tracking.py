@@ -18,13 +18,7 @@ from ep2sindy.data.coerce import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import with_guess_by
 from ep2sindy.estimation.kernels import departures, filtered
-from ep2sindy.estimation.likelihood import (
-    FREE_START,
-    Level,
-    TrajectoryFit,
-    enough_substeps,
-    observe,
-)
+from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, enough_substeps
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord, scale_problem
 from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
 from ep2sindy.model.model import SparseModel
@@ -137,7 +131,7 @@ class Tracker:
         none = np.zeros(len(self.free), dtype=np.bool_)
         with np.errstate(over="ignore", invalid="ignore"):
             flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
-        residuals = observe(record, path, np.ones_like(path)).residuals
+        residuals = np.where(self.measured, record.samples - path, np.nan)
         return np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals
 
     def _smooth(
