@@ -37,8 +37,9 @@ def toy(path: Path, output: Path, *more: str) -> list[str]:
 
 
 def glance(path: Path, output: Path, *more: str) -> list[str]:
-    """What is said of a signal; the model, of one term, is chosen without a free run."""
+    """What is said of a smoothed signal; the model, of one term, is chosen without a free run."""
     few = ("depth=1", "search.n_best=1", "search.max_terms=1", "selection=ebic")
+    more = ("embedding=log_rate", *more)
     own = ("~selection.bounds", "~selection.n_windows", "~selection.n_starts")  # of free runs
     given = [o for o in toy(path, output, *few) if not o.startswith("selection.")]
     return [*given, *own, *more]
@@ -49,8 +50,42 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal(24.0))
 
 
+def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_path: Path) -> None:
+    folder = run_config(composed(*toy(record, tmp_path))).folder
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["signal"]["embedding"] == "HiddenStates"
+    assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
+    assert summary["states"]["2"]["unexplained"] is None
+    assert not summary["misfit"]
+    found = summary["model"]["equations"]
+    assert found["I"] == {"I*g": 1.0}
+    assert found["g"] == pytest.approx(CYCLE, rel=0.02)
+    for term, (low, high) in summary["model"]["intervals"]["g"].items():
+        assert low < CYCLE[term] < high
+    assert summary["living"]["verdict"] == "lives"
+    assert summary["living"]["waveform_error"] < 0.01
+    log = " ".join((folder / "run.log").read_text().split())
+    for words in ("explain the signal to its noise", "95 % from", "what the samples say"):
+        assert words in log
+    assert "smoothing" not in log
+    page = (folder / "report.html").read_text()
+    assert "supports that were weighed against each other" in page
+    assert "Error of the derivative" not in page
+
+
+def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 60.0, 1201)
+    path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)  # no linear equations make it
+    found = computed(composed(*glance(path, tmp_path, "embedding=hidden", "degree=1")))
+    assert found.summary["signal"]["embedding"] == "HiddenStates"
+    assert found.summary["signal"]["reason"] == "set"
+    assert found.summary["misfit"]
+    assert not found.summary["model"]["intervals"]
+
+
 def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
-    folder = run_config(composed(*toy(record, tmp_path, "selection.n_starts=2"))).folder
+    own = ("selection.n_starts=2", "embedding=log_rate")
+    folder = run_config(composed(*toy(record, tmp_path, *own))).folder
     summary = json.loads((folder / "summary.json").read_text())
     living = summary["living"]
     assert living["verdict"] == "lives"
@@ -64,7 +99,7 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     assert summary["signal"]["embedding"] == "LogRate"
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
     log = (folder / "run.log").read_text()
-    for words in ("(I is positive)", "known: I' = 1 I g", "attracting", "1 known"):
+    for words in ("its growth rate, I and g (set)", "known: I' = 1 I g", "attracting", "1 known"):
         assert words in log
     page = (folder / "report.html").read_text()
     assert "intervals are not given" in " ".join(log.split())  # of smoothed states
@@ -110,11 +145,23 @@ def test_fine_samples_are_averaged_by_default(tmp_path: Path) -> None:
 def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path: Path) -> None:
     run = ep.lorenz().trajectory()
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    found = computed(composed(*glance(path, tmp_path, "degree=2")))
+    smoothed = ("degree=2", "embedding=rate")
+    found = computed(composed(*glance(path, tmp_path, *smoothed)))
     assert set(found.summary["states"]) == {"2", "3"}
-    assert "+exp=discover 'trajectory.states=[I]' 'hidden=[v,h]'" in " ".join(found.log.split())
-    set_to_two = computed(composed(*glance(path, tmp_path, "degree=2", "n_states=2")))
+    set_to_two = computed(composed(*glance(path, tmp_path, *smoothed, "n_states=2")))
     assert set(set_to_two.summary["states"]) == {"2"}
+
+
+def test_the_law_of_chaos_is_found_in_one_of_its_states(tmp_path: Path) -> None:
+    run = ep.lorenz().trajectory(noise=0.02, rng=2)
+    path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
+    found = computed(composed(*toy(path, tmp_path, "degree=2"))).summary
+    assert set(found["states"]) == {"3"}
+    assert found["model"]["equations"]["I"] == {"v": 1.0}
+    assert set(found["model"]["equations"]["v"]) == {"v", "I*w"}
+    assert set(found["model"]["equations"]["w"]) == {"1", "w", "I^2", "I*v"}
+    assert found["living"]["verdict"] == "alike"
+    assert max(found["forecast"]["nrmse"]["model"]) < 0.2
 
 
 def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
@@ -131,7 +178,7 @@ def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
         (lambda t, x: (t[:200], x[:200]), [], "must hold 6 periods or more"),
         (lambda t, x: (t, np.random.default_rng(0).random(len(t))), [], "must oscillate"),
         (lambda t, x: (t, x - 1.0), ["embedding=log_rate"], "needs a positive signal: I falls"),
-        (lambda t, x: (t, x), ["embedding=log"], "embedding must be auto, log_rate or rate or"),
+        (lambda t, x: (t, x), ["embedding=log"], "embedding must be auto, hidden or log_rate or"),
         (lambda t, x: (t, x), ["n_states=some"], "n_states must be auto or a number: 'some' came"),
         (lambda t, x: (t, x), ["decimate=0"], "decimate must be auto, null or a whole number"),
         (lambda t, x: (t, x), ["signal=V"], "has no variable 'V'"),
@@ -169,7 +216,7 @@ def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
 def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> None:
     t, x = signal(12.0)
     path = scope(tmp_path / "scope.csv", t, x - x.mean())
-    lost = computed(composed(*glance(path, tmp_path)))
+    lost = computed(composed(*glance(path, tmp_path, "embedding=rate")))
     assert lost.summary["signal"]["embedding"] == "Rate"
     assert "offset=MEAN gives it back" in " ".join(lost.log.split())
     given = computed(composed(*glance(path, tmp_path, f"offset={x.mean()}")))

@@ -14,6 +14,7 @@ from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_gue
 from ep2sindy.estimation.likelihood import Level, TrajectoryFit, hessian, observe
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.estimation.solver import AnnealedFit, astray
 from ep2sindy.library.relations import relations_of
 from tests.programs import composed
 
@@ -176,6 +177,21 @@ def test_guesses_are_close_without_noise() -> None:
 
 
 # The likelihood without the samples of a state.
+
+
+def test_a_hidden_state_that_follows_nothing_is_astray() -> None:
+    run = PLANE.trajectory(noise=0.05, rng=0).window(0, 40)
+    problem = scale_problem([run], ep.polynomial(["x", "y"], degree=1), measured=["x"])
+    free, still = np.zeros(problem.C.shape[1]), np.ones(40)  # nothing moves
+    everything, cold = np.ones(len(free), dtype=bool), Level((np.ones((40, 2)),), 1e-4)
+    for hidden, is_astray in (
+        (np.sin(np.arange(40.0)), True),
+        (1e-9 * np.sin(np.arange(40.0)), True),
+        (still, False),
+    ):
+        path = np.column_stack([np.sin(np.arange(40.0)), hidden])
+        fit = TrajectoryFit((path,), free, everything, np.zeros(2))
+        assert astray(problem, AnnealedFit(fit, cold, 0.0)).tolist() == [False, is_astray]
 
 
 def test_what_was_not_measured_counts_nothing() -> None:

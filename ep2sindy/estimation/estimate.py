@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Float
@@ -14,13 +15,13 @@ from jaxtyping import Float
 from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.hidden import Entrance, with_guesses
+from ep2sindy.estimation.lateness import delay_words, late_words
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import EstimationProblem, check_size, scale_problem
 from ep2sindy.estimation.pushed import push_words, solution_under_pushes, solve_pushed
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
-    Aligned,
     Solution,
     enough_samples,
     max_terms_for,
@@ -268,7 +269,7 @@ def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Repo
     if late is None:
         return _under_pushes(problem, found, max_terms)
     if not align:
-        return _Reported(problem, found, late_words(problem, late), late.delays, none)
+        return _Reported(problem, found, late_words(problem, late.delays), late.delays, none)
     said = f"{delay_words(problem, late.delays)}: brought together with the others"
     misfit = _at_limit(late.problem, late.solution, max_terms)
     return _Reported(late.problem, late.solution, misfit, late.delays, none, (said,))
@@ -398,6 +399,9 @@ def _misfit(problem: EstimationProblem, found: Solution) -> str:
     for state, memory in zip(problem.states, found.noise.unexplained, strict=True):
         if memory:
             signs.append(f"what is left of {state} lasts ({memory:.2f} from sample to sample)")
+    signs += [
+        f"{s} does not follow its own equation" for s in compress(problem.states, found.astray)
+    ]
     return (
         "no model of this library fits these data as far as their noise: "
         + "; ".join(signs)
@@ -431,26 +435,6 @@ def remarks(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
         *(f"{words}: read as limits, not as values" for words in dict.fromkeys(limits)),
         *_of_noise(problem, noise),
         *_of_collinear_states(problem, noise),
-    )
-
-
-def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
-    """Delays in words, `z comes 0.00333 s late (0.99 samples)`, for every delayed state."""
-    parts = [
-        f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
-        f"({abs(delay):.2f} samples)"
-        for state, delay in zip(problem.states, delays, strict=True)
-        if delay
-    ]
-    return " and ".join(parts)
-
-
-def late_words(problem: EstimationProblem, late: Aligned) -> str:
-    """Explanation why samples with a late channel are a misfit, and what to do about it."""
-    return (
-        f"{delay_words(problem, late.delays)}: brought together, the samples are better explained "
-        "by other equations; ask for those by ep.TrajectorySearch(align=True), in configs "
-        "search.align=true. These are of the samples as they are"
     )
 
 

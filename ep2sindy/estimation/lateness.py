@@ -170,3 +170,23 @@ def move_channels(
             samples[:, j] += curve(record.times[kept] + delays[j]) - path[kept, j]
         records.append(record.kept(kept, samples))
     return replace(problem, records=tuple(records))
+
+
+def delay_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
+    """Delays in words, `z comes 0.00333 s late (0.99 samples)`, for every delayed state."""
+    parts = [
+        f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
+        f"({abs(delay):.2f} samples)"
+        for state, delay in zip(problem.states, delays, strict=True)
+        if delay
+    ]
+    return " and ".join(parts)
+
+
+def late_words(problem: EstimationProblem, delays: Float[np.ndarray, " d"]) -> str:
+    """Explanation why samples with a late channel are a misfit, and what to do about it."""
+    return (
+        f"{delay_words(problem, delays)}: brought together, the samples are better explained "
+        "by other equations; ask for those by ep.TrajectorySearch(align=True), in configs "
+        "search.align=true. These are of the samples as they are"
+    )

@@ -205,6 +205,7 @@ class EstimationProblem:
             states = total
         return states
 
+    @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
     def flow(
         self,
         record: ScaledRecord,

@@ -176,7 +176,8 @@ def solution_under_pushes(problem: EstimationProblem, pushed: PushedFit) -> Solu
         deviance=pushed.errors.deviance,
     )
     annealed = AnnealedFit(pushed.fit, pushed.level, pushed.score)
-    return Solution(annealed, explained, pushed.prices, 0.0)
+    astray = np.zeros(len(problem.states), dtype=np.bool_)
+    return Solution(annealed, explained, pushed.prices, 0.0, astray)
 
 
 def push_words(problem: EstimationProblem, pushed: PushedFit) -> str:

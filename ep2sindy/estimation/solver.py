@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from math import inf, log
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import zero_to_one
@@ -52,6 +52,7 @@ OTHER_STARTS = (-2.0, 0.0, 2.0)
 # explains, and a term dropped too early would have to be found again.
 COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
 COLD = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
+ASTRAY = 0.1  # RMS miss of the flow, as a share of the steps of a hidden state, if it follows none
 MAX_EXCHANGES = 3  # exchanges of supports at one level
 # rho at which supports are compared again. At lower rho the linearised flow says too little about
 # other supports; at higher rho free states hide their differences.
@@ -75,12 +76,17 @@ def enough_samples(problem: EstimationProblem) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Result from one start. score: -2 log likelihood plus prices, comparable between starts."""
+    """Result from one start.
+
+    score: -2 log likelihood plus prices, comparable between starts. astray: (d,), True for hidden
+    states that do not follow their own equations.
+    """
 
     annealed: AnnealedFit
     noise: Noise
     prices: Float[np.ndarray, " free"]
     flow_error: float
+    astray: Bool[np.ndarray, " d"]
 
     @property
     def score(self) -> float:
@@ -92,7 +98,7 @@ class Solution:
     def fits(self) -> bool:
         """True if the residuals look like noise."""
         exact = self.flow_error == 0.0 and not self.noise.unexplained.any()
-        return exact and bool(np.isfinite(self.score))
+        return exact and not self.astray.any() and bool(np.isfinite(self.score))
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +199,21 @@ def _settle(problem: EstimationProblem, found: AnnealedFit, max_terms: int) -> S
     error = 0.0
     if np.isfinite(found.score) and (noise.std > FLOOR).any():
         error = flow_error(problem, found.fit, noise, found.level)
-    return Solution(found, noise, prices, error)
+    return Solution(found, noise, prices, error, astray(problem, found))
+
+
+def astray(problem: EstimationProblem, found: AnnealedFit) -> Bool[np.ndarray, " d"]:
+    """Hidden states whose steps are not those of the flow.
+
+    One that has become very small leaves the flow freely, and large coefficients make it count.
+    """
+    off, steps = np.zeros(len(problem.states)), np.zeros(len(problem.states))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for record, path in zip(problem.records, found.fit.paths, strict=True):
+            ends = problem.ends(record, path[:-1], found.fit.free, found.level.n_substeps)
+            off += np.square(ends - path[1:]).sum(axis=0)
+            steps += np.square(np.diff(path, axis=0)).sum(axis=0)
+        return ~problem.measured & ~(off <= ASTRAY**2 * steps)
 
 
 @dataclass(frozen=True, eq=False)

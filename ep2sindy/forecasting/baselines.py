@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from jaxtyping import Float
@@ -84,8 +85,10 @@ class Autoregression:
         if d == 1:
             from statsmodels.tsa.ar_model import AutoReg, ar_select_order  # takes a second
 
-            lags = ar_select_order(x[:, 0], maxlag=most, ic="aic").ar_lags or [1]
-            params = AutoReg(x[:, 0], lags=max(lags)).fit().params
+            with catch_warnings():  # of a record without noise, for which any solution is exact
+                simplefilter("ignore")
+                lags = ar_select_order(x[:, 0], maxlag=most, ic="aic").ar_lags or [1]
+                params = AutoReg(x[:, 0], lags=max(lags)).fit().params
             constant, coef = params[:1], params[1:].reshape(-1, 1, 1)
         else:
             from statsmodels.tsa.vector_ar.var_model import VAR

@@ -129,8 +129,7 @@ class Tracker:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Derivatives of the flow, its misses, and residuals, NaN where nothing was measured."""
         none = np.zeros(len(self.free), dtype=np.bool_)
-        with np.errstate(over="ignore", invalid="ignore"):
-            flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
+        flow = self.problem.flow(record, path[:-1], self.free, none, self.n_substeps)
         residuals = np.where(self.measured, record.samples - path, np.nan)
         return np.ascontiguousarray(flow.slopes), flow.ends - path[1:], residuals
 

@@ -192,7 +192,7 @@ AnyEmbedding = LogRate | Rate | Delays
 class Chosen:
     """An embedding, its result, and the reason for choosing it, in words."""
 
-    embedding: AnyEmbedding
+    embedding: Embedding
     reason: str
     embedded: Embedded = field(repr=False)
 

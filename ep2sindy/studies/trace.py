@@ -1,11 +1,13 @@
 """A living model from one measured signal: `+exp=trace`.
 
-The model is tested on the end of the record, and by runs from starts off its cycle.
+States that nobody measured are found along with their equations. If no such equations explain the
+signal to its noise, states are made of it by smoothing, and the equations searched by rows. The
+model is tested on the end of the record, and by runs from starts off its cycle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,7 +20,7 @@ from ep2sindy.data.conversion import to_si
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.discover import Discovery, discover
-from ep2sindy.discovery.fitted_functions import fit_functions
+from ep2sindy.discovery.fitted_functions import FITTED, fit_functions
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.skill import forecast_skill
@@ -45,6 +47,7 @@ from ep2sindy.signals.trace import Trace, from_one_signal
 from ep2sindy.studies.living import FreeCycle
 from ep2sindy.studies.source import Source, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
+from ep2sindy.studies.trace_hidden import names_of, search_hidden
 from ep2sindy.studies.trace_result import (
     Attempt,
     Outcome,
@@ -59,19 +62,26 @@ PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that
 # Candidates per equation if no equation is known, so that there are few combinations.
 DEPTH_OF_BOTH = 2
 
+NOT_EXPLAINED = (
+    "no equations of the signal and states that nobody measured explain it to its noise and live: "
+    "states are made by smoothing"
+)
+
 MIN_FITTED = 4.0  # periods that a fitted part must have
 MIN_JUDGED = 1.5  # periods that a held-out part must have
 
 
 @dataclass(frozen=True)
 class Study:
-    """Embed one signal, search its unknown equation, and test the model on time it has not seen.
+    """Find states and equations of one signal, and test the model on time it has not seen.
 
     signal: the variable. unit: needed if the data group does not describe the signal, or to
     override its unit; None takes the described unit, or none. offset: added to the samples, in SI.
-    embedding: auto, log_rate, rate or delays. n_states: made of the signal, or auto: two, and three
-    as well for a signal that does not repeat itself; of these the ones that forecast best where
-    they were fitted. harmonics: number of harmonics of the period that the smoother follows.
+    embedding: how states are made. hidden: they are found along with their equations; log_rate,
+    rate and delays: by smoothing the signal; auto: hidden if an exact trajectory of such equations
+    explains the signal to its noise, and lives, else by smoothing. n_states: or auto: two, and
+    three as well for a signal that does not repeat itself; of these the ones that forecast best
+    where they were fitted. harmonics: of the period, which the smoother follows.
     decimate, detrend: see `from_one_signal`. degree, functions, function_degree: of the library; a
     `?` in a function stands for a number to be fitted, as in `sign(?*v)` and `1/(?+x)`.
     held_out: the share at the end of the record that is not fitted and serves as the test.
@@ -93,7 +103,7 @@ class Study:
     unit: str | None = None
 
     def __post_init__(self) -> None:
-        known = embeddings(self.harmonics, 2)
+        known = ("hidden", *embeddings(self.harmonics, 2))
         if self.embedding not in ("auto", *known):
             raise ValueError(
                 f"embedding must be auto, {' or '.join(known)}: {self.embedding!r} came"
@@ -111,17 +121,14 @@ class Study:
         for text in signal.advice:
             run.warn(text)
         n_fitted = count_fitted(signal, self.held_out)
-        past = signal.window(0, n_fitted)
-        attempts = [self._attempt(past, n, run) for n in self._numbers(signal)]
+        attempts = self._attempts(signal.window(0, n_fitted), self._numbers(signal), run)
         best = choose_attempt(attempts)
-        if type(best.chosen.embedding) is not LogRate and (hint := lost_mean(signal)):
+        if isinstance(best.chosen.embedding, Rate | Delays) and (hint := lost_mean(signal)):
             run.warn(hint)
         if best.found.misfit:
             run.warn(best.found.misfit)
-        if not repeats(signal):
-            run.say(other_way(signal))
         with run.progress(None, "", "forecasts, free run and limit cycle"):
-            return evaluate(signal, n_fitted, best, attempts, label=self.method.selection.label)
+            return evaluate(signal, n_fitted, best, attempts)
 
     def _sampled(self, run: Run) -> Trajectory:
         zone = zone_of(self.source) or Zone()
@@ -142,20 +149,49 @@ class Study:
             return [int(self.n_states)]
         return [2] if repeats(signal) else [2, 3]
 
-    def _attempt(self, past: Trace, n_states: int, run: Run) -> Attempt:
+    def _attempts(self, past: Trace, numbers: Sequence[int], run: Run) -> list[Attempt]:
+        """One with hidden states if it explains the signal, or else one for every number."""
+        if self.embedding in ("auto", "hidden"):
+            libraries = self._libraries(past, numbers)
+            search = search_hidden(past, libraries, self._by_trajectories, run.watch)
+            if search.explains or self.embedding == "hidden":
+                return [self._attempt(past, search.chosen(past), search.found, run)]
+            run.say(NOT_EXPLAINED)
+        return [self._smoothed(past, n, run) for n in numbers]
+
+    def _libraries(self, past: Trace, numbers: Sequence[int]) -> Iterator[Library]:
+        """Of the signal and hidden states, the smallest first."""
+        for n_states in numbers:
+            names, functions = names_of(past, n_states), self.functions
+            if any(FITTED in text for text in functions):
+                functions = self._fitted_functions(self._embedded(past, n_states).embedded)
+            for degree in range(min(2, self.degree), self.degree + 1):
+                yield self._library(names, functions, degree)
+
+    @property
+    def _by_trajectories(self) -> TrajectorySearch:
+        own = self.method
+        if isinstance(own, TrajectorySearch):
+            return TrajectorySearch(max_terms=own.max_terms)
+        return TrajectorySearch()
+
+    def _smoothed(self, past: Trace, n_states: int, run: Run) -> Attempt:
         with run.progress(None, "", f"{n_states} states of the signal"):
             chosen = self._embedded(past, n_states)
-        found = self._found(chosen, run)
+        return self._attempt(past, chosen, self._found(chosen, run), run)
+
+    def _attempt(self, past: Trace, chosen: Chosen, found: Discovery, run: Run) -> Attempt:
         with run.progress(None, "", "forecasts where it was fitted"):
             record = with_all_states(past, chosen)
             tracker = track(found.model, record, measured=[past.name])
             error = error_where_fitted(past, chosen, tracker)
-            share = unexplained(past, chosen.embedding)
+            own = chosen.embedding
+            share = unexplained(past, own) if isinstance(own, AnyEmbedding) else None
         return Attempt(chosen, found, tracker, error, share)
 
     def _embedded(self, signal: Trace, n_states: int) -> Chosen:
         known = embeddings(self.harmonics, n_states)
-        if self.embedding != "auto":
+        if self.embedding in known:
             return embed(signal, known[self.embedding])
         chosen = embed(signal, n_states=n_states)
         (fitting,) = (e for e in known.values() if type(e) is type(chosen.embedding))
@@ -163,16 +199,25 @@ class Study:
             embed(signal, fitting), reason=chosen.reason
         )  # fmt: skip
 
-    def _library(self, states: Trajectory, functions: Sequence[str]) -> Library:
+    def _library(
+        self, names: Sequence[str], functions: Sequence[str], degree: int | None = None
+    ) -> Library:
         return polynomial(
-            states.state_names,
-            degree=self.degree,
+            names,
+            degree=self.degree if degree is None else degree,
             functions=functions,
             function_degree=self.function_degree,
         )
 
+    def _fitted_functions(self, known: Embedded) -> list[str]:
+        """The functions, with numbers where they have a `?`."""
+        library_of = partial(self._library, known.run.state_names)
+        return fit_functions(
+            self.functions, known.run, library_of, partial(_misfit, self.method, known)
+        )
+
     def _found(self, chosen: Chosen, run: Run) -> Discovery:
-        method, rule, states = self.method, self.method.selection, chosen.embedded.run
+        method, rule, known = self.method, self.method.selection, chosen.embedded
         if isinstance(rule, SystemSelection):  # the measured signal is judged, not derived states
             from ep2sindy.selection.free_run import (
                 FreeRunScore,  # loads torch, only for this rule
@@ -180,16 +225,11 @@ class Study:
 
             if isinstance(rule, FreeRunScore):
                 method = replace(method, selection=replace(rule, judged=(self.signal,)))
-        if not chosen.embedded.terms:
+        if not known.terms:
             method = replace(method, depth=min(method.depth, DEPTH_OF_BOTH))
-        known = chosen.embedded
-        library_of = partial(self._library, states)
-        functions = fit_functions(
-            self.functions, states, library_of, partial(_misfit, method, known)
-        )
         found = discover(
-            states,
-            library_of(functions),
+            known.run,
+            self._library(known.run.state_names, self._fitted_functions(known)),
             method,
             relations=known.relations,
             terms=known.terms,
@@ -229,16 +269,6 @@ def embeddings(harmonics: float, n_states: int) -> dict[str, AnyEmbedding]:
 def repeats(signal: Trace) -> bool:
     """True if most of the signal is one cycle, again and again."""
     return signal.cycle is not None and signal.cycle.share >= REPEATS
-
-
-def other_way(signal: Trace) -> str:
-    """What else to try with a signal that does not repeat itself, as chaos does not."""
-    first = "g" if signal.is_positive else "v"
-    return (
-        f"{signal.name} does not repeat itself: if little noise is in it, equations of states that "
-        f"nobody measured may explain all of it: +exp=discover 'trajectory.states=[{signal.name}]' "
-        f"'hidden=[{first},h]'"
-    )
 
 
 def lost_mean(signal: Trace) -> str | None:
@@ -298,9 +328,7 @@ def count_fitted(signal: Trace, held_out: float) -> int:
     return n_fitted if enough else n
 
 
-def evaluate(
-    signal: Trace, n_fitted: int, best: Attempt, attempts: Sequence[Attempt], *, label: str
-) -> Outcome:
+def evaluate(signal: Trace, n_fitted: int, best: Attempt, attempts: Sequence[Attempt]) -> Outcome:
     """Run the model freely over the held-out part, and forecast it again and again.
 
     The start is fitted to the samples before the held-out part. Without such a part, the whole
@@ -315,7 +343,7 @@ def evaluate(
         begin = int(np.searchsorted(signal.t, chosen.embedded.run.t[0]))
         measured = whole.window(begin, whole.n_samples)
         run = free_run(model, measured, initial=chosen.embedded.run.states[0], judged=own)
-        return Outcome(signal, best, attempts, whole, measured, FreeCycle.of(run), None, label)
+        return Outcome(signal, best, attempts, whole, measured, FreeCycle.of(run), None)
     past = with_all_states(signal.window(0, n_fitted), chosen)
     before = partial(states_before, signal, chosen.embedding)
     tracker = calibrate(best.tracker, past, states_of=before)
@@ -330,4 +358,4 @@ def evaluate(
         states_of=before,
         tracker=tracker,
     )
-    return Outcome(signal, best, attempts, whole, measured, FreeCycle.of(run), skill, label)
+    return Outcome(signal, best, attempts, whole, measured, FreeCycle.of(run), skill)

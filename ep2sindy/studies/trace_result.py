@@ -30,6 +30,7 @@ from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.document import Block, Captioned, Equation, Section, Table, Text, pictures
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, facts, percent
+from ep2sindy.selection.rule import SystemSelection
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.embedding import (
     Chosen,
@@ -41,9 +42,15 @@ from ep2sindy.studies.forecasts import (
     forecast_picture,
     forecast_section,
 )
-from ep2sindy.studies.library_result import CandidateRow, candidate_rows
+from ep2sindy.studies.library_result import (
+    CandidateRow,
+    candidate_rows,
+    column_note,
+    estimate_section,
+)
 from ep2sindy.studies.living import WAVEFORM, FreeCycle, runs_from
 from ep2sindy.studies.source import data_summary
+from ep2sindy.studies.trace_hidden import HiddenStates, alone
 from ep2sindy.studies.views import (
     coefficients,
     display_equation,
@@ -56,6 +63,11 @@ from ep2sindy.studies.views import (
 # Error of forecasts, as a share of that of fewer states, from which more states are taken; starts
 # from which it is counted, and draws of each.
 CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
+
+SCORED = (
+    "Score against number of terms: the supports that were weighed against each other; the star is "
+    "selected."
+)
 
 STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distance from the cycle's middle, relative to its states
 
@@ -76,14 +88,14 @@ class Attempt:
 
     tracker: of its states along the fitted part. error: of its forecasts up to a period there, in
     standard deviations. share: of the next state's variance that neighbours in these states do not
-    explain.
+    explain; None for hidden states, of which there is no next one.
     """
 
     chosen: Chosen
     found: Discovery
     tracker: Tracker
     error: float
-    share: float
+    share: float | None
 
     @property
     def n_states(self) -> int:
@@ -91,11 +103,14 @@ class Attempt:
 
     @property
     def text(self) -> str:
-        return (
+        errors = (
             f"{self.n_states} states: forecasts up to a period err by {self.error:.3f} standard "
-            f"deviations where fitted; neighbours leave {100.0 * self.share:.2g} % of the next "
-            "derivative unexplained"
+            "deviations where fitted"
         )
+        if self.share is None:
+            return errors
+        left = f"neighbours leave {100.0 * self.share:.2g} % of the next derivative unexplained"
+        return f"{errors}; {left}"
 
 
 def choose_attempt(attempts: Sequence[Attempt]) -> Attempt:
@@ -133,6 +148,8 @@ def with_all_states(signal: Trace, chosen: Chosen) -> Trajectory:
 
 def states_before(signal: Trace, embedding: Embedding, past: Trajectory) -> Trajectory:
     """The states at a time, made from samples before it alone."""
+    if isinstance(embedding, HiddenStates):  # the tracker fits them itself
+        return alone(signal.with_samples(past.t, past.states[:, 0]))
     return embedding.embed(signal.with_samples(past.t, past.states[:, 0])).run
 
 
@@ -143,7 +160,7 @@ class Outcome:
     best: the attempt that was chosen among `attempts`. states: all of the record, the signal as
     measured. measured: the test data. free: the run of the model over them, from a start that was
     fitted to the samples before, and its cycle. skill: of forecasts of the test data; None without
-    any. label: name of the scores.
+    any.
     """
 
     signal: Trace
@@ -153,7 +170,6 @@ class Outcome:
     measured: Trajectory
     free: FreeCycle
     skill: ForecastSkill | None
-    label: str
 
     @property
     def chosen(self) -> Chosen:
@@ -162,6 +178,16 @@ class Outcome:
     @property
     def found(self) -> Discovery:
         return self.best.found
+
+    @property
+    def label(self) -> str:
+        """The name of the scores."""
+        return self.found.method.selection.label
+
+    @property
+    def by_runs(self) -> bool:
+        """Whether whole models were run freely, rather than weighed by their likelihood."""
+        return isinstance(self.found.method.selection, SystemSelection)
 
     @property
     def run(self) -> FreeRun:
@@ -204,7 +230,9 @@ class Outcome:
         }
 
     def _front(self, state: str) -> ResultTable[CandidateRow]:
-        return ResultTable(candidate_rows(self.found.fronts[state]), CANDIDATES)
+        front = self.found.fronts[state]
+        metrics = [m for m in CANDIDATES if m.key != "r2" or front.problem is not None]
+        return ResultTable(candidate_rows(front), metrics)
 
     def figures(self) -> dict[str, Captioned]:
         held, rollout = self.measured, self.run.rollout
@@ -221,16 +249,19 @@ class Outcome:
             drawn["waveform"] = partial(waveform_figure, held, rollout)
         fronts = {state: self.found.fronts[state] for state in self.searched}
         drawn["front"] = partial(front_figure, fronts, label=self.label)
-        pictures_of = {name: Captioned(draw, CAPTIONS[name]) for name, draw in drawn.items()}
+        captions = CAPTIONS if self.by_runs else CAPTIONS | {"front": SCORED}
+        pictures_of = {name: Captioned(draw, captions[name]) for name, draw in drawn.items()}
         if self.skill is not None:
             pictures_of["forecast"] = forecast_picture(self.states, self.skill)
         return pictures_of
 
     def sections(self) -> list[Section]:
         forecasts = [] if self.skill is None else [forecast_section(self.skill)]
-        return [
-            self._signal_section(), self._search_section(), self._living_section(), *forecasts
-        ]  # fmt: skip
+        said = [self._search_section()]
+        if (estimate := self.found.estimate) is not None:
+            tested = self.found.noise_test.tested
+            said.append(estimate_section(self.signal.name, estimate, self.states, of_model=tested))
+        return [self._signal_section(), *said, self._living_section(), *forecasts]
 
     def _signal_section(self) -> Section:
         signal, embedded = self.signal, self.chosen.embedded
@@ -265,11 +296,16 @@ class Outcome:
                     front.screen().iloc[shown].reset_index(drop=True),
                     title=f"candidates for {state}'",
                     bold=np.flatnonzero(table["selected"].to_numpy()[shown]).tolist(),
-                    note="Of every size the best three by score, then by R2 of the derivative; "
-                    "score: largest deviation of a free run, in units of its bound; one lives.",
+                    note=f"Of every size the best three. Score: {self._score_words}",
                 )
             )
         return Section("Search", [*blocks, *pictures(["front"])])
+
+    @property
+    def _score_words(self) -> str:
+        if self.by_runs:
+            return "largest deviation of a free run, in units of its bound; one lives."
+        return column_note(self.label)
 
     def _living_section(self) -> Section:
         model, clock = self.model, self.states.clock

@@ -1,0 +1,117 @@
+"""States of one signal that nobody measured, found along with their equations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.discovery.discover import Discovery, discover
+from ep2sindy.discovery.method import TrajectorySearch
+from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.forecasting.tracking import Tracker, track
+from ep2sindy.library.library import Library
+from ep2sindy.model.comparison import SPIRALS, Verdict
+from ep2sindy.model.free_run import free_run
+from ep2sindy.runtime.progress import Progress
+from ep2sindy.signals.embedding import Chosen, Embedded, LogRate, Rate
+from ep2sindy.signals.trace import Trace
+from ep2sindy.studies.living import FreeCycle
+
+MAX_FITTED = 3000  # samples from the end of the fitted part that the search sees
+
+ENDURING = (Verdict.LIVES, Verdict.FOLLOWS, Verdict.ALIKE)
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenStates:
+    """An embedding by a model: its states as it fits them to the samples of a signal.
+
+    noise_std: of the signal's samples, in SI.
+    """
+
+    tracker: Tracker
+    noise_std: float
+
+    @property
+    def n_states(self) -> int:
+        return len(self.tracker.model.states)
+
+    @property
+    def says(self) -> str:
+        return f"the signal and {self.n_states - 1} that nobody measured"
+
+    def names(self, signal: str) -> tuple[str, ...]:
+        return tuple(self.tracker.model.states)
+
+    def embed(self, signal: Trace) -> Embedded:
+        model = self.tracker.model
+        known = {signal.name: tuple(model.terms(signal.name))}  # its term sets a scale
+        return Embedded(self.tracker.along(alone(signal)), (), known, self.noise_std)
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenSearch:
+    """A model with hidden states.
+
+    explains: whether it explains the signal to its noise, and run freely stays with it where it was
+    fitted.
+    """
+
+    found: Discovery
+    estimate: Estimate
+    explains: bool
+
+    def chosen(self, signal: Trace) -> Chosen:
+        """The states along a signal."""
+        tracker = track(self.found.model, alone(signal))
+        own = HiddenStates(tracker, float(self.estimate.noise_std[0]))
+        reason = "their equations explain the signal to its noise" if self.explains else "set"
+        return Chosen(own, reason, own.embed(signal))
+
+
+def search_hidden(
+    past: Trace, libraries: Iterable[Library], method: TrajectorySearch, progress: Progress
+) -> HiddenSearch:
+    """The model of the first library that explains a signal, or of the last."""
+    run = alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
+    for library in libraries:
+        hidden = [name for name in library.variables if name != past.name]
+        found = discover(run, library, method, hidden=hidden, progress=progress)
+        estimate = found.estimate
+        assert estimate is not None  # a search of trajectories has one
+        search = HiddenSearch(found, estimate, not found.misfit and _endures(estimate, past.name))
+        if search.explains:
+            break
+    return search
+
+
+def _endures(estimate: Estimate, signal: str) -> bool:
+    """Whether the model, run freely over the record that it was fitted to, stays with it.
+
+    Nor may its cycle repel: a departure that grew would show in a record that keeps its amplitude.
+    """
+    (record,), (path,) = estimate.runs, estimate.paths
+    free = FreeCycle.of(free_run(estimate.model, record, initial=path[0], judged=[signal]))
+    if free.run.verdict not in ENDURING or free.cycle is None:
+        return free.run.verdict in ENDURING
+    n_periods = float(record.t[-1] - record.t[0]) / free.cycle.period_s
+    return free.multiplier**n_periods < SPIRALS
+
+
+def names_of(signal: Trace, n_states: int) -> tuple[str, ...]:
+    """Names of the signal and of hidden states: a growth rate or a rate, and others."""
+    natural = LogRate if signal.is_positive else Rate
+    return natural(n_states=n_states).names(signal.name)
+
+
+def alone(signal: Trace) -> Trajectory:
+    """A signal as a record of one state."""
+    return Trajectory(
+        signal.t,
+        signal.x[:, None],
+        (signal.name,),
+        units={signal.name: signal.unit},
+        label=signal.name,
+        clock=signal.clock,
+    )
