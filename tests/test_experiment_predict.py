@@ -50,12 +50,19 @@ def test_the_run_leaves_laws_tables_figures_and_a_summary(folder: Path) -> None:
     assert branch["exact"][3] == "n_n: 1 == 4.58e+22 * mdot_mg_s"
     assert branch["degree"] == 1
     assert branch["left_out"]["n"] == 4
+    forecast = branch["forecast"]
+    assert forecast["n_records"] == 4
+    assert set(forecast["nrmse"]) >= {"model", "persistence", "autoregression"}
+    assert forecast["nrmse"]["model"] < 0.5 < forecast["nrmse"]["persistence"]
     quiet = [p for p in summary["points"] if p["status"] != "oscillating"]
     assert [(p["V_D_V"], p["mdot_mg_s"]) for p in quiet] == [(150.0, 2.0)]
     assert summary["oscillating_or_not"]["points"] == 5
     tables = {path.stem: pd.read_csv(path) for path in (folder / "tables").glob("*.csv")}
     assert len(tables["laws"]) == 27
     assert len(tables["left_out"]) == 4
+    median = tables["left_out"]["forecast"].median()
+    assert median == pytest.approx(forecast["nrmse"]["model"], rel=0.1)
+    assert "Forecasts half a period ahead" in (folder / "run.log").read_text()
     assert len(tables["map"]) == 4
     assert len(tables["coefficients"]) == 36
     assert {p.stem for p in (folder / "figures").glob("*.png")} == {

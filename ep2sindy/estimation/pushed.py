@@ -39,7 +39,7 @@ MAX_EXCHANGES = 4  # of supports in one round
 # of the products of states that they are compared with.
 LAGS, MORE_DEGREES, MAX_POWERS = range(1, 9), 2, 60
 # Standard errors that random innovations may show: see `PushedFit`.
-MOST_SHOWN = (5.0, 4.5, 6.0)
+MOST_SHOWN = (5.0, 4.0, 6.0)
 COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
 SETTLING = 5  # samples from whose start on innovations count
 

@@ -13,6 +13,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.bands import LEVEL
 from ep2sindy.forecasting.rolling import RollingStarts, StatesOf
 from ep2sindy.forecasting.tracking import Tracker
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.signals.spectrum import is_uniform
 
 N_STARTS, N_DRAWS, PERIODS_AHEAD = 24, 60, 1.5
@@ -20,6 +21,7 @@ TOLERANCE = 0.03  # deviation from the level at which a band counts as calibrate
 FACTORS = 10.0 ** np.arange(-2.0, 2.1, 0.25)  # of the likeliest pushes
 
 
+@one_thread()
 def calibrate(
     tracker: Tracker, run: Trajectory, *, states_of: StatesOf | None = None, seed: int = 0
 ) -> Tracker:

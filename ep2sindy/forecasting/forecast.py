@@ -13,9 +13,11 @@ from ep2sindy.forecasting.bands import Forecast, forecasts
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.tracking import track
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count
 
 
+@one_thread()
 def forecast(
     model: SparseModel,
     history: Run,

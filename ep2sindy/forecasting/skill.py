@@ -20,6 +20,7 @@ from ep2sindy.forecasting.tracking import Tracker, measured_states, track
 from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Advance, nothing
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.spectrum import crossing_frequency
@@ -128,6 +129,7 @@ class ForecastSkill:
         return duration_s / unit_s
 
 
+@one_thread()
 def forecast_skill(
     model: SparseModel,
     run: Run,

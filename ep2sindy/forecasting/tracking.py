@@ -22,6 +22,7 @@ from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, eno
 from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord, scale_problem
 from ep2sindy.estimation.pushed import LEAST_NOISE, MOST, error_variances, likely_errors
 from ep2sindy.model.model import SparseModel
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.signals.spectrum import dominant_frequency
 
 MEMORY_PERIODS = 4.0  # length of the window that a start is fitted to
@@ -168,6 +169,7 @@ class Tracker:
         return total if np.isfinite(total) else np.inf
 
 
+@one_thread()
 def track(
     model: SparseModel,
     run: Trajectory,
@@ -207,6 +209,7 @@ def track(
     return tracker
 
 
+@one_thread()
 def estimate_states(
     model: SparseModel, run: Run, *, measured: Sequence[str] | None = None
 ) -> Trajectory:

@@ -10,13 +10,16 @@ import pandas as pd
 from scipy.special import ndtri
 
 from ep2sindy.figures.operating import frequency_scale
+from ep2sindy.forecasting.skill import AUTOREGRESSION, MODEL, ForecastSkill
 from ep2sindy.operating.choice import Branch, StructureTrial
 from ep2sindy.operating.fit import LeaveOneOut
 from ep2sindy.operating.map import Fate, MapPoint
 from ep2sindy.operating.records import OperatingRecord, point_label
 from ep2sindy.report.document import places
 from ep2sindy.report.results import Metric, ResultTable, View, percent
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.oscillation import Oscillation
+from ep2sindy.studies.forecasts import skill_of
 
 Parameters = Mapping[str, float]
 
@@ -84,12 +87,14 @@ def coefficients_table(branches: Mapping[str, Branch]) -> pd.DataFrame:
 class LeftOutPoint:
     """Prediction at one point by the law of the other points.
 
-    also: other cycles whose law oscillates there.
+    also: other cycles whose law oscillates there. skill: of forecasts over the second half of the
+    point's record, by the same law; None if there are none.
     """
 
     branch: str
     result: LeaveOneOut
     also: str
+    skill: ForecastSkill | None = None
 
     @property
     def record(self) -> OperatingRecord:
@@ -99,10 +104,31 @@ class LeftOutPoint:
     def f_kHz(self) -> float:
         return 1e-3 * self.record.cycle.frequency_Hz
 
+    def forecast_error(self, name: str) -> float:
+        """Half a period ahead, in standard deviations; NaN if there is none."""
+        known = {} if self.skill is None else self.skill.at(0.5 / self.record.cycle.frequency_Hz)
+        return known.get(name, float("nan"))
+
+
+def skills_left_out(
+    left_out: Sequence[LeaveOneOut], *, starts: int, progress: Progress = SILENT
+) -> list[ForecastSkill | None]:
+    """At points left out, each by the law of the others over the second half of its record."""
+    skills = []
+    with progress.stage(len(left_out), "point", "forecasts") as advance:
+        for each in left_out:
+            record = each.record.run
+            skills.append(
+                skill_of(each.run.model, record, n_fitted=record.n_samples // 2, starts=starts)
+            )
+            advance(1)
+    return skills
+
 
 def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint]]:
     """Metrics of points left out; their cycle is shown if there are several."""
     several = View.SHOWN if len({point.branch for point in points}) > 1 else View.FILES
+    forecast = View.SHOWN if any(point.skill for point in points) else View.FILES
     factor, unit = frequency_scale(pd.Series([point.f_kHz for point in points]))
     relative = percent(2, sign=True)
     return [
@@ -133,6 +159,14 @@ def left_out_metrics(points: Sequence[LeftOutPoint]) -> list[Metric[LeftOutPoint
             lambda error: places(error, 3),
         ),
         Metric("verdict", lambda p: str(p.result.run.verdict), View.SHOWN),
+        Metric("forecast", lambda p: p.forecast_error(MODEL), forecast, format="{:.3f}"),
+        Metric(
+            "autoregression",
+            lambda p: p.forecast_error(AUTOREGRESSION),
+            forecast,
+            "AR",
+            "{:.3f}",
+        ),
         Metric("also", lambda p: p.also, several),
     ]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from typing import Annotated, Any
 
@@ -15,6 +15,7 @@ from ep2sindy.figures.operating import (
     laws_figure,
     left_out_figure,
 )
+from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.choice import (
@@ -44,6 +45,7 @@ from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.oscillation import Oscillation
 from ep2sindy.studies.fits import Terms, terms_of
+from ep2sindy.studies.forecasts import TypicalSkill
 from ep2sindy.studies.law_tables import (
     LeftOutPoint,
     agreement,
@@ -52,6 +54,7 @@ from ep2sindy.studies.law_tables import (
     left_out_metrics,
     map_table,
     points_table,
+    skills_left_out,
     structure_metrics,
     structures_table,
 )
@@ -69,7 +72,7 @@ LEFT_OUT = (
     "Each point in turn read off the law of the others, tied in one refinement, and run freely "
     "from one sample of its record, where the states move least. Errors are those against the "
     "record's cycle; a model lives within 1 % of frequency, 10 % of amplitude and 0.2 standard "
-    "deviations of waveform; enclosed: whether the others enclose it."
+    "deviations of waveform; enclosed: whether the others enclose it; forecast, AR: half a period."
 )
 ALSO = " also: other cycles whose law oscillates there, inside its points."
 TRIED = (
@@ -160,6 +163,8 @@ class Study:
     from the data group. models: of which one is selected, by name; None searches for terms.
     degrees: candidate degrees of the polynomials, of which one is selected. map_points: number of
     points along each parameter. labels: names of the parameters in figures.
+    forecasts: number of starts of forecasts over the second half of every record, by the law that
+    has not seen it; 0 for none.
     """
 
     source: Source
@@ -172,8 +177,11 @@ class Study:
     windows: Followed
     map_points: Count
     labels: Mapping[str, str]
+    forecasts: int = 0
 
     def __post_init__(self) -> None:
+        if self.forecasts < 0:
+            raise ValueError(f"forecasts must be zero or more starts: {self.forecasts} came")
         self._how(0)
         given = expand(self.points, list(self.parameters))
         sources = point_sources(self.source, self.parameters, given)
@@ -216,7 +224,11 @@ class Study:
         for name, branch in found.items():
             run.write(f"law_{name}.json", branch.law.save)
         members_of = {name: [r.parameters for r in group] for name, group in groups.items()}
-        return Outcome(everywhere, statuses, records, members_of, found, self.labels)
+        skills = {
+            name: skills_left_out(branch.left_out, starts=self.forecasts, progress=run.watch)
+            for name, branch in found.items()
+        }
+        return Outcome(everywhere, statuses, records, members_of, found, skills, self.labels)
 
     def _how(self, seed: int) -> BranchSettings:
         states, parameters = self.source.states, list(self.parameters)
@@ -255,7 +267,8 @@ class Outcome:
     """Operating points, the law of each cycle, and its predictions at points left out.
 
     statuses: of every point, by its label. members: parameters of the records, by cycle. branches:
-    by cycle, for the cycles that have a law. labels: names of the parameters in figures.
+    by cycle, for the cycles that have a law. skills: of forecasts at the points left out, by cycle.
+    labels: names of the parameters in figures.
     """
 
     points: Sequence[Mapping[str, float]]
@@ -263,6 +276,7 @@ class Outcome:
     records: Sequence[OperatingRecord]
     members: Mapping[str, Sequence[Mapping[str, float]]]
     branches: Mapping[str, Branch]
+    skills: Mapping[str, Sequence[ForecastSkill | None]]
     labels: Mapping[str, str]
 
     @property
@@ -283,9 +297,11 @@ class Outcome:
     @cached_property
     def _points_left_out(self) -> list[LeftOutPoint]:
         return [
-            LeftOutPoint(name, result, ", ".join(self._also_there(result.record.label, name)))
+            LeftOutPoint(
+                name, result, ", ".join(self._also_there(result.record.label, name)), skill
+            )
             for name, branch in self.branches.items()
-            for result in branch.left_out
+            for result, skill in zip(branch.left_out, self.skills[name], strict=True)
         ]
 
     def _also_there(self, label: str, own: str) -> list[str]:
@@ -411,23 +427,27 @@ class Outcome:
         points = self._points_left_out
         shown = sorted(points, key=lambda point: (point.branch, *point.record.parameters.values()))
         lines: list[Block] = [Text(self._spread(name)) for name in self.branches]
+        for name, skills in self.skills.items():
+            if typical := TypicalSkill.of(skills):
+                lines.append(Text(f"{self._lead(name)}{typical.text}."))
         note = LEFT_OUT + (ALSO if len(self.branches) > 1 else "")
         table = Table(ResultTable(shown, left_out_metrics(points)).screen(), note=note)
         return [*lines, table, Picture("left_out")]
+
+    def _lead(self, name: str) -> str:
+        return f"{name} cycle: " if len(self.members) > 1 else ""
 
     def _spread(self, name: str) -> str:
         found = error_statistics(self.branches[name].left_out)
         smooth_f, smooth_amplitude = self.branches[name].smooth
         text = percent(2)
-        lead = f"{name} cycle: " if len(self.members) > 1 else ""
         most = f"nine in ten within {text(found['f_90'])}"
         if not np.isfinite(found["f_90"]):
             most = "more than one in ten do not oscillate"
         return (
-            f"{lead}{found['n_lives']} of {found['n']} live, diverging: {found['diverging']}. "
-            f"Errors in the median: frequency {text(found['f_median'])} ({most}), the worst "
-            "state's amplitude "
-            f"{text(found['amplitude_median'])} and waveform "
+            f"{self._lead(name)}{found['n_lives']} of {found['n']} live, diverging: "
+            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
+            f"({most}), the worst state's amplitude {text(found['amplitude_median'])} and waveform "
             f"{places(found['waveform_median'], 3)}. The records' own frequencies and amplitudes, "
             f"interpolated by the same functions, miss by {text(float(np.median(smooth_f)))} "
             f"and {text(float(np.median(smooth_amplitude)))} in the median."
@@ -457,6 +477,7 @@ class Outcome:
                     "status": branch.tied.status,
                     "loss": float(branch.tied.loss.mean()),
                     "left_out": error_statistics(branch.left_out),
+                    "forecast": (each := TypicalSkill.of(self.skills[name])) and asdict(each),
                 }
                 for name, branch in self.branches.items()
             },
