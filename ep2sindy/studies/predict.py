@@ -163,8 +163,7 @@ class Study:
     from the data group. models: of which one is selected, by name; None searches for terms.
     degrees: candidate degrees of the polynomials, of which one is selected. map_points: number of
     points along each parameter. labels: names of the parameters in figures.
-    forecasts: number of starts of forecasts over the second half of every record, by the law that
-    has not seen it; 0 for none.
+    forecasts: number of starts over the second half of every record left out; 0 for none.
     """
 
     source: Source
