@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy._stubs import dotted_names
 from ep2sindy.discovery.recipe import method_of
+from ep2sindy.estimation import explanation
 from ep2sindy.estimation import problem as estimation_problem
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
+from ep2sindy.estimation.solver import Solution, from_smooth
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
@@ -342,6 +345,22 @@ def test_noise_that_grows_with_the_state_is_weighed_so() -> None:
     found = ep.estimate([run], system.model.library)
     assert is_right(found.model, system)
     assert found.misfit == ""
+
+
+def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The score of states that leave the flow is no likelihood."""
+
+    def leaves(*given: object, max_terms: int) -> Solution:
+        found = from_smooth(*given, max_terms=max_terms)
+        noise = replace(found.noise, deviance=found.noise.deviance - 1e4)
+        return replace(found, noise=noise, flow_error=0.1)
+
+    monkeypatch.setattr(explanation, "from_smooth", leaves)
+    system = ep.lotka_volterra()
+    found = ep.estimate([system.trajectory(noise=0.05, rng=0)], system.model.library)
+    assert found.misfit == ""
+    assert found.flow_error == 0.0
+    assert is_right(found.model, system)
 
 
 def test_a_linear_library_of_what_is_not_linear_is_called_a_misfit() -> None:

@@ -62,7 +62,7 @@ def test_a_law_is_found_under_pushes_with_intervals_that_hold() -> None:
 def test_the_law_is_found_in_most_draws(system: System, degree: int) -> None:
     right, held, n = counted(system, degree, range(10))
     assert right >= 9
-    assert held >= 0.85 * n
+    assert held >= 0.8 * n  # nine in ten or so, less two standard errors
 
 
 def test_the_sizes_of_pushes_and_noise_are_found() -> None:

@@ -7,26 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
 
 import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
-from ep2sindy.estimation.lateness import delay_words, late_words
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
 from ep2sindy.estimation.problem import EstimationProblem, check_size, scale_problem
-from ep2sindy.estimation.pushed import push_words, solution_under_pushes, solve_pushed
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Solution,
     enough_samples,
     max_terms_for,
-    settle,
-    solve,
 )
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
@@ -185,19 +181,19 @@ def estimate_task(
 
 def _try(
     task: Task, known: Task, ways: Sequence[Entrance], max_terms: int, align: bool, advance: Advance
-) -> tuple[_Reported, Sequence[Trajectory]]:
+) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
     given = known.runs, known.library, known.relations, known.terms
     measured = task.runs[0].state_names
     problem = scale_problem(*given, measured=measured, advance=advance)
-    found = _answer(problem, max_terms, align=align)
+    found = explain(problem, max_terms=max_terms, align=align)
     return replace(found, said=(*(way.words for way in ways), *found.said)), known.runs
 
 
-def _with_path(answer: _Reported, number: int, run: Trajectory) -> Trajectory:
+def _with_path(answer: Explanation, number: int, run: Trajectory) -> Trajectory:
     """A run as it was fitted, with the estimated path of hidden states among its samples."""
-    problem, fit = answer.problem, answer.found.annealed.fit
+    problem, fit = answer.problem, answer.solution.annealed.fit
     record = problem.records[number]
     states = np.where(problem.measured, record.samples, fit.paths[number]) * problem.scale
     kept = np.isin((run.t - run.t[0]) / problem.step_s, record.times)
@@ -205,14 +201,14 @@ def _with_path(answer: _Reported, number: int, run: Trajectory) -> Trajectory:
 
 
 def _report(
-    answer: _Reported,
+    answer: Explanation,
     model: SparseModel,
     runs: Sequence[Trajectory],
     max_terms: int,
     watch: Progress,
 ) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
-    problem, found = answer.problem, answer.found
+    problem, found = answer.problem, answer.solution
     fit, few_terms = found.annealed.fit, max_terms_for(problem, max_terms)
     pair = gram(problem, fit, found.annealed.level)
     supports = {
@@ -240,59 +236,6 @@ def _report(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Reported:
-    """The reported solution: of the samples as given, or of the aligned samples if asked for.
-
-    delays: (d,), in mean steps. pushes: (d,), scaled. said: remarks on how the samples were changed
-    or explained.
-    """
-
-    problem: EstimationProblem
-    found: Solution
-    misfit: str
-    delays: Float[np.ndarray, " d"]
-    pushes: Float[np.ndarray, " d"]
-    said: tuple[str, ...] = ()
-
-    @property
-    def rank(self) -> tuple[bool, bool, float]:
-        """Order between ways in which hidden states may enter: least is best."""
-        return bool(self.misfit), bool(self.pushes.any()), self.found.score
-
-
-def _answer(problem: EstimationProblem, max_terms: int, *, align: bool) -> _Reported:
-    most, none = max_terms_for(problem, max_terms), np.zeros(len(problem.states))
-    found, late = solve(problem, max_terms=most)
-    if late is None and found.fits:
-        return _Reported(problem, found, _at_limit(problem, found, max_terms), none, none)
-    if late is None:
-        return _under_pushes(problem, found, max_terms)
-    if not align:
-        return _Reported(problem, found, late_words(problem, late.delays), late.delays, none)
-    said = f"{delay_words(problem, late.delays)}: brought together with the others"
-    misfit = _at_limit(late.problem, late.solution, max_terms)
-    return _Reported(late.problem, late.solution, misfit, late.delays, none, (said,))
-
-
-def _under_pushes(problem: EstimationProblem, found: Solution, max_terms: int) -> _Reported:
-    """What random pushes explain; the exact solution near it, or the one that did not fit."""
-    none = np.zeros(len(problem.states))
-    misfit = _Reported(problem, found, _misfit(problem, found), none, none)
-    most = max_terms_for(problem, max_terms)
-    pushed = solve_pushed(problem, max_terms=most)
-    if not pushed.explains:
-        return misfit
-    exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=most)
-    if exact.fits:  # the pushes were needed on the way alone
-        return _Reported(problem, exact, _at_limit(problem, exact, max_terms), none, none)
-    if not problem.measured.all():  # a hidden state that is pushed explains whatever there is
-        return misfit
-    found, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
-    limit = _at_limit(problem, found, max_terms)
-    return _Reported(problem, found, limit, none, pushed.errors.process, (said,))
-
-
 def check_runs(task: Task) -> None:
     """Raise ValueError for too few samples, or some outside the domain of a library's function."""
     n_samples = sum(run.n_samples for run in task.runs)
@@ -310,28 +253,22 @@ def check_runs(task: Task) -> None:
             )
 
 
-def _coef_SI(
-    problem: EstimationProblem, free: Float[np.ndarray, " free"]
-) -> Float[np.ndarray, " _"]:
-    return (problem.C @ free + problem.fixed) * problem.to_SI
-
-
 def _named_coef(
     problem: EstimationProblem, free: Float[np.ndarray, " free"], block: int
 ) -> dict[str, float]:
     """Term -> SI coefficient of one equation, for the coefficients that are not zero."""
-    values = _coef_SI(problem, free)
+    values = problem.coef_SI(free)
     own = (problem.equation == block) & (values != 0.0)
     names = [problem.term_names[j] for j in problem.column[own]]
     return dict(zip(names, values[own].tolist(), strict=True))
 
 
 def _model(
-    answer: _Reported, library: Library, units: Mapping[str, str], provenance: Mapping[str, str]
+    answer: Explanation, library: Library, units: Mapping[str, str], provenance: Mapping[str, str]
 ) -> SparseModel:
-    problem, found = answer.problem, answer.found
+    problem, found = answer.problem, answer.solution
     fit = found.annealed.fit
-    values = _coef_SI(problem, fit.free)
+    values = problem.coef_SI(fit.free)
     coef = np.zeros((len(library), len(problem.states)))
     coef[problem.column, problem.equation] = values
     used = values != 0.0
@@ -385,46 +322,6 @@ def _few(problem: EstimationProblem, max_terms: int) -> str:
         f"{problem.n_samples} samples do not tell which of {n_terms} terms "
         f"({SAMPLES_PER_TERM * n_terms} would): {max_terms} an equation at most were tried; "
         "name the terms that you know (terms=...), or take a smaller library"
-    )
-
-
-def _misfit(problem: EstimationProblem, found: Solution) -> str:
-    if found.fits:
-        return ""
-    signs = []
-    if not np.isfinite(found.score):
-        signs.append("whatever was tried runs away between two samples")
-    if found.flow_error:
-        signs.append(f"the states leave the model by {found.flow_error:g} of the noise per sample")
-    for state, memory in zip(problem.states, found.noise.unexplained, strict=True):
-        if memory:
-            signs.append(f"what is left of {state} lasts ({memory:.2f} from sample to sample)")
-    signs += [
-        f"{s} does not follow its own equation" for s in compress(problem.states, found.astray)
-    ]
-    return (
-        "no model of this library fits these data as far as their noise: "
-        + "; ".join(signs)
-        + ". The equations are the nearest found; add terms or states, or judge them by free run"
-    )
-
-
-def _at_limit(problem: EstimationProblem, found: Solution, max_terms: int) -> str:
-    """Warning if an equation uses all terms allowed: many terms may stand in for a missing one."""
-    if max_terms_for(problem, max_terms) < max_terms:
-        return ""  # too few samples: this is reported anyway
-    used = _coef_SI(problem, found.annealed.fit.free) != 0.0
-    full = [
-        f"{state}'"
-        for block, state in enumerate(problem.states)
-        if used[own := problem.equation == block].sum() >= max_terms < own.sum()
-    ]
-    if not full:
-        return ""
-    return (
-        f"{', '.join(full)} with as many terms as may be (max_terms={max_terms}): they may "
-        "stand for one that the library lacks, and intervals are not given; add terms to it, or "
-        "raise max_terms"
     )
 
 

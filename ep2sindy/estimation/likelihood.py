@@ -145,6 +145,7 @@ def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> T
     return fit
 
 
+@np.errstate(over="ignore", invalid="ignore")  # `Gram.finite` says whether the result counts
 def gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> Gram:
     """Linearise about a fit: all free coefficients of all equations, the states eliminated."""
     everything = np.ones_like(fit.support)

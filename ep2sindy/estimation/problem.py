@@ -174,6 +174,10 @@ class EstimationProblem:
         coef[self.column, self.equation] = self.C @ free + self.fixed
         return coef
 
+    def coef_SI(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefficients"]:
+        """All coefficients that may differ from zero, in SI."""
+        return (self.C @ free + self.fixed) * self.to_SI
+
     @property
     def driven(self) -> bool:
         """True if inputs drive the states."""

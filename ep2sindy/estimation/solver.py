@@ -1,15 +1,14 @@
 """The joint estimator of states and coefficients: annealing from free states to exact trajectories.
 
 It starts from smoothed states, and from all coefficients regressed on their derivatives. Supports
-are chosen at every level on the way (`anneal`), compared again at its end (`polish`), and once more
-with late channels brought forward (`solve`).
+are chosen at every level on the way (`anneal`), and compared again at its end (`polish`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, log
+from math import inf
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,12 +16,8 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.coerce import keep_inside
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.lateness import (
-    PAYS,
     DelayedGram,
     delayed_gram,
-    fit_delays,
-    move_channels,
-    suspect_delays,
 )
 from ep2sindy.estimation.likelihood import (
     FAR,
@@ -40,14 +35,7 @@ from ep2sindy.signals.kalman import KalmanSmoother
 
 SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
 SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
-LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
-ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
-# Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
-MAX_MOVES, SETTLED = 3, 0.05
-MIN_LEFT = 5  # fewest samples of a record that a smoother accepts
 MAX_PASSES = 4  # until noise and support agree; usually two
-# Smoother settings (log10 of process to measurement noise) to try if the likeliest one fails.
-OTHER_STARTS = (-2.0, 0.0, 2.0)
 # rho, and the share of a term's price charged at that level. Free states hide part of what a term
 # explains, and a term dropped too early would have to be found again.
 COOLING = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
@@ -101,72 +89,13 @@ class Solution:
         return exact and not self.astray.any() and bool(np.isfinite(self.score))
 
 
-@dataclass(frozen=True, eq=False)
-class Aligned:
-    """The solution for samples whose channels were brought forward by their delays.
+def from_smooth(
+    problem: EstimationProblem, log10_ratio: float | None, *, max_terms: int
+) -> Solution:
+    """Anneal with the smoother's noise, then with the residuals'.
 
-    delays: (d,), in mean steps.
+    log10_ratio: of the smoother, see `start_from_smooth`.
     """
-
-    problem: EstimationProblem
-    solution: Solution
-    delays: Float[np.ndarray, " d"]
-
-
-def solve(problem: EstimationProblem, *, max_terms: int) -> tuple[Solution, Aligned | None]:
-    """The most likely support, and a better explanation with late channels if there is one.
-
-    The search starts from the likeliest smoothing, and from other smoothings if that fits badly or
-    the samples are few.
-    """
-    spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
-
-    def rank(each: Solution) -> tuple[int, float]:
-        # A crude model may score best by following one state exactly and ignoring another.
-        let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
-        let_go &= problem.measured
-        return int(let_go.sum()), each.score
-
-    best = first = _from_start(problem, None, max_terms)
-    late = _align(problem, first, max_terms)
-    # Guesses of hidden states do not depend on how they are smoothed.
-    for log10_ratio in OTHER_STARTS if problem.measured.all() else ():
-        if late or (best.fits and problem.n_samples >= ENOUGH_SAMPLES):
-            break
-        best = min([best, _from_start(problem, log10_ratio, max_terms)], key=rank)
-    return best, late if best is first else _align(problem, best, max_terms)
-
-
-def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Aligned | None:
-    """A solution with late channels that fits and is likelier; None if there is none."""
-    around = found.annealed.around
-    if around is None:  # no model follows the samples
-        return None
-    support = found.annealed.fit.support
-    step = suspect_delays(problem, around, support, found.prices, max_terms=max_terms)
-    if step is None:
-        return None
-    here, now, late, delays = problem, found, step != 0.0, np.zeros(len(step))
-    for _ in range(MAX_MOVES):
-        delays = delays + step
-        here = move_channels(here, now.annealed.fit.paths, step)
-        if min(len(record.samples) for record in here.records) < MIN_LEFT:
-            return None  # shifts as long as a record are no delays
-        now = _from_start(here, None, max_terms)
-        if now.annealed.around is None:
-            return None
-        around, support = now.annealed.around, now.annealed.fit.support
-        step = fit_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
-        if np.abs(step).max() < SETTLED:
-            break
-    # Samples at the ends are left out: scale the likelihood to the full number of samples.
-    score = now.score + now.noise.deviance * (problem.n_samples / here.n_samples - 1.0)
-    price = late.sum() * log(problem.n_samples) + PAYS
-    return Aligned(here, now, delays) if now.fits and score + price < found.score else None
-
-
-def _from_start(problem: EstimationProblem, log10_ratio: float | None, max_terms: int) -> Solution:
-    """Anneal with the smoother's noise, then with the residuals'."""
     fit, std = start_from_smooth(problem, log10_ratio)
     prices = term_prices(problem, float(problem.n_samples))
     found = anneal(problem, fit, std, prices, COOLING, max_terms=max_terms)

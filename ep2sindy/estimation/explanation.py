@@ -1,0 +1,193 @@
+"""What explains the samples: an exact trajectory, channels that come late, or random pushes.
+
+The search for an exact trajectory starts from smoothed states. If what it finds does not fit, it
+starts again from states that random pushes let go their own way, and then from other smoothings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import compress
+from math import log
+
+import numpy as np
+from jaxtyping import Float
+
+from ep2sindy.estimation.lateness import (
+    PAYS,
+    delay_words,
+    fit_delays,
+    late_words,
+    move_channels,
+    suspect_delays,
+)
+from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.pushed import (
+    PushedFit,
+    push_words,
+    solution_under_pushes,
+    solve_pushed,
+)
+from ep2sindy.estimation.solver import Solution, from_smooth, max_terms_for, settle
+
+LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
+ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
+# Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
+MAX_MOVES, SETTLED = 3, 0.05
+MIN_LEFT = 5  # fewest samples of a record that a smoother accepts
+# Smoother settings (log10 of process to measurement noise) to try if no other start fits.
+OTHER_STARTS = (-2.0, 0.0, 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The reported solution: of the samples as given, or of the aligned samples if asked for.
+
+    misfit: the reason why it does not explain the samples; empty if it does. delays: (d,), in mean
+    steps. pushes: (d,), scaled. said: remarks on how the samples were changed or explained.
+    """
+
+    problem: EstimationProblem
+    solution: Solution
+    misfit: str
+    delays: Float[np.ndarray, " d"]
+    pushes: Float[np.ndarray, " d"]
+    said: tuple[str, ...] = ()
+
+    @property
+    def rank(self) -> tuple[bool, bool, float]:
+        """Order between ways in which hidden states may enter: least is best."""
+        return bool(self.misfit), bool(self.pushes.any()), self.solution.score
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """The solution for samples whose channels were brought forward by their delays.
+
+    delays: (d,), in mean steps. score: of all samples, with the price of the delays.
+    """
+
+    problem: EstimationProblem
+    solution: Solution
+    delays: Float[np.ndarray, " d"]
+    score: float
+
+
+def explain(problem: EstimationProblem, *, max_terms: int, align: bool) -> Explanation:
+    """The most likely support, and what beside its trajectory explains the samples, if need be."""
+    none = np.zeros(len(problem.states))
+    best, late, pushed = _solve(problem, max_terms_for(problem, max_terms))
+    if late is not None and not align:
+        return Explanation(problem, best, late_words(problem, late.delays), late.delays, none)
+    if late is not None:
+        said = f"{delay_words(problem, late.delays)}: brought together with the others"
+        misfit = _at_limit(late.problem, late.solution, max_terms)
+        return Explanation(late.problem, late.solution, misfit, late.delays, none, (said,))
+    if best.fits:
+        return Explanation(problem, best, _at_limit(problem, best, max_terms), none, none)
+    # A hidden state that is pushed explains whatever there is.
+    if pushed is not None and pushed.explains and problem.measured.all():
+        solution, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
+        limit = _at_limit(problem, solution, max_terms)
+        return Explanation(problem, solution, limit, none, pushed.errors.process, (said,))
+    return Explanation(problem, best, _misfit(problem, best), none, none)
+
+
+def _solve(
+    problem: EstimationProblem, max_terms: int
+) -> tuple[Solution, Aligned | None, PushedFit | None]:
+    """The best exact solution, a better one with late channels, and one under random pushes.
+
+    Each of the others is None if it is not asked for, or if there is none.
+    """
+    spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
+
+    def rank(each: Solution) -> tuple[bool, int, float]:
+        # The score of states that leave the flow is no likelihood, so those that fit come first. A
+        # crude model may score best by following one state exactly and ignoring another.
+        let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
+        return not each.fits, int((let_go & problem.measured).sum()), each.score
+
+    best = first = from_smooth(problem, None, max_terms=max_terms)
+    pushed = None
+    if not first.fits:
+        pushed = solve_pushed(problem, max_terms=max_terms)
+        exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=max_terms)
+        best = min([first, exact], key=rank)
+    late = _align(problem, first, max_terms)
+    if late is not None and not (best.fits and best.score < late.score):
+        return best, late, pushed
+    # Guesses of hidden states do not depend on how they are smoothed.
+    for log10_ratio in OTHER_STARTS if problem.measured.all() else ():
+        if best.fits and problem.n_samples >= ENOUGH_SAMPLES:
+            break
+        best = min([best, from_smooth(problem, log10_ratio, max_terms=max_terms)], key=rank)
+    return best, None if best is first else _align(problem, best, max_terms), pushed
+
+
+def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Aligned | None:
+    """A solution with late channels that fits and is likelier; None if there is none."""
+    around = found.annealed.around
+    if around is None:  # no model follows the samples
+        return None
+    support = found.annealed.fit.support
+    step = suspect_delays(problem, around, support, found.prices, max_terms=max_terms)
+    if step is None:
+        return None
+    here, now, late, delays = problem, found, step != 0.0, np.zeros(len(step))
+    for _ in range(MAX_MOVES):
+        delays = delays + step
+        here = move_channels(here, now.annealed.fit.paths, step)
+        if min(len(record.samples) for record in here.records) < MIN_LEFT:
+            return None  # shifts as long as a record are no delays
+        now = from_smooth(here, None, max_terms=max_terms)
+        if now.annealed.around is None:
+            return None
+        around, support = now.annealed.around, now.annealed.fit.support
+        step = fit_delays(here, around, late, support, now.prices, max_terms=max_terms)[1]
+        if np.abs(step).max() < SETTLED:
+            break
+    # Samples at the ends are left out: scale the likelihood to the full number of samples.
+    score = now.score + now.noise.deviance * (problem.n_samples / here.n_samples - 1.0)
+    score += late.sum() * log(problem.n_samples) + PAYS
+    return Aligned(here, now, delays, score) if now.fits and score < found.score else None
+
+
+def _misfit(problem: EstimationProblem, found: Solution) -> str:
+    if found.fits:
+        return ""
+    signs = []
+    if not np.isfinite(found.score):
+        signs.append("whatever was tried runs away between two samples")
+    if found.flow_error:
+        signs.append(f"the states leave the model by {found.flow_error:g} of the noise per sample")
+    for state, memory in zip(problem.states, found.noise.unexplained, strict=True):
+        if memory:
+            signs.append(f"what is left of {state} lasts ({memory:.2f} from sample to sample)")
+    signs += [
+        f"{s} does not follow its own equation" for s in compress(problem.states, found.astray)
+    ]
+    return (
+        "no model of this library fits these data as far as their noise: "
+        + "; ".join(signs)
+        + ". The equations are the nearest found; add terms or states, or judge them by free run"
+    )
+
+
+def _at_limit(problem: EstimationProblem, found: Solution, max_terms: int) -> str:
+    """Warning if an equation uses all terms allowed: many terms may stand in for a missing one."""
+    if max_terms_for(problem, max_terms) < max_terms:
+        return ""  # too few samples: this is reported anyway
+    used = problem.coef_SI(found.annealed.fit.free) != 0.0
+    full = [
+        f"{state}'"
+        for block, state in enumerate(problem.states)
+        if used[own := problem.equation == block].sum() >= max_terms < own.sum()
+    ]
+    if not full:
+        return ""
+    return (
+        f"{', '.join(full)} with as many terms as may be (max_terms={max_terms}): they may "
+        "stand for one that the library lacks, and intervals are not given; add terms to it, or "
+        "raise max_terms"
+    )
