@@ -154,7 +154,7 @@ def _offer_supports(
     yy = max(gram.offset - gram.linear[kept] @ inverse @ gram.linear[kept], 1.0)
     # A column that the kept ones span leaves only rounding: it is not available.
     square = np.diag(xx).copy()
-    square[square <= CUTOFF * np.diag(gram.quadratic)[own]] = 0.0
+    square[~(square > CUTOFF * np.abs(np.diag(gram.quadratic)[own]))] = 0.0
     size = np.sqrt(zero_to_one(square))
     at_hand = square > 0.0
     unit = np.where(at_hand[:, None] & at_hand, xx / np.outer(size, size), 0.0)
