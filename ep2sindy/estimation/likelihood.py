@@ -293,7 +293,7 @@ def observe(
     return Seen(residuals, variance, squares)
 
 
-# Far out, limits may be one number to rounding: their probability is zero, and the squares infinite.
+# Far out, limits may be one number to rounding: the probability is zero, and the squares infinite.
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
 def between(
     lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"]
