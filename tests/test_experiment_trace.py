@@ -1,4 +1,5 @@
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -222,6 +223,28 @@ def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> Non
     given = computed(composed(*glance(path, tmp_path, f"offset={x.mean()}")))
     assert given.summary["signal"]["embedding"] == "LogRate"
     assert "offset=MEAN" not in given.log
+
+
+def test_a_mean_that_was_lost_is_fitted_with_its_interval(tmp_path: Path) -> None:
+    t, x = signal(12.0)
+    noisy = x + 0.02 * x.std() * np.random.default_rng(0).standard_normal(len(x))
+    path = scope(tmp_path / "scope.csv", t, noisy - x.mean())
+    found = computed(composed(*toy(path, tmp_path, "offset=fit"))).summary
+    (words,) = [each for each in found["signal"]["done"] if "offset" in each]
+    value, low, high = map(float, re.findall(r"-?\d+\.?\d*(?= A|(?: to)|\))", words))
+    assert low < x.mean() < high
+    assert value == pytest.approx(x.mean(), rel=0.05)
+    assert found["model"]["equations"]["I"] == pytest.approx({"I*g": 1.0})
+    assert found["living"]["verdict"] in ("lives", "alike")  # over three periods
+
+
+def test_an_offset_that_no_equations_tell_is_refused(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 60.0, 1201)
+    path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)
+    with pytest.raises(ValueError, match=r"offset=fit asks for equations .* write offset=NUMBER"):
+        computed(composed(*toy(path, tmp_path, "offset=fit", "degree=1")))
+    with pytest.raises(ValueError, match="offset must be a number or fit: 'fitted' came"):
+        computed(composed(*toy(path, tmp_path, "offset=fitted")))
 
 
 def test_discover_says_that_one_state_cannot_oscillate(record: Path, tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ LAGS, MORE_DEGREES, MAX_POWERS = range(1, 9), 2, 60
 # Standard errors that random innovations may show: see `PushedFit`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
 COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
+RUNAWAY = 1e6  # innovations, in RMS of the states, of a model that follows no samples
 SETTLING = 5  # samples from whose start on innovations count
 
 
@@ -199,6 +200,9 @@ def _left_over(
         variances = error_variances(len(each[2]), level.noise[0][0], np.asarray(level.push))
         new.append(np.nan_to_num(filtered(*each, *variances, FREE_START)[0][SETTLING:]))
     joined = np.concatenate(new)
+    if not (np.abs(joined) < RUNAWAY).all():
+        all_of_it = np.full(joined.shape[1], np.inf)
+        return all_of_it, all_of_it, all_of_it
     size = np.maximum(np.linalg.norm(joined, axis=0), 1e-150)
     products = [sum((own[lag:] * own[:-lag]).sum(axis=0) for own in new) for lag in LAGS]
     root = np.sqrt(len(joined))

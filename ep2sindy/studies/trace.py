@@ -47,7 +47,7 @@ from ep2sindy.signals.trace import Trace, from_one_signal
 from ep2sindy.studies.living import FreeCycle
 from ep2sindy.studies.source import Source, zone_of
 from ep2sindy.studies.study import Count, Deferred, Positive, Share
-from ep2sindy.studies.trace_hidden import names_of, search_hidden
+from ep2sindy.studies.trace_hidden import fit_offset, names_of, search_hidden
 from ep2sindy.studies.trace_result import (
     Attempt,
     Outcome,
@@ -76,7 +76,8 @@ class Study:
     """Find states and equations of one signal, and test the model on time it has not seen.
 
     signal: the variable. unit: needed if the data group does not describe the signal, or to
-    override its unit; None takes the described unit, or none. offset: added to the samples, in SI.
+    override its unit; None takes the described unit, or none. offset: added to the samples, in
+    SI; fit finds it, for a positive signal that lost its mean.
     embedding: how states are made. hidden: they are found along with their equations; log_rate,
     rate and delays: by smoothing the signal; auto: hidden if an exact trajectory of such equations
     explains the signal to its noise, and lives, else by smoothing. n_states: or auto: two, and
@@ -90,7 +91,7 @@ class Study:
     source: Source
     method: AnyMethod
     signal: str
-    offset: float
+    offset: float | str
     embedding: str
     n_states: int | str
     harmonics: Positive
@@ -108,6 +109,8 @@ class Study:
             raise ValueError(
                 f"embedding must be auto, {' or '.join(known)}: {self.embedding!r} came"
             )
+        if isinstance(self.offset, str) and self.offset != "fit":
+            raise ValueError(f"offset must be a number or fit: {self.offset!r} came")
         if self.n_states != "auto":
             if isinstance(self.n_states, str):
                 raise ValueError(f"n_states must be auto or a number: {self.n_states!r} came")
@@ -115,7 +118,7 @@ class Study:
 
     def compute(self, run: Run) -> Outcome:
         data = self._sampled(run)
-        signal = from_one_signal(data, decimate=self.decimate, detrend=self.detrend)
+        signal = self._with_offset(self._signal(data), data, run)
         for text in signal.done:
             run.say(f"{signal.name}: {text}")
         for text in signal.advice:
@@ -130,6 +133,29 @@ class Study:
         with run.progress(None, "", "forecasts, free run and limit cycle"):
             return evaluate(signal, n_fitted, best, attempts)
 
+    def _signal(self, data: Trajectory) -> Trace:
+        return from_one_signal(data, decimate=self.decimate, detrend=self.detrend)
+
+    def _with_offset(self, signal: Trace, data: Trajectory, run: Run) -> Trace:
+        """The signal with its fitted offset, if one is asked for."""
+        if self.offset != "fit":
+            return signal
+        names = LogRate().names(signal.name)
+        library = self._library(names, (), max(2, self.degree))
+        past = signal.window(0, count_fitted(signal, self.held_out))
+        found = fit_offset(past, library, self._by_trajectories, run.watch)
+        moved = self._signal(replace(data, states=data.states + found.value))
+        words = (
+            f"offset of {found.value:.4g} {signal.unit} fitted and added (95 %: {found.low:.4g} to "
+            f"{found.high:.4g})"
+        )
+        return replace(moved, done=(*moved.done, words))
+
+    @property
+    def _degrees(self) -> range:
+        """Of the libraries of hidden states, the smallest first."""
+        return range(min(2, self.degree), self.degree + 1)
+
     def _sampled(self, run: Run) -> Trajectory:
         zone = zone_of(self.source) or Zone()
         space = [axis for axis, bounds in (("z", zone.z), ("r", zone.r)) if bounds is None]
@@ -141,7 +167,8 @@ class Study:
         with run.progress(None, "", "data"):
             field = source.field()
         sampled = source.sampled(field, [], run)
-        return replace(sampled, states=sampled.states + self.offset)
+        known = 0.0 if isinstance(self.offset, str) else self.offset
+        return replace(sampled, states=sampled.states + known)
 
     def _numbers(self, signal: Trace) -> list[int]:
         """Numbers of states to try; a signal of two states either repeats itself or spirals."""
@@ -165,7 +192,7 @@ class Study:
             names, functions = names_of(past, n_states), self.functions
             if any(FITTED in text for text in functions):
                 functions = self._fitted_functions(self._embedded(past, n_states).embedded)
-            for degree in range(min(2, self.degree), self.degree + 1):
+            for degree in self._degrees:
                 yield self._library(names, functions, degree)
 
     @property
@@ -279,8 +306,8 @@ def lost_mean(signal: Trace) -> str | None:
         return None
     return (
         f"{signal.name} is pulses that take either sign, as a positive signal does that lost its "
-        f"mean in a capacitor: offset=MEAN gives it back (over {-signal.x.min():.3g}), and the "
-        "growth rate with it, which is simpler"
+        f"mean in a capacitor: offset=MEAN gives it back (over {-signal.x.min():.3g}; offset=fit "
+        "looks for it), and the growth rate with it, which is simpler"
     )
 
 

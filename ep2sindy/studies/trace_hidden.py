@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import Discovery, discover
@@ -15,10 +15,14 @@ from ep2sindy.model.comparison import SPIRALS, Verdict
 from ep2sindy.model.free_run import free_run
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.signals.embedding import Chosen, Embedded, LogRate, Rate
-from ep2sindy.signals.trace import Trace
+from ep2sindy.signals.trace import Trace, is_positive
 from ep2sindy.studies.living import FreeCycle
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that the search sees
+
+# Means, in standard deviations, of the signals from which an offset is looked for: the search for
+# the growth rate finds its way from some of them alone.
+SHIFTS = (0.3, 0.0, 0.1, -0.3)
 
 ENDURING = (Verdict.LIVES, Verdict.FOLLOWS, Verdict.ALIKE)
 
@@ -84,6 +88,52 @@ def search_hidden(
         if search.explains:
             break
     return search
+
+
+@dataclass(frozen=True)
+class FittedOffset:
+    """What must be added to a signal for its growth rate to obey equations, in the signal's unit.
+
+    low, high: 95 % interval.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+def fit_offset(
+    past: Trace, library: Library, method: TrajectorySearch, progress: Progress
+) -> FittedOffset:
+    """The offset of a signal x, by the equations of x and of the growth rate g of x + offset.
+
+    x' = (x + offset) g, so the offset is the coefficient of g where that of x g is one. library: of
+    x and g. Raises ValueError if none of its models explains the signal to its noise, or if the
+    signal and its offset are not positive.
+    """
+    run = alone(past.window(max(0, len(past.t) - MAX_FITTED), len(past.t)))
+    mean, spread = run.states.mean(), run.states.std()
+    x, g = library.variables
+    for share in SHIFTS:
+        shift = share * spread - mean
+        found = discover(
+            replace(run, states=run.states + shift),
+            library,
+            method,
+            relations=[f"{x}: {x}*{g} == 1"],
+            terms={x: [g, f"{x}*{g}"]},
+            hidden=[g],
+            progress=progress,
+        )
+        rest = found.model.terms(x).get(g, 0.0)
+        if not found.misfit and is_positive(past.t, past.x + shift + rest):
+            low, high = found.model.intervals(x).get(g, (rest, rest))
+            return FittedOffset(shift + rest, shift + low, shift + high)
+    raise ValueError(
+        f"offset=fit asks for equations of {past.name} with an offset and of its growth rate that "
+        "explain it to its noise: none of this library do; write offset=NUMBER, as the sensor's "
+        "mean is known, or leave it out"
+    )
 
 
 def _endures(estimate: Estimate, signal: str) -> bool:

@@ -268,6 +268,8 @@ class Outcome:
         names = self.states.state_names
         made = f"{self.chosen.embedding.says}, {', '.join(names[:-1])} and {names[-1]}"
         per_period = signal.period_s / self.states.dt_s
+        is_hidden = isinstance(self.chosen.embedding, HiddenStates)
+        too_fast = "" if is_hidden else ", and what is too fast to be followed"
         turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
         blocks: list[Block] = [
             Text(
@@ -276,9 +278,8 @@ class Outcome:
             ),
             Text(f"states: {made} ({self.chosen.reason})"),
             Text(
-                f"noise, and what is too fast to be followed: {embedded.noise_std:.3g} "
-                f"{signal.unit}, {100.0 * embedded.noise_std / signal.x.std():.2g} % of the "
-                "standard deviation"
+                f"noise{too_fast}: {embedded.noise_std:.3g} {signal.unit}, "
+                f"{100.0 * embedded.noise_std / signal.x.std():.2g} % of the standard deviation"
             ),
             *(Text(each) for each in signal.done),
             *(Text(each.text) for each in self.attempts),
@@ -322,7 +323,8 @@ class Outcome:
 
     def _stability(self) -> list[tuple[str, bool]]:
         if self.cycle is None:
-            return [("the model has no cycle near its run", True)]
+            is_asked = self.signal.cycle is not None
+            return [("the model has no cycle near its run", True)] if is_asked else []
         return [(self.free.text, self.run.verdict is not Verdict.LIVES)]
 
     def n_terms(self, *, known: bool) -> int:
