@@ -192,6 +192,7 @@ FOREIGN = {
     "app.runner": "a module of a user's own, which may be a package of experiments",
     "runtime.compilation": "kernels of numba, which has no public way to its cache",
     "runtime.files": "an error of any kind, which may say what the system said",
+    "systems.collection": "systems of another package",
     "trust.interruption": "os and signal, which have less on Windows",
     "trust.user_code": "whatever a user marked for configs",
 }

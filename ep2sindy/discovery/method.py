@@ -99,21 +99,21 @@ class TrajectorySearch:
 
     For noisy samples of all states of a system whose law the library holds. No derivative is
     estimated, so it finds laws that no regression can (docs/estimation.md). The noise may be white,
-    or correlated over some samples. max_terms: of one equation. align: if True, channels found to
-    be late are shifted forward; if False, late channels make the model a misfit, and their delays
-    are reported.
+    or correlated over some samples. max_terms: of one equation; None allows seven, and more where
+    an equation of a large library needs them. align: if True, channels found to be late are shifted
+    forward; if False, late channels make the model a misfit, and their delays are reported.
     selection: Evidence, or a rule that runs models, such as FreeRunScore. depth: candidates kept
     per size, for such a rule to judge.
     Raises ValueError for fewer than one term, or a rule that does not go with the search.
     """
 
-    max_terms: int = 7
+    max_terms: int | None = None
     align: bool = False
     selection: SystemSelection | Selection = field(default_factory=Evidence)
     depth: int = 1
 
     def __post_init__(self) -> None:
-        set_counts(self, {"max_terms": 1, "depth": 1})
+        set_counts(self, {"depth": 1} | ({} if self.max_terms is None else {"max_terms": 1}))
         check_kind("selection", self.selection, Selection, "ep.Evidence()")
         if not isinstance(self.selection, Evidence | SystemSelection):
             raise ValueError(

@@ -22,7 +22,6 @@ from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Solution,
     enough_samples,
-    max_terms_for,
 )
 from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
@@ -119,7 +118,7 @@ def estimate(
     runs: Runs,
     library: Library,
     *,
-    max_terms: int = 7,
+    max_terms: int | None = None,
     align: bool = False,
     relations: Sequence[Relation | str] = (),
     terms: Mapping[str, Sequence[str]] | None = None,
@@ -131,9 +130,10 @@ def estimate(
     """Estimate the states at every sample and sparse coefficients together, by maximum likelihood.
 
     runs: one run or a list, see `trajectories_of`; all share the coefficients. Samples may be
-    spaced unequally. Inputs are taken as exact. max_terms: the most terms of one equation. align:
-    if True, channels found to be late are shifted forward; if False, late channels make the model a
-    misfit, and their delays are reported.
+    spaced unequally. Inputs are taken as exact. max_terms: the most terms of one equation; None
+    allows seven, and more where an equation of a large library needs them. align: if True, channels
+    found to be late are shifted forward; if False, late channels make the model a misfit, and their
+    delays are reported.
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
     known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
     which the library has; all ways in which they may enter are compared. progress: True shows bars;
@@ -156,14 +156,15 @@ def estimate(
 def estimate_task(
     task: Task,
     *,
-    max_terms: int,
+    max_terms: int | None,
     align: bool,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
     progress: Progress = SILENT,
 ) -> Estimate:
     """Answer a task by `estimate`."""
-    max_terms = check_count("max_terms", max_terms)
+    if max_terms is not None:
+        max_terms = check_count("max_terms", max_terms)
     check_size(task.runs, task.library, task.terms)
     with progress.stage(None, "step", "states and coefficients") as advance:
         best = []
@@ -176,11 +177,16 @@ def estimate_task(
     if task.hidden:
         runs = [_with_path(answer, k, run) for k, run in enumerate(runs)]
     model = _model(answer, task.library, units or runs[0].units, provenance or {})
-    return _report(answer, model, runs, max_terms, progress)
+    return _report(answer, model, runs, progress)
 
 
 def _try(
-    task: Task, known: Task, ways: Sequence[Entrance], max_terms: int, align: bool, advance: Advance
+    task: Task,
+    known: Task,
+    ways: Sequence[Entrance],
+    max_terms: int | None,
+    align: bool,
+    advance: Advance,
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
@@ -204,12 +210,11 @@ def _report(
     answer: Explanation,
     model: SparseModel,
     runs: Sequence[Trajectory],
-    max_terms: int,
     watch: Progress,
 ) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
     problem, found = answer.problem, answer.solution
-    fit, few_terms = found.annealed.fit, max_terms_for(problem, max_terms)
+    fit, few_terms = found.annealed.fit, answer.max_terms
     pair = gram(problem, fit, found.annealed.level)
     supports = {
         state: _score_supports(problem, pair, found, block, few_terms)
@@ -270,9 +275,10 @@ def _model(
     fit = found.annealed.fit
     values = problem.coef_SI(fit.free)
     coef = np.zeros((len(library), len(problem.states)))
-    coef[problem.column, problem.equation] = values
+    column = problem.places[problem.column]
+    coef[column, problem.equation] = values
     used = values != 0.0
-    order = np.lexsort((problem.column[used], problem.equation[used]))
+    order = np.lexsort((column[used], problem.equation[used]))
     rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
     # If the residuals exceed the noise, intervals would not cover the truth.
     known = found.fits and not answer.misfit
@@ -317,7 +323,7 @@ def _rivals(
 def _few(problem: EstimationProblem, max_terms: int) -> str:
     if enough_samples(problem):
         return ""
-    n_terms = len(problem.library)
+    n_terms = len(problem.candidates.library)
     return (
         f"{problem.n_samples} samples do not tell which of {n_terms} terms "
         f"({SAMPLES_PER_TERM * n_terms} would): {max_terms} an equation at most were tried; "

@@ -29,7 +29,9 @@ from ep2sindy.estimation.pushed import (
     solve_pushed,
 )
 from ep2sindy.estimation.solver import Solution, from_smooth, max_terms_for, settle
+from ep2sindy.estimation.working_set import search_within
 
+FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where all are used
 LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
 ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
 # Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
@@ -43,12 +45,14 @@ OTHER_STARTS = (-2.0, 0.0, 2.0)
 class Explanation:
     """The reported solution: of the samples as given, or of the aligned samples if asked for.
 
-    misfit: the reason why it does not explain the samples; empty if it does. delays: (d,), in mean
-    steps. pushes: (d,), scaled. said: remarks on how the samples were changed or explained.
+    max_terms: the most terms of one equation that were tried. misfit: the reason why it does not
+    explain the samples; empty if it does. delays: (d,), in mean steps. pushes: (d,), scaled. said:
+    remarks on how the samples were changed or explained.
     """
 
     problem: EstimationProblem
     solution: Solution
+    max_terms: int
     misfit: str
     delays: Float[np.ndarray, " d"]
     pushes: Float[np.ndarray, " d"]
@@ -73,32 +77,60 @@ class Aligned:
     score: float
 
 
-def explain(problem: EstimationProblem, *, max_terms: int, align: bool) -> Explanation:
-    """The most likely support, and what beside its trajectory explains the samples, if need be."""
+def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -> Explanation:
+    """The most likely support, and what beside its trajectory explains the samples, if need be.
+
+    max_terms: of one equation; None begins with 7, and allows more where an equation needs them.
+    """
+    problem, first, max_terms = _search_by_size(problem, max_terms)
+    few_terms = max_terms_for(problem, max_terms)
+    best, late, pushed = _solve(problem, first, few_terms)
     none = np.zeros(len(problem.states))
-    best, late, pushed = _solve(problem, max_terms_for(problem, max_terms))
     if late is not None and not align:
-        return Explanation(problem, best, late_words(problem, late.delays), late.delays, none)
+        words = late_words(problem, late.delays)
+        return Explanation(problem, best, few_terms, words, late.delays, none)
     if late is not None:
         said = f"{delay_words(problem, late.delays)}: brought together with the others"
         misfit = _at_limit(late.problem, late.solution, max_terms)
-        return Explanation(late.problem, late.solution, misfit, late.delays, none, (said,))
+        return Explanation(
+            late.problem, late.solution, few_terms, misfit, late.delays, none, (said,)
+        )
     if best.fits:
-        return Explanation(problem, best, _at_limit(problem, best, max_terms), none, none)
+        limit = _at_limit(problem, best, max_terms)
+        return Explanation(problem, best, few_terms, limit, none, none)
     # A hidden state that is pushed explains whatever there is.
     if pushed is not None and pushed.explains and problem.measured.all():
         solution, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
         limit = _at_limit(problem, solution, max_terms)
-        return Explanation(problem, solution, limit, none, pushed.errors.process, (said,))
-    return Explanation(problem, best, _misfit(problem, best), none, none)
+        process = pushed.errors.process
+        return Explanation(problem, solution, few_terms, limit, none, process, (said,))
+    return Explanation(problem, best, few_terms, _misfit(problem, best), none, none)
+
+
+def _search_by_size(
+    problem: EstimationProblem, max_terms: int | None
+) -> tuple[EstimationProblem, Solution, int]:
+    """The solution from smoothed states, the problem of its working set, and the limit of terms."""
+    limit = max_terms or FIRST_MAX_TERMS
+    part, found = search_within(problem, max_terms=max_terms_for(problem, limit))
+    # More than half of the candidates would stand in for terms that the library lacks.
+    most = 0 if max_terms else int(np.bincount(problem.block).max()) // 2
+    while limit < most and _full(part, found, limit):
+        wider = min(limit + MORE_TERMS, most)
+        tried, better = search_within(problem, max_terms=max_terms_for(problem, wider))
+        if (not better.fits, better.score) >= (not found.fits, found.score):
+            break
+        part, found, limit = tried, better, wider
+    return part, found, limit
 
 
 def _solve(
-    problem: EstimationProblem, max_terms: int
+    problem: EstimationProblem, first: Solution, max_terms: int
 ) -> tuple[Solution, Aligned | None, PushedFit | None]:
     """The best exact solution, a better one with late channels, and one under random pushes.
 
-    Each of the others is None if it is not asked for, or if there is none.
+    first: from smoothed states. Each of the others is None if it is not asked for, or if there is
+    none.
     """
     spread = np.concatenate([record.samples for record in problem.records]).std(axis=0)
 
@@ -108,8 +140,7 @@ def _solve(
         let_go = (each.noise.unexplained > 0.0) & (each.noise.std > LET_GO * spread)
         return not each.fits, int((let_go & problem.measured).sum()), each.score
 
-    best = first = from_smooth(problem, None, max_terms=max_terms)
-    pushed = None
+    best, pushed = first, None
     if not first.fits:
         pushed = solve_pushed(problem, max_terms=max_terms)
         exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=max_terms)
@@ -174,16 +205,20 @@ def _misfit(problem: EstimationProblem, found: Solution) -> str:
     )
 
 
+def _full(problem: EstimationProblem, found: Solution, max_terms: int) -> list[str]:
+    """Equations with all terms allowed, though the library has more."""
+    if max_terms_for(problem, max_terms) < max_terms:
+        return []  # too few samples: this is reported anyway
+    used = problem.coef_SI(found.annealed.fit.free) != 0.0
+    n_used = np.bincount(problem.equation[used], minlength=len(problem.states))
+    n_all = np.bincount(problem.candidates.equation, minlength=len(problem.states))
+    full = (n_used >= max_terms) & (n_all > max_terms)
+    return [f"{state}'" for state in compress(problem.states, full)]
+
+
 def _at_limit(problem: EstimationProblem, found: Solution, max_terms: int) -> str:
     """Warning if an equation uses all terms allowed: many terms may stand in for a missing one."""
-    if max_terms_for(problem, max_terms) < max_terms:
-        return ""  # too few samples: this is reported anyway
-    used = problem.coef_SI(found.annealed.fit.free) != 0.0
-    full = [
-        f"{state}'"
-        for block, state in enumerate(problem.states)
-        if used[own := problem.equation == block].sum() >= max_terms < own.sum()
-    ]
+    full = _full(problem, found, max_terms)
     if not full:
         return ""
     return (

@@ -29,31 +29,42 @@ def term_values(columns, table):
 
 
 @compiled
-def sensitivity_stage(jacobian, terms, equation, column, start, lead, slope, weight, total):
-    """One Runge-Kutta stage of the sensitivities, at all samples at once.
+def sensitivities(jacobians, terms, equation, column, leads, weights, steps, slopes):
+    """One Runge-Kutta step of the sensitivities; `slopes` (n, d, d + p) is advanced in place.
 
-    start: (n, d, d + p), the sensitivities at the start of the step. lead: (n,), the distance in
-    time of this stage from the start, to be covered along `slope` of the previous stage. slope is
-    overwritten by this stage's, and total grows by weight (n,) times it. Coefficient c multiplies
-    terms[:, column[c]] in equation[c].
+    jacobians: (stages, n, d, d) and terms: (stages, n, products), at the stages of each step.
+    leads, weights: (stages,), of the method, as shares of the step; steps: (n,), in time.
+    Coefficient c multiplies terms[..., column[c]] in equation[c]. A sample passes all stages before
+    the next one comes, so that what it needs stays in the cache.
     """
-    n, d, width = start.shape
-    here = np.empty((d, width))
+    n, d, width = slopes.shape
+    here, slope, total = np.empty((d, width)), np.empty((d, width)), np.empty((d, width))
     for k in range(n):
         for i in range(d):
             for c in range(width):
-                here[i, c] = start[k, i, c] + lead[k] * slope[k, i, c]
-        for i in range(d):
-            for c in range(width):
-                value = 0.0
+                slope[i, c] = 0.0
+                total[i, c] = slopes[k, i, c]
+        for s in range(len(leads)):
+            lead, weight = leads[s] * steps[k], weights[s] * steps[k]
+            for i in range(d):
+                for c in range(width):
+                    here[i, c] = slopes[k, i, c] + lead * slope[i, c]
+            for i in range(d):
+                for c in range(width):
+                    slope[i, c] = 0.0
                 for j in range(d):
-                    value += jacobian[k, i, j] * here[j, c]
-                slope[k, i, c] = value
-        for c in range(width - d):
-            slope[k, equation[c], d + c] += terms[k, column[c]]
+                    factor = jacobians[s, k, i, j]
+                    if factor != 0.0:
+                        for c in range(width):
+                            slope[i, c] += factor * here[j, c]
+            for c in range(width - d):
+                slope[equation[c], d + c] += terms[s, k, column[c]]
+            for i in range(d):
+                for c in range(width):
+                    total[i, c] += weight * slope[i, c]
         for i in range(d):
             for c in range(width):
-                total[k, i, c] += weight[k] * slope[k, i, c]
+                slopes[k, i, c] = total[i, c]
 
 
 @compiled
@@ -88,10 +99,10 @@ def _step(flow, miss, mean, by_coef, cov, process, buffer):
             value += flow[i, j] * mean[j]
         buffer[i, 0] = value
         for a in range(p):
-            value = flow[i, d + a]
-            for j in range(d):
-                value += flow[i, j] * by_coef[j, a]
-            buffer[i, 1 + a] = value
+            buffer[i, 1 + a] = flow[i, d + a]
+        for j in range(d):
+            for a in range(p):  # innermost, where it is a sum of vectors
+                buffer[i, 1 + a] += flow[i, j] * by_coef[j, a]
         for m in range(d):
             value = 0.0
             for j in range(d):

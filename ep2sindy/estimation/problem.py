@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.kernels import sensitivity_stage, term_values
+from ep2sindy.estimation.kernels import sensitivities, term_values
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, constraint
 from ep2sindy.runtime.progress import Advance, nothing
@@ -106,7 +106,9 @@ class EstimationProblem:
     identity.
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
-    measured: (d,), False for hidden states. advance: called at every step of a fit.
+    measured: (d,), False for hidden states. advance: called at every step of a fit. whole: the
+    problem with all terms, if this one has only those of a working set; places: (terms,), their
+    positions in its library.
     """
 
     library: Library
@@ -123,8 +125,33 @@ class EstimationProblem:
     input_scale: Float[np.ndarray, " n_inputs"]
     step_s: float
     measured: Bool[np.ndarray, " d"]
+    places: Int[np.ndarray, " terms"]
     inputs: tuple[str, ...] = ()
     advance: Advance = nothing
+    whole: EstimationProblem | None = None
+
+    def restricted(self, kept: Bool[np.ndarray, " free"]) -> EstimationProblem:
+        """The same records with some of the coefficients; the others are zero."""
+        rows = (self.C[:, kept] != 0.0).any(axis=1) | (self.fixed != 0.0)
+        columns = np.unique(self.column[rows])
+        return replace(
+            self,
+            library=self.library.take(columns),
+            term_names=tuple(self.term_names[column] for column in columns),
+            equation=self.equation[rows],
+            column=np.searchsorted(columns, self.column[rows]),
+            C=self.C[np.ix_(rows, kept)],
+            fixed=self.fixed[rows],
+            required=self.required[kept],
+            to_SI=self.to_SI[rows],
+            places=self.places[columns],
+            whole=self.candidates,
+        )
+
+    @property
+    def candidates(self) -> EstimationProblem:
+        """The problem with all terms that may be in the model."""
+        return self.whole or self
 
     def record(self, run: Trajectory) -> ScaledRecord:
         """A run with the same states and inputs, in the scale of this problem."""
@@ -209,6 +236,36 @@ class EstimationProblem:
             states = total
         return states
 
+    def term_steps(
+        self,
+        record: ScaledRecord,
+        states: Float[np.ndarray, "steps d"],
+        free: Float[np.ndarray, " free"],
+        n_substeps: int,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`ends`, the integral of every term over each step, and each state's growth by itself.
+
+        Returns (steps, d), (steps, terms), and (steps, d), the derivative of a state's end by the
+        state if the other states are held.
+        """
+        coef = self.coef(free)
+        d = len(self.states)
+        rates = self._shares[:, 0].T @ coef
+        growths = np.einsum("tip,ti->pi", self._shares[:, 1 : 1 + d], coef)
+        h = record.steps[:, None] / n_substeps
+        terms, growth = np.zeros((len(states), len(self.library))), np.zeros_like(states)
+        for k in range(n_substeps):
+            slope, total = np.zeros_like(states), states
+            for lead, weight in STAGES:
+                here = states + lead * h * slope
+                values = self._products_at(record, here, (k + lead) / n_substeps)
+                slope = values @ rates
+                total = total + weight * h * slope
+                terms += weight * h * values[:, self._places]
+                growth += weight * h * (values @ growths)
+            states = total
+        return states, terms, np.exp(growth)
+
     @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
     def flow(
         self,
@@ -231,17 +288,19 @@ class EstimationProblem:
         slopes[:, np.arange(d), np.arange(d)] = 1.0
         for k in range(n_substeps):
             slope, total = np.zeros_like(states), states
-            stage, sums = np.zeros_like(slopes), slopes.copy()
+            jacobians, values = [], []
             for lead, weight in STAGES:
                 here = states + (lead * h)[:, None] * slope
-                values = self._products_at(record, here, (k + lead) / n_substeps)
-                both = values @ rates
-                slope, jacobian = both[:, :d], both[:, d:].reshape(-1, d, d)
-                sensitivity_stage(
-                    jacobian, values, equation, column, slopes, lead * h, stage, weight * h, sums
-                )
+                values.append(self._products_at(record, here, (k + lead) / n_substeps))
+                both = values[-1] @ rates
+                slope = both[:, :d]
+                jacobians.append(both[:, d:].reshape(-1, d, d))
                 total = total + (weight * h)[:, None] * slope
-            states, slopes = total, sums
+            leads, weights = np.array(STAGES).T
+            sensitivities(
+                np.stack(jacobians), np.stack(values), equation, column, leads, weights, h, slopes
+            )
+            states = total
         if self.related:
             by_free = slopes[:, :, d:] @ self.C[np.ix_(involved, support)]
             slopes = np.concatenate([slopes[:, :, :d], by_free], axis=2)
@@ -321,6 +380,7 @@ def scale_problem(
         input_scale=size[len(states) :],
         step_s=step_s,
         measured=np.isin(states, measured or states),
+        places=np.arange(len(over)),
         inputs=tuple(inputs),
         advance=advance,
     )

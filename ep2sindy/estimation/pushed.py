@@ -208,7 +208,7 @@ def _left_over(
     root = np.sqrt(len(joined))
     lasting = root * np.abs(products).max(axis=0) / np.square(size)
     before = np.concatenate([path[SETTLING - 1 : -1] for path in fit.paths])
-    powers = _powers(before, int(problem.library.degrees.max()) + MORE_DEGREES)
+    powers = _powers(before, int(problem.candidates.library.degrees.max()) + MORE_DEGREES)
     unit = root * joined / size
     together = np.square(np.linalg.qr(powers)[0].T @ unit).sum(axis=0) - powers.shape[1]
     single = _largest_share(problem, fit, before, powers, unit)

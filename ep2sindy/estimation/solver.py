@@ -59,7 +59,7 @@ def max_terms_for(problem: EstimationProblem, max_terms: int) -> int:
 
 def enough_samples(problem: EstimationProblem) -> bool:
     """True if there are enough samples to tell which terms of the library are present."""
-    return problem.n_samples >= SAMPLES_PER_TERM * len(problem.library)
+    return problem.n_samples >= SAMPLES_PER_TERM * len(problem.candidates.library)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,24 +258,48 @@ def start_from_smooth(
     each record and state. Below about twenty samples a period this ratio may take signal for noise.
     Returns the fit, and the residuals' standard deviations, by record (samples, d).
     """
+    start = smoothed(problem, log10_ratio)
+    values = [
+        np.concatenate([path, record.inputs], axis=1)
+        for path, record in zip(start.paths, problem.records, strict=True)
+    ]
+    theta = np.concatenate([problem.library.evaluate(each) for each in values])
+    free = _regress(problem, theta, np.concatenate(start.rates))
+    support = np.ones(problem.C.shape[1], dtype=np.bool_)
+    fit = TrajectoryFit(start.paths, free, support, np.full(len(problem.states), np.inf))
+    return fit, start.noise
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Smoothed states, their rates, and standard deviations of the noise, by record (samples, d).
+
+    They lie in the domains of the library's functions.
+    """
+
+    paths: tuple[np.ndarray, ...]
+    rates: tuple[np.ndarray, ...]
+    noise: tuple[np.ndarray, ...]
+
+
+def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
+    """Smooth the samples; log10_ratio as in `start_from_smooth`."""
     smoother = KalmanSmoother(log10_ratio)
     estimates = [smoother.estimate(r.times, r.samples) for r in problem.records]
     variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
-    samples = [np.concatenate([r.samples, r.inputs], axis=1) for r in problem.records]
-    values = [
-        keep_inside(problem.library, np.concatenate([e.smoothed, r.inputs], axis=1), raw)
-        for e, r, raw in zip(estimates, problem.records, samples, strict=True)
-    ]
-    paths = tuple(each[:, : len(problem.states)] for each in values)
-    theta = np.concatenate([problem.library.evaluate(each) for each in values])
-    rates = np.concatenate([e.derivative for e in estimates])
-    support = np.ones(problem.C.shape[1], dtype=np.bool_)
-    fit = TrajectoryFit(
-        paths, _regress(problem, theta, rates), support, np.full(len(variance), np.inf)
-    )
+    paths = []
+    for each, record in zip(estimates, problem.records, strict=True):
+        samples = np.concatenate([record.samples, record.inputs], axis=1)
+        values = np.concatenate([each.smoothed, record.inputs], axis=1)
+        inside = keep_inside(problem.library, values, samples)
+        paths.append(inside[:, : len(problem.states)])
     std = np.maximum(np.sqrt(variance), FLOOR if log10_ratio is None else UNSURE)
     std[~problem.measured] = std[problem.measured].mean()
-    return fit, tuple(np.tile(std, (len(path), 1)) for path in paths)
+    return Smoothed(
+        paths=tuple(paths),
+        rates=tuple(each.derivative for each in estimates),
+        noise=tuple(np.tile(std, (len(path), 1)) for path in paths),
+    )
 
 
 def _regress(

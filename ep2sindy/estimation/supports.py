@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,9 +11,11 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.likelihood import Gram, unit_sizes
 from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.regression.exchanges import exchanged_supports
 from ep2sindy.regression.searches import BestSubset
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
+PROVEN_TERMS = 7  # of one equation; larger supports are the best that exchanges find
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
 MAX_ALTERNATIVES = 24  # supports of one equation for which the others are searched again
 CUTOFF = 1e-11  # eigenvalues of a Gram matrix of unit diagonal, below which terms are dependent
@@ -37,7 +40,8 @@ def term_prices(problem: EstimationProblem, n_samples: float) -> Float[np.ndarra
     doi:10.1093/biomet/asn034, for the count.
     """
     degrees = np.maximum(problem.degrees, 1)
-    counts = np.array([(problem.degrees <= degree).sum() for degree in degrees])
+    every = problem.candidates.degrees
+    counts = np.array([(every <= degree).sum() for degree in degrees])
     return np.log(n_samples) + 2.0 * np.log(counts) + 2.0 * np.log(2.0) * (degrees - 1)
 
 
@@ -67,7 +71,8 @@ def best_support(
             if block == held or problem.required[own].all():
                 continue
             offered = _offer_supports(problem, gram, best.support, own, max_terms)
-            best = min([best, *(penalise(gram, s, prices) for s in offered)], key=rank)
+            first = min(offered, key=lambda each: each.squares + prices[each.support].sum())
+            best = min([best, penalise(gram, first.support, prices)], key=rank)
         if best is before:
             return best
     return best
@@ -88,7 +93,8 @@ def supports_by_size(
     max_terms: int,
 ) -> list[Bool[np.ndarray, " free"]]:
     """The best few supports of every size of one equation, the other equations as chosen."""
-    return _offer_supports(problem, gram, chosen, problem.block == block, max_terms)
+    own = problem.block == block
+    return [each.support for each in _offer_supports(problem, gram, chosen, own, max_terms)]
 
 
 def alternatives(
@@ -108,13 +114,15 @@ def alternatives(
     limit = penalise(gram, chosen, prices).score + within
     found: dict[bytes, PenalisedFit] = {}
     for block in np.unique(problem.block).tolist():
-        masks = supports_by_size(problem, gram, chosen, block, max_terms=max_terms)
-        seeds = [penalise(gram, m, prices) for m in masks if not np.array_equal(m, chosen)]
-        seeds = [each for each in seeds if each.score <= limit + within]
-        for seed in sorted(seeds, key=lambda each: each.score)[:MAX_ALTERNATIVES]:
-            each = best_support(
-                problem, gram, prices, seed.support, max_terms=max_terms, held=block
-            )
+        offered = _offer_supports(problem, gram, chosen, problem.block == block, max_terms)
+        scored = [(each.squares + prices[each.support].sum(), each.support) for each in offered]
+        near = [
+            (score, support)
+            for score, support in scored
+            if score <= limit + within and not np.array_equal(support, chosen)
+        ]
+        for _, support in sorted(near, key=lambda each: each[0])[:MAX_ALTERNATIVES]:
+            each = best_support(problem, gram, prices, support, max_terms=max_terms, held=block)
             if each.score <= limit and excess(problem, each.support, max_terms) == 0:
                 found[each.support.tobytes()] = each
     found.pop(chosen.tobytes(), None)
@@ -135,37 +143,68 @@ def penalise(
     return PenalisedFit(support, free, float(rest + prices[support].sum()))
 
 
+class Offered(NamedTuple):
+    """A support, and the squares that it leaves."""
+
+    support: Bool[np.ndarray, " free"]
+    squares: float
+
+
 def _offer_supports(
     problem: EstimationProblem,
     gram: Gram,
     chosen: Bool[np.ndarray, " free"],
     own: Bool[np.ndarray, " free"],
     max_terms: int,
-) -> list[Bool[np.ndarray, " free"]]:
+) -> list[Offered]:
     """Best supports of one equation; the other equations' and required coefficients stay free."""
     kept = (chosen & ~own) | problem.required
     own = own & ~problem.required
-    if not own.any():
-        return [kept]
     inverse = inverse_of(gram.quadratic[np.ix_(kept, kept)])
+    yy = max(gram.offset - gram.linear[kept] @ inverse @ gram.linear[kept], 1.0)
+    if not own.any():
+        return [Offered(kept, yy)]
     share = gram.quadratic[np.ix_(own, kept)] @ inverse
     xx = gram.quadratic[np.ix_(own, own)] - share @ gram.quadratic[np.ix_(kept, own)]
     xy = gram.linear[own] - share @ gram.linear[kept]
-    yy = max(gram.offset - gram.linear[kept] @ inverse @ gram.linear[kept], 1.0)
     # A column that the kept ones span leaves only rounding: it is not available.
     square = np.diag(xx).copy()
     square[~(square > CUTOFF * np.abs(np.diag(gram.quadratic)[own]))] = 0.0
     size = np.sqrt(zero_to_one(square))
     at_hand = square > 0.0
     unit = np.where(at_hand[:, None] & at_hand, xx / np.outer(size, size), 0.0)
-    search = BestSubset(max_terms=min(max_terms, int(own.sum())), n_best=N_BEST)
-    masks = search.supports(unit, np.where(at_hand, xy / size, 0.0) / np.sqrt(yy), 1.0)
+    target = np.where(at_hand, xy / size, 0.0)
+    search = BestSubset(max_terms=min(max_terms, PROVEN_TERMS, int(own.sum())), n_best=N_BEST)
+    share_of_yy = target / np.sqrt(yy)
+    masks = search.supports(unit, share_of_yy, 1.0)
+    if max_terms > PROVEN_TERMS and own.sum() > PROVEN_TERMS:
+        masks = exchanged_supports(
+            unit[None], share_of_yy[None], np.ones(1),
+            max_terms=max_terms, n_best=N_BEST, known=masks,
+        )  # fmt: skip
     found = []
-    for mask in masks:
+    for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):
         support = kept.copy()
         support[own] = mask
-        found.append(support)
+        found.append(Offered(support, yy - gain))
     return found
+
+
+def _gains(
+    unit: Float[np.ndarray, "own own"],
+    target: Float[np.ndarray, " own"],
+    masks: Bool[np.ndarray, "supports own"],
+) -> Float[np.ndarray, " supports"]:
+    """Fall of the squares by each support, supports of one size at once."""
+    gains, sizes = np.zeros(len(masks)), masks.sum(axis=1)
+    for size in np.unique(sizes[sizes > 0]):
+        here = sizes == size
+        terms = np.nonzero(masks[here])[1].reshape(-1, size)
+        y = target[terms]
+        pairs = unit[terms[:, :, None], terms[:, None]]
+        inverse = np.linalg.pinv(pairs, rcond=CUTOFF, hermitian=True)
+        gains[here] = np.einsum("ks,kst,kt->k", y, inverse, y)
+    return gains
 
 
 def inverse_of(quadratic: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

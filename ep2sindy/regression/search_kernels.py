@@ -227,8 +227,8 @@ def _eliminate(levels, level, j, smallest):
 
 
 @compiled
-def best_subsets(xx, xy, yy, max_terms, n_best):
-    """The `n_best` supports of least residual of every size up to max_terms, proven best.
+def best_subsets(xx, xy, yy, max_terms, n_best, most_work):
+    """The `n_best` supports of least residual of every size up to max_terms, proven best or not.
 
     One support serves several problems, each with its own coefficients. The product of their
     residuals is minimised (for one problem, the residual), so the scales of the targets do not
@@ -237,8 +237,9 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
     leaf costs one division. A branch is cut if all of its columns together leave a larger
     residual than the best known (Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231).
     xx: (problems, terms, terms), the most informative columns first, for early cuts;
-    xy: (problems, terms); yy: (problems,).
-    Returns (supports, terms) of bool, the empty support first.
+    xy: (problems, terms); yy: (problems,). most_work: multiplications after which the search ends
+    without a proof.
+    Returns (supports, terms) of bool, the empty support first, and whether they are proven best.
     """
     n_terms = xy.shape[1]
     depth = min(max_terms, n_terms)
@@ -249,7 +250,7 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
             best[size, rank] = np.inf
     best[0, 0] = 0.0
     best_masks = np.zeros((depth + 1, n_best, n_terms), dtype=np.bool_)
-    _search(levels, smallest, best, best_masks)
+    proven = _search(levels, smallest, best, best_masks, most_work)
     found = np.empty((best.size, n_terms), dtype=np.bool_)
     n_found = 0
     for size in range(depth + 1):
@@ -258,18 +259,21 @@ def best_subsets(xx, xy, yy, max_terms, n_best):
                 for j in range(n_terms):
                     found[n_found, j] = best_masks[size, rank, j]
                 n_found += 1
-    return found[:n_found]
+    return found[:n_found], proven
 
 
 @compiled
-def _search(levels, smallest, best, best_masks):
-    """Branch and bound of `best_subsets`, from the Gram matrices of the first level."""
+def _search(levels, smallest, best, best_masks, most_work):
+    """Branch and bound of `best_subsets`, from the Gram matrices of the first level.
+
+    Returns false if it ended for the work that it had done.
+    """
     n_problems, size = smallest.shape
     depth, n_best, n_terms = best.shape[0] - 1, best.shape[1], size - 1
     scratch = np.empty((size, size))
     chosen = np.zeros(depth + 1, dtype=np.int64)
     following = np.zeros(depth + 1, dtype=np.int64)
-    level = 0
+    level, work = 0, 0.0
     while level >= 0:
         j = following[level]
         if j >= n_terms or level == depth:
@@ -291,9 +295,14 @@ def _search(levels, smallest, best, best_masks):
             continue
         _eliminate(levels, level, j, smallest)
         worth_bounding = n_terms - j > 6 and depth - level > 2
+        left = float(n_terms - j)
+        work += n_problems * left * left * (1.0 + (left / 6.0 if worth_bounding else 0.0))
+        if work > most_work:
+            return False
         if worth_bounding and best[level + 2, n_best - 1] <= _least_residual(
             levels[level + 1], j + 1, size, smallest, scratch
         ):
             continue
         following[level + 1] = j + 1
         level += 1
+    return True

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.regression.exchanges import exchanged_supports
 from ep2sindy.regression.search_kernels import (
     adaptive_lasso_supports,
     best_subsets,
@@ -15,6 +17,8 @@ from ep2sindy.regression.search_kernels import (
 )
 from ep2sindy.runtime.values import set_counts
 from ep2sindy.trust.memory import check_memory
+
+MOST_WORK = 2e9  # multiplications of one search for a proof, a few seconds
 
 Gram = Float[np.ndarray, "terms terms"]
 Products = Float[np.ndarray, " terms"]
@@ -82,12 +86,18 @@ class STLSQ:
         return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
 
 
+class Unproven(UserWarning):
+    """Warning that supports are the best found, and not proven best."""
+
+
 @dataclass(frozen=True)
 class BestSubset:
     """The supports of least residual of every size, proven best by branch and bound.
 
     The work grows with the number of subsets of up to max_terms terms: a library of 10 terms
-    takes a tenth of a millisecond, 20 terms with all sizes a tenth of a second.
+    takes a tenth of a millisecond, 20 terms with all sizes a tenth of a second. If a proof would
+    take more than a few seconds, as with more than about sixty terms, the search goes on from the
+    best supports found by exchanges of terms, and warns with `Unproven`.
     n_best: number of supports of each size.
     """
 
@@ -120,13 +130,19 @@ class BestSubset:
         )
         # Branches are cut sooner if the columns closest to the targets come first.
         order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
-        found = best_subsets(
-            xx.take(order, axis=1).take(order, axis=2),
-            xy.take(order, axis=1),
-            yy,
-            self.max_terms,
-            self.n_best,
-        )
+        ordered = xx.take(order, axis=1).take(order, axis=2), xy.take(order, axis=1), yy
+        found, proven = best_subsets(*ordered, self.max_terms, self.n_best, MOST_WORK)
+        if not proven:
+            warnings.warn(
+                f"the best supports of {xy.shape[1]} terms were found by exchanges and are not "
+                f"proven best: a proof for up to {depth} terms would take too long; lower "
+                "max_terms or take fewer terms for a proof",
+                Unproven,
+                stacklevel=2,
+            )
+            found = exchanged_supports(
+                *ordered, max_terms=self.max_terms, n_best=self.n_best, known=found
+            )
         masks = np.zeros_like(found)
         masks[:, order] = found
         return masks

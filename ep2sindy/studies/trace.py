@@ -22,6 +22,7 @@ from ep2sindy.data.zones import Zone
 from ep2sindy.discovery.discover import Discovery, discover
 from ep2sindy.discovery.fitted_functions import FITTED, fit_functions
 from ep2sindy.discovery.method import AnyMethod, Regression, TrajectorySearch
+from ep2sindy.estimation.explanation import FIRST_MAX_TERMS
 from ep2sindy.forecasting.calibration import calibrate
 from ep2sindy.forecasting.skill import forecast_skill
 from ep2sindy.forecasting.tracking import track
@@ -275,7 +276,9 @@ def _misfit(method: AnyMethod, known: Embedded, library: Library) -> float:
     Infinite for a library that cannot be used on the states.
     """
     if isinstance(method, TrajectorySearch):
-        method = Regression(WeightedWeak(), BestSubset(max_terms=method.max_terms))
+        method = Regression(
+            WeightedWeak(), BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS)
+        )
     try:
         task = Task([known.run], library, relations_of(known.relations), known.terms)
         equations = method.search_equations(task, rng=0)

@@ -1,6 +1,6 @@
-"""Random draws of known systems, as in the benchmark of the thesis.
+"""Random draws of known systems: those of the thesis's benchmark, and a collection of chaotic ones.
 
-Source: the thesis, appendix, II-E and III-C.
+Source: the thesis, appendix, II-E and III-C; of the others, `systems.collection`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.systems.collection import collected, collected_names
 from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
@@ -54,6 +55,18 @@ DRAWS: Mapping[str, Callable[[np.random.Generator], Draw]] = {
 }
 
 
+COLLECTION = "dysts"  # stands for all systems of the collection
+
+
+def drawn(name: str, rng: np.random.Generator) -> Draw:
+    """Draw a system by name; one of the collection starts anywhere on its attractor."""
+    if name in DRAWS:
+        return DRAWS[name](rng)
+    system = collected(name)
+    states = system.trajectory().states
+    return Draw(system, states[rng.integers(len(states))])
+
+
 def realization(
     name: str, noise: float, number: int, *, n_trajectories: int = 1, seed: int = 0
 ) -> tuple[System, list[Trajectory]]:
@@ -64,11 +77,12 @@ def realization(
     [-2, 2]^2 for the Van der Pol oscillator.
     """
     check_systems([name])
-    rng = np.random.default_rng([seed, list(DRAWS).index(name), number])
-    draw = DRAWS[name](rng)
+    key = [list(DRAWS).index(name)] if name in DRAWS else list(name.encode())
+    rng = np.random.default_rng([seed, *key, number])
+    draw = drawn(name, rng)
     starts = [draw.initial]
     for _ in range(n_trajectories - 1):
-        other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else DRAWS[name](rng).initial
+        other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else drawn(name, rng).initial
         starts.append(other)
     return draw.system, [
         draw.system.trajectory(initial=start, noise=noise, rng=stream)
@@ -76,7 +90,22 @@ def realization(
     ]
 
 
+def system_names(asked: Sequence[str]) -> tuple[str, ...]:
+    """The names asked for, with all names of the collection in place of `dysts`.
+
+    Raises ValueError for a name that there is not, or if the collection is not installed.
+    """
+    every = [collected_names() if name == COLLECTION else (name,) for name in asked]
+    names = tuple(dict.fromkeys(name for names in every for name in names))
+    check_systems(names)
+    return names
+
+
 def check_systems(systems: Sequence[str]) -> None:
-    unknown = [name for name in systems if name not in DRAWS]
+    others = [name for name in systems if name not in DRAWS]
+    unknown = [name for name in others if name not in collected_names()]
     if unknown:
-        raise ValueError(f"unknown systems {unknown}; there are {list(DRAWS)}")
+        raise ValueError(
+            f"unknown systems {unknown}; there are {[*DRAWS]}, the names of the collection, such "
+            f"as Rossler, and {COLLECTION} for all of these"
+        )

@@ -1,0 +1,228 @@
+"""The working set: the few terms of each equation that a search weighs, out of a large library.
+
+The first set comes from each equation by itself: its own state is let go, the others are taken from
+their smoothed samples. After the search every term outside is tested on what the solution leaves,
+and terms that would pay for themselves enter. So the cost grows with the terms of the set, and only
+slowly with those of the library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.estimation.kernels import departures, eliminate
+from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, hessian, observe
+from ep2sindy.estimation.problem import EstimationProblem, Flow
+from ep2sindy.estimation.solver import (
+    WEIGHED_AT,
+    Solution,
+    at_level,
+    from_smooth,
+    settle,
+    smoothed,
+)
+from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
+from ep2sindy.regression.exchanges import exchanged_supports
+
+SMALL = 20  # terms of an equation that are all weighed from the start
+WARM = 0.3  # rho of the first set: the state all but free, the other states smoothed
+MOST_ENTER, MAX_ENTRANCES = 3, 4  # terms of one equation that enter at once; times that some do
+DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if they span the term
+N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of its square
+
+
+def search_within(
+    problem: EstimationProblem, *, max_terms: int
+) -> tuple[EstimationProblem, Solution]:
+    """The solution from smoothed states by a working set, and the problem of the set's terms."""
+    kept = first_set(problem, max_terms)
+    if kept.all():
+        return problem, from_smooth(problem, None, max_terms=max_terms)
+    part = problem.restricted(kept)
+    found = from_smooth(part, None, max_terms=max_terms)
+    for _ in range(MAX_ENTRANCES):
+        entering = ~kept & _would_pay(problem, kept, part, found)
+        if not entering.any():
+            break
+        before, kept = kept, kept | entering
+        part, fit = problem.restricted(kept), found.annealed.fit
+        widened = replace(
+            fit,
+            free=_spread(fit.free, before)[kept],
+            support=_spread(fit.support, before)[kept] | entering[kept],
+        )
+        found = settle(part, widened, found.noise.effective, max_terms=max_terms)
+    return part, found
+
+
+def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " free"]:
+    """Required terms, and of each equation the terms of its best few supports of every size.
+
+    Everything if the equations are small, or tied together by relations or hidden states.
+    """
+    kept = problem.required.copy()
+    sizes = np.bincount(problem.block[~kept], minlength=len(problem.states))
+    if problem.related or not problem.measured.all() or (sizes <= SMALL).all():
+        return np.ones_like(kept)
+    start = smoothed(problem, None)
+    level = Level(start.noise, WARM)
+    steps = [
+        problem.term_steps(record, path[:-1], np.zeros(len(kept)), 1)[1]
+        for record, path in zip(problem.records, start.paths, strict=True)
+    ]
+    for block in np.flatnonzero(sizes).tolist():
+        own = np.flatnonzero((problem.block == block) & ~problem.required)
+        if len(own) <= SMALL:
+            kept[own] = True
+        else:
+            quadratic, linear, offset = _own_squares(problem, start.paths, level, steps, block, own)
+            size = np.sqrt(zero_to_one(np.diag(quadratic)))
+            masks = exchanged_supports(
+                (quadratic / np.outer(size, size))[None],
+                (linear / size)[None],
+                np.array([offset]),
+                max_terms=max_terms,
+                n_best=N_BEST,
+            )
+            kept[own[masks.any(axis=0)]] = True
+    return kept
+
+
+def _own_squares(
+    problem: EstimationProblem,
+    paths: tuple[np.ndarray, ...],
+    level: Level,
+    steps: list[Float[np.ndarray, "steps terms"]],
+    block: int,
+    own: np.ndarray,
+) -> tuple[Float[np.ndarray, "own own"], Float[np.ndarray, " own"], float]:
+    """The squares as a quadratic function of one equation's coefficients, the other states held.
+
+    steps: integrals of the terms over each step. Returns the parts of `likelihood.Gram`.
+    """
+    total: list[Any] = [0.0, 0.0, 0.0]
+    one = slice(block, block + 1)
+    for record, path, variance, process, integrals in zip(
+        problem.records, paths, level.variances, level.processes, steps, strict=True
+    ):
+        columns = integrals[:, problem.column[own]]
+        flow = np.concatenate([np.ones((len(columns), 1)), columns], axis=1)[:, None]
+        residuals, apparent, _ = observe(record, path, variance)
+        misses = -np.diff(path[:, one], axis=0)
+        parts = eliminate(
+            np.ascontiguousarray(flow), misses, np.ascontiguousarray(residuals[:, one]),
+            np.ascontiguousarray(apparent[:, one]), np.ascontiguousarray(process[:, one]),
+            FREE_START,
+        )  # fmt: skip
+        total = [whole + part for whole, part in zip(total, parts[:3], strict=True)]
+    quadratic, linear, offset = total
+    return quadratic, linear, float(offset)
+
+
+def _would_pay(
+    problem: EstimationProblem,
+    kept: Bool[np.ndarray, " free"],
+    part: EstimationProblem,
+    found: Solution,
+) -> Bool[np.ndarray, " free"]:
+    """Terms that would lower the squares by more than their price, at most a few per equation.
+
+    Score tests: the derivative of the squares by each coefficient, against its scatter if the
+    samples were the solution and noise. Draws of such noise pass through the same linear fit of
+    states and chosen coefficients; this costs no Hessian of the whole library.
+    Source: Rao 1948, doi:10.1017/S0305004100023987.
+    """
+    enters = np.zeros_like(kept)
+    if not np.isfinite(found.score):
+        return enters
+    fit, level = at_level(part, found.annealed.fit, replace(found.annealed.level, rho=WEIGHED_AT))
+    gains = _gains(problem, part, fit, level, _spread(fit.free, kept))
+    gains -= term_prices(problem, float(part.n_samples))
+    gains[kept] = -np.inf
+    for block in range(len(problem.states)):
+        own = np.flatnonzero((problem.block == block) & (gains > 0.0))
+        enters[own[np.argsort(-gains[own])[:MOST_ENTER]]] = True
+    return enters
+
+
+def _gains(
+    problem: EstimationProblem,
+    part: EstimationProblem,
+    fit: TrajectoryFit,
+    level: Level,
+    free: Float[np.ndarray, " free"],
+) -> Float[np.ndarray, " free"]:
+    """Fall of the squares that each coefficient by itself would bring, to first order."""
+    quadratic, _, _, flows = hessian(
+        part,
+        fit,
+        level,
+        lambda record, path: part.flow(record, path[:-1], fit.free, fit.support, level.n_substeps),
+    )
+    if not np.isfinite(quadratic).all():
+        return np.zeros(len(free))
+    terms = np.concatenate(
+        [
+            problem.term_steps(record, path[:-1], free, level.n_substeps)[1]
+            for record, path in zip(problem.records, fit.paths, strict=True)
+        ]
+    )
+    left = [flow.ends - path[1:] for flow, path in zip(flows, fit.paths, strict=True)]
+    score = np.square(terms.T @ _weighted(left, level))
+    with_states, with_all = np.zeros_like(score), np.zeros_like(score)
+    rng, inverse = np.random.default_rng(0), inverse_of(quadratic)
+    for _ in range(N_PROBES):
+        noise = [std * rng.standard_normal(std.shape) for std in level.noise]
+        without = _misses(part, fit, level, flows, noise, np.zeros(len(inverse)))
+        slopes = [flow.slopes[:, :, len(part.states) :] for flow in flows]
+        weighted = np.split(_weighted(without, level), np.cumsum([len(e) for e in without])[:-1])
+        gradient = sum(
+            np.einsum("kd,kds->s", each, slope)
+            for each, slope in zip(weighted, slopes, strict=True)
+        )
+        fitted = _misses(part, fit, level, flows, noise, -inverse @ gradient)
+        with_states += np.square(terms.T @ _weighted(without, level)) / N_PROBES
+        with_all += np.square(terms.T @ _weighted(fitted, level)) / N_PROBES
+    # A term that the chosen ones span leaves only rounding: it is not available.
+    tells = with_all > DEPENDENT * with_states
+    gains = np.where(tells, score / np.where(tells, with_all, 1.0), 0.0)
+    return gains[problem.column, problem.equation]
+
+
+def _misses(
+    part: EstimationProblem,
+    fit: TrajectoryFit,
+    level: Level,
+    flows: list[Flow],
+    noise: list[Float[np.ndarray, "samples d"]],
+    change: Float[np.ndarray, " support"],
+) -> list[Float[np.ndarray, "steps d"]]:
+    """How far states that follow a draw of noise leave the flow, the coefficients changed."""
+    d, found = len(part.states), []
+    for k, (record, path, flow) in enumerate(zip(part.records, fit.paths, flows, strict=True)):
+        by_state = np.ascontiguousarray(flow.slopes[:, :, :d])
+        moved = flow.slopes[:, :, d:] @ change
+        seen = observe(record, path, level.variances[k])
+        draw = np.where(np.isfinite(seen.residuals), noise[k], np.nan)
+        off = departures(by_state, moved, draw, seen.variance, level.processes[k], FREE_START)
+        found.append(np.einsum("kij,kj->ki", by_state, off[:-1]) + moved - off[1:])
+    return found
+
+
+def _weighted(
+    misses: list[Float[np.ndarray, "steps d"]], level: Level
+) -> Float[np.ndarray, "steps d"]:
+    """Misses of all records over the variance of the flow's error."""
+    return np.concatenate([m / p for m, p in zip(misses, level.processes, strict=True)])
+
+
+def _spread(values: np.ndarray, kept: Bool[np.ndarray, " free"]) -> np.ndarray:
+    """Values of the set's coefficients among all, zero (or False) for the others."""
+    every = np.zeros(len(kept), dtype=values.dtype)
+    every[kept] = values
+    return every

@@ -1,0 +1,212 @@
+"""Large libraries: exchanges, the working set, terms that enter, and equations of many terms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ep2sindy as ep
+from benchmarks.many_states import lorenz_96
+from ep2sindy.estimation import working_set
+from ep2sindy.estimation.likelihood import Gram, gram
+from ep2sindy.estimation.problem import EstimationProblem, scale_problem
+from ep2sindy.estimation.solver import WEIGHED_AT, Solution, at_level, from_smooth
+from ep2sindy.estimation.supports import inverse_of, term_prices
+from ep2sindy.estimation.working_set import first_set, search_within
+from ep2sindy.regression import searches
+from ep2sindy.regression.exchanges import exchanged_supports
+from ep2sindy.systems.systems import System
+from tests.models import model_of
+
+
+def waves(n: int) -> System:
+    start = 8.0 + np.random.default_rng(0).standard_normal(n)
+    system = System("waves", lorenz_96(n), start, 25.0, 100.0)
+    states = system.trajectory().states
+    return System("waves", system.model, states[-1], 10.0, 100.0)
+
+
+def problem_of(system: System, noise: float, degree: int) -> EstimationProblem:
+    run = system.trajectory(noise=noise, rng=0)
+    return scale_problem([run], ep.polynomial(run.state_names, degree=degree))
+
+
+def mask_of(problem: EstimationProblem, system: System) -> np.ndarray:
+    """Free coefficients of the true terms."""
+    true = {state: set(system.model.terms(state)) for state in problem.states}
+    return np.array(
+        [
+            problem.term_names[column] in true[problem.states[equation]]
+            for column, equation in zip(problem.column, problem.equation, strict=True)
+        ]
+    )
+
+
+def random_gram(n_terms: int, n_problems: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(n_terms)
+    columns = rng.standard_normal((n_problems, 3 * n_terms, n_terms))
+    columns /= np.linalg.norm(columns, axis=1, keepdims=True)
+    target = columns[:, :, :3].sum(axis=2) + 0.2 * rng.standard_normal((n_problems, 3 * n_terms))
+    transposed = columns.transpose(0, 2, 1)
+    products = np.einsum("pjn,pn->pj", transposed, target)
+    return transposed @ columns, products, np.square(target).sum(axis=1)
+
+
+@pytest.mark.parametrize("n_problems", [1, 2])
+def test_exchanges_find_the_best_subsets(n_problems: int) -> None:
+    """On columns that are far from dependent; the best of every size, of one problem or two."""
+    xx, xy, yy = random_gram(12, n_problems)
+    proven = ep.BestSubset(max_terms=5).shared_supports(xx, xy, yy)
+    found = exchanged_supports(xx, xy, yy, max_terms=5, n_best=1)
+    assert np.array_equal(found, proven)
+
+
+def test_exchanges_start_from_known_supports() -> None:
+    xx, xy, yy = random_gram(12)
+    best = ep.BestSubset(max_terms=4).shared_supports(xx, xy, yy)
+    known = exchanged_supports(xx, xy, yy, max_terms=4, n_best=3, known=best)
+    assert all(any(np.array_equal(mask, each) for each in known) for mask in best)
+
+
+def test_dependent_terms_are_not_exchanged() -> None:
+    """A column that repeats another one adds nothing beside it, and one of zeros adds nothing."""
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((50, 4))
+    columns[:, 2], columns[:, 3] = columns[:, 0], 0.0
+    target = columns[:, 0] + columns[:, 1]
+    found = exchanged_supports(
+        (columns.T @ columns)[None], (columns.T @ target)[None], np.array([target @ target]),
+        max_terms=4, n_best=5,
+    )  # fmt: skip
+    assert not found[:, 3].any()
+    assert not (found[:, 0] & found[:, 2]).any()
+    assert found.sum(axis=1).max() == 2
+
+
+def test_a_search_without_a_proof_says_so_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    xx, xy, yy = random_gram(40)
+    proven = ep.BestSubset(max_terms=4).shared_supports(xx, xy, yy)
+    monkeypatch.setattr(searches, "MOST_WORK", 1.0)
+    with pytest.warns(searches.Unproven, match="40 terms were found by exchanges"):
+        found = ep.BestSubset(max_terms=4).shared_supports(xx, xy, yy)
+    assert np.array_equal(found, proven)
+
+
+def test_a_problem_of_some_terms_keeps_the_prices_of_all() -> None:
+    problem = problem_of(waves(5), 0.02, 2)
+    kept = np.arange(len(problem.block)) % 3 == 0
+    part = problem.restricted(kept)
+    again = part.restricted(np.arange(kept.sum()) % 2 == 0)
+    assert np.array_equal(term_prices(part, 1000.0), term_prices(problem, 1000.0)[kept])
+    assert again.candidates is problem
+    free = np.random.default_rng(0).standard_normal(kept.sum())
+    every = np.zeros(len(kept))
+    every[kept] = free
+    record = problem.records[0]
+    found, whole = (
+        each.ends(record, record.samples[:-1], values, 1)
+        for each, values in ((part, free), (problem, every))
+    )
+    np.testing.assert_allclose(found, whole, rtol=1e-13)
+
+
+def test_the_first_set_is_small_and_holds_the_truth() -> None:
+    system = waves(8)
+    problem = problem_of(system, 0.05, 2)
+    kept, true = first_set(problem, 7), mask_of(problem, system)
+    assert kept[true].all()
+    assert kept.sum() < 0.5 * len(kept)
+
+
+def test_small_libraries_are_weighed_whole() -> None:
+    assert first_set(problem_of(waves(4), 0.05, 2), 7).all()
+
+
+def exact_gains(pair: Gram, support: np.ndarray) -> np.ndarray:
+    """Fall of the quadratic function of all coefficients by each one beside a support."""
+    inverse = inverse_of(pair.quadratic[np.ix_(support, support)])
+    share = pair.quadratic[:, support] @ inverse
+    own = np.diag(pair.quadratic) - np.einsum("js,js->j", share, pair.quadratic[:, support])
+    score = pair.linear - share @ pair.linear[support]
+    return np.where(support, 0.0, np.square(score) / np.where(support, 1.0, own))
+
+
+def test_scores_tell_what_a_term_would_bring() -> None:
+    """Score tests by draws of noise against the Gram matrix of the whole library."""
+    system = waves(6)
+    problem = problem_of(system, 0.05, 2)
+    true = mask_of(problem, system)
+    part = problem.restricted(true)
+    found = from_smooth(part, None, max_terms=7)
+    fit, level = at_level(part, found.annealed.fit, found.annealed.level)
+    fit, level = at_level(part, fit, type(level)(level.noise, WEIGHED_AT, level.n_substeps))
+    every = working_set._spread(fit.free, true)
+    gains = working_set._gains(problem, part, fit, level, every)
+    whole = type(fit)(fit.paths, every, true, fit.squares)
+    exact = exact_gains(gram(problem, whole, level), true)
+    large = ~true & (exact > 1.0)
+    assert large.sum() > 20
+    ratio = gains[large] / exact[large]
+    assert 0.8 < np.median(ratio) < 1.25
+    assert np.abs(np.log(ratio)).max() < 1.0  # forty draws scatter by 22 %
+
+
+def test_a_true_term_outside_the_set_enters(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = waves(6)
+    problem = problem_of(system, 0.02, 2)
+    true = mask_of(problem, system)
+    kept = first_set(problem, 7)
+    kept[np.flatnonzero(true)[[1, 6]]] = False
+    monkeypatch.setattr(working_set, "first_set", lambda problem, max_terms: kept)
+    part, found = search_within(problem, max_terms=7)
+    assert chosen(problem, part, found) == true.tolist()
+
+
+def chosen(problem: EstimationProblem, part: EstimationProblem, found: Solution) -> list[bool]:
+    coef = np.zeros((len(problem.library), len(problem.states)))
+    values = part.coef_SI(found.annealed.fit.free)
+    coef[part.places[part.column], part.equation] = values
+    return (coef[problem.column, problem.equation] != 0.0).tolist()
+
+
+def test_eight_waves_of_360_coefficients_are_found() -> None:
+    system = waves(8)
+    run = system.trajectory(noise=0.05, rng=1)
+    found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))
+    assert not found.misfit
+    for state in run.state_names:
+        assert set(found.model.terms(state)) == set(system.model.terms(state))
+    np.testing.assert_allclose(
+        [found.model.terms(state)["1"] for state in run.state_names], 8.0, rtol=0.1
+    )
+
+
+def many_terms() -> System:
+    """An oscillator with nine terms in one equation, of the twenty-one of degree five."""
+    equation = {
+        "x": -1.0, "x^3": -0.5, "y": 0.6, "x*y": 0.4, "x^2*y": -0.9, "1": 0.2, "y^3": -0.15,
+        "x^2": 0.3, "x^4*y": -0.1,
+    }  # fmt: skip
+    library = ep.polynomial(["x", "y"], degree=5)
+    coef = np.zeros((len(library), 2))
+    coef[library.index("y"), 0] = 1.0
+    for name, value in equation.items():
+        coef[library.index(name), 1] = value
+    model = model_of({"x": {"y": 1.0}, "y": equation})
+    return System("many terms", model, np.array([0.5, 0.5]), 60.0, 40.0)
+
+
+def test_an_equation_may_have_more_terms_than_seven() -> None:
+    """Seven are tried first; a limit that the user sets is kept, and said to be reached."""
+    system = many_terms()
+    runs = [
+        system.trajectory(initial=np.array(start), noise=0.001, rng=k)
+        for k, start in enumerate([(0.5, 0.5), (2.5, 0.0), (-2.0, 2.0)])
+    ]
+    library = ep.polynomial(["x", "y"], degree=5)
+    found = ep.estimate(runs, library)
+    assert not found.misfit
+    assert set(found.model.terms("y")) == set(system.model.terms("y"))
+    bound = ep.estimate(runs, library, max_terms=7)
+    assert len(bound.model.terms("y")) == 7
+    assert "max_terms" in bound.misfit or "leave the model" in bound.misfit
