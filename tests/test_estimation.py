@@ -14,8 +14,7 @@ import ep2sindy as ep
 from benchmarks.known_systems import noisy
 from ep2sindy._stubs import dotted_names
 from ep2sindy.discovery.recipe import method_of
-from ep2sindy.estimation import explanation
-from ep2sindy.estimation import problem as estimation_problem
+from ep2sindy.estimation import cost, explanation
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import Gram, Level, TrajectoryFit, fit_paths, gram, squares
 from ep2sindy.estimation.noise import noise_beside
@@ -156,7 +155,7 @@ def test_the_flow_converges_with_the_fourth_order() -> None:
 def test_sensitivities_are_derivatives_of_the_flow(relations: Sequence[str]) -> None:
     problem, _ = lorenz_problem(relations=[parse_relation(r) for r in relations])
     (record,) = problem.records
-    free = np.random.default_rng(0).normal(scale=1e-2, size=problem.C.shape[1])
+    free = np.random.default_rng(0).normal(scale=1e-2, size=problem.n_free)
     support = np.zeros(len(free), dtype=np.bool_)
     support[[1, 4, 12, -1]] = True
     states = record.samples[:-1]
@@ -646,25 +645,100 @@ def many_states(n_states: int) -> ep.Trajectory:
 def test_more_coefficients_than_memory_holds_are_refused_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(memory, "free_bytes", lambda: 5 * 10**8)
+    monkeypatch.setattr(memory, "free_bytes", lambda: 3 * 10**8)
     run = many_states(10)
     library = ep.polynomial(run.state_names, degree=3)
-    said = r"2860 coefficients \(286 terms, 10 states\) .* 400 samples would take 0.628 GB"
-    monkeypatch.setattr(estimation_problem, "NUMBERS", 4.0)
+    monkeypatch.setattr(cost, "NUMBERS", 50.0)
+    said = r"2860 coefficients \(286 terms, 10 states\), of which 200 .* 400 samples, would take"
     with pytest.raises(ValueError, match=said):
         ep.estimate([run], library)
     run_of_known_terms = {name: ["x0", "x1"] for name in run.state_names}
-    estimation_problem.check_size([run], library, run_of_known_terms)
+    cost.check_size([run], library, run_of_known_terms)
 
 
-def test_a_long_search_is_told_of() -> None:
+def test_a_long_search_is_told_of_with_its_time() -> None:
     run = many_states(7)
+    long = ep.Trajectory(
+        np.linspace(0.0, 20.0, 90_000),
+        np.zeros((90_000, 7)) + np.sin(np.linspace(0.0, 900.0, 90_000))[:, None],
+        run.state_names,
+    )
     small, large = (ep.polynomial(run.state_names, degree=degree) for degree in (2, 3))
-    with pytest.warns(ep.warnings.SlowSearch, match=r"840 coefficients .* may take many minutes"):
-        estimation_problem.check_size([run], large, {})
+    said = r"840 coefficients .*, of which 140 .* may take some 2 minutes of one core. limit_s ends"
+    with pytest.warns(ep.warnings.SlowSearch, match=said):
+        cost.check_size([long], large, {})
+    with pytest.warns(ep.warnings.SlowSearch, match="of which 840 .* some 60 minutes"):
+        cost.check_size([long], large, {}, tied=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        estimation_problem.check_size([run], small, {})
+        cost.check_size([run], small, {})
+        cost.check_size([run], large, {})
+        cost.check_size([long], large, {}, told=False)
+
+
+class Clock:
+    """A clock that goes on by a second whenever it is read."""
+
+    def __init__(self) -> None:
+        self.read = 0
+
+    def monotonic(self) -> float:
+        self.read += 1
+        return float(self.read)
+
+
+@pytest.mark.parametrize("limit_s", [1e-3, 10.0, 20.0, 400.0])
+def test_a_search_ends_at_its_limit_with_the_best_so_far(
+    monkeypatch: pytest.MonkeyPatch, limit_s: float
+) -> None:
+    """However early: the model is whole, and what is said of it says that the search was ended."""
+    run = ep.lorenz().trajectory(noise=0.05, rng=0)
+    monkeypatch.setattr(cost, "time", Clock())
+    found = ep.estimate(run, ep.polynomial(["x", "y", "z"], degree=3), limit_s=limit_s)
+    assert np.isfinite(found.model.coef).all()
+    assert found.model.coef.any()
+    assert all(path.shape == run.states.shape for path in found.paths)
+    ended = found.misfit.startswith("the search was ended by limit_s after")
+    if limit_s < 100.0:
+        assert ended
+        assert found.model.covariance is None
+    else:
+        assert not found.misfit
+        assert set(found.model.terms("x")) == {"x", "y"}
+
+
+def test_an_interruption_ends_a_search_that_is_watched() -> None:
+    """With the best so far; a search that nobody watches, or without a model yet, is ended."""
+    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    library = ep.polynomial(["x", "y"], degree=2)
+    steps = 0
+
+    def interrupt(at: int) -> Callable[[int], None]:
+        def advance(n_more: int) -> None:
+            nonlocal steps
+            steps += n_more
+            if steps == at:
+                raise KeyboardInterrupt
+
+        return advance
+
+    found = ep.estimate(run, library, progress=interrupt(15))
+    assert "ended by an interruption after" in found.misfit + " ".join(found.remarks)
+    assert found.model.coef.any()
+    steps = 0
+    with pytest.raises(KeyboardInterrupt):
+        ep.estimate(run, library, progress=interrupt(1))
+
+
+@pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan")])
+def test_a_limit_is_positive(limit_s: float) -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
+    for search in (
+        lambda: ep.estimate(run, ep.polynomial(["x", "y"], degree=2), limit_s=limit_s),
+        lambda: ep.TrajectorySearch(limit_s=limit_s),
+    ):
+        with pytest.raises(ValueError, match="limit_s must be positive, in s, or None"):
+            search()
 
 
 def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:

@@ -113,7 +113,7 @@ def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
     sizes = []
     for factor in (1.0, 1e-6):
         path = problem.records[0].samples * [1.0, factor]
-        free = np.zeros(problem.C.shape[1])
+        free = np.zeros(problem.n_free)
         fit = TrajectoryFit((path + np.array([0.05, 0.0]),), free, free != 0.0, np.zeros(2))
         noise = noise_beside(problem, fit)
         sizes.append(noise.white[0][0])
@@ -182,7 +182,7 @@ def test_guesses_are_close_without_noise() -> None:
 def test_a_hidden_state_that_follows_nothing_is_astray() -> None:
     run = PLANE.trajectory(noise=0.05, rng=0).window(0, 40)
     problem = scale_problem([run], ep.polynomial(["x", "y"], degree=1), measured=["x"])
-    free, still = np.zeros(problem.C.shape[1]), np.ones(40)  # nothing moves
+    free, still = np.zeros(problem.n_free), np.ones(40)  # nothing moves
     everything, cold = np.ones(len(free), dtype=bool), Level((np.ones((40, 2)),), 1e-4)
     for hidden, is_astray in (
         (np.sin(np.arange(40.0)), True),
@@ -205,7 +205,7 @@ def test_what_was_not_measured_counts_nothing() -> None:
     assert seen.squares[:, 0] == pytest.approx(0.01)
     assert not seen.squares[:, 1].any()
     assert problem.n_squares == 40
-    free = np.zeros(problem.C.shape[1])
+    free = np.zeros(problem.n_free)
     fit = TrajectoryFit((path,), free, np.ones(len(free), dtype=bool), np.zeros(2))
     level = Level((0.1 * ones,), 1.0)
     everything = np.ones(len(free), dtype=bool)

@@ -21,6 +21,7 @@ from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import Choice, choice_of, choose, choose_by_runs
+from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate_task
 from ep2sindy.library.library import Library
 from ep2sindy.library.roles import Roles
@@ -102,6 +103,7 @@ class TrajectorySearch:
     or correlated over some samples. max_terms: of one equation; None allows seven, and more where
     an equation of a large library needs them. align: if True, channels found to be late are shifted
     forward; if False, late channels make the model a misfit, and their delays are reported.
+    limit_s: wall time after which the search ends with the best that it has, and says so.
     selection: Evidence, or a rule that runs models, such as FreeRunScore. depth: candidates kept
     per size, for such a rule to judge.
     Raises ValueError for fewer than one term, or a rule that does not go with the search.
@@ -109,11 +111,13 @@ class TrajectorySearch:
 
     max_terms: int | None = None
     align: bool = False
+    limit_s: float | None = None
     selection: SystemSelection | Selection = field(default_factory=Evidence)
     depth: int = 1
 
     def __post_init__(self) -> None:
         set_counts(self, {"depth": 1} | ({} if self.max_terms is None else {"max_terms": 1}))
+        check_limit_s(self.limit_s)
         check_kind("selection", self.selection, Selection, "ep.Evidence()")
         if not isinstance(self.selection, Evidence | SystemSelection):
             raise ValueError(
@@ -151,6 +155,7 @@ class TrajectorySearch:
             task,
             max_terms=self.max_terms,
             align=self.align,
+            limit_s=self.limit_s,
             provenance=provenance,
             progress=progress,
         )

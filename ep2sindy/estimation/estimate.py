@@ -13,11 +13,12 @@ from jaxtyping import Float
 
 from ep2sindy.data.coerce import Runs, Task, check_domain, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.cost import Watch, check_limit_s, check_size
 from ep2sindy.estimation.explanation import Explanation, explain
 from ep2sindy.estimation.hidden import Entrance, with_guesses
 from ep2sindy.estimation.likelihood import Gram, covariance, gram
 from ep2sindy.estimation.noise import FLOOR, Noise
-from ep2sindy.estimation.problem import EstimationProblem, check_size, scale_problem
+from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import (
     SAMPLES_PER_TERM,
     Solution,
@@ -27,7 +28,7 @@ from ep2sindy.estimation.supports import penalise, supports_by_size
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, relations_of
 from ep2sindy.model.model import SparseModel
-from ep2sindy.runtime.progress import SILENT, Advance, Progress, as_progress, count_pieces
+from ep2sindy.runtime.progress import SILENT, Progress, as_progress, count_pieces
 from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
@@ -125,6 +126,7 @@ def estimate(
     hidden: Sequence[str] = (),
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
+    limit_s: float | None = None,
     progress: Progress | bool = False,
 ) -> Estimate:
     """Estimate the states at every sample and sparse coefficients together, by maximum likelihood.
@@ -136,10 +138,11 @@ def estimate(
     delays are reported.
     relations: between coefficients, held in fit and search. terms: for each state whose equation is
     known but for its coefficients, all terms of that equation. hidden: states that nobody measured,
-    which the library has; all ways in which they may enter are compared. progress: True shows bars;
-    see `Progress`.
-    Raises ValueError for fewer than one term, a library that needs more samples than there are, or
-    whatever a `Task` refuses.
+    which the library has; all ways in which they may enter are compared. limit_s: wall time after
+    which the search ends with the best that it has, and says so. progress: True shows bars, see
+    `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
+    Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
+    more samples than there are or more memory, or whatever a `Task` refuses.
     """
     known = trajectories_of(runs)
     task = Task(known, library, relations_of(relations), terms or {}, hidden=hidden)
@@ -149,6 +152,7 @@ def estimate(
         align=align,
         units=units,
         provenance=provenance,
+        limit_s=limit_s,
         progress=as_progress(progress),
     )
 
@@ -160,20 +164,26 @@ def estimate_task(
     align: bool,
     units: Mapping[str, str] | None = None,
     provenance: Mapping[str, str] | None = None,
+    limit_s: float | None = None,
     progress: Progress = SILENT,
 ) -> Estimate:
     """Answer a task by `estimate`."""
     if max_terms is not None:
         max_terms = check_count("max_terms", max_terms)
-    check_size(task.runs, task.library, task.terms)
-    with progress.stage(None, "step", "states and coefficients") as advance:
-        best = []
-        for group in with_guesses(task) if task.hidden else [[(task, ())]]:
-            tried = [_try(task, *each, max_terms, align, advance) for each in group]
-            best.append(min(tried, key=lambda each: each[0].rank))
-            if not best[-1][0].misfit:
+    check_limit_s(limit_s)
+    tied = bool(task.relations or task.hidden)
+    check_size(task.runs, task.library, task.terms, tied=tied, told=limit_s is None)
+    watch, best = Watch(progress, limit_s), []
+    for group in with_guesses(task) if task.hidden else [[(task, ())]]:
+        tried = []
+        for known, ways in group:
+            tried.append(_try(task, known, ways, max_terms, align, watch))
+            if watch.ended:
                 break
-        answer, runs = min(best, key=lambda each: bool(each[0].misfit))
+        best.append(min(tried, key=lambda each: each[0].rank))
+        if watch.ended or not best[-1][0].misfit:
+            break
+    answer, runs = min(best, key=lambda each: bool(each[0].misfit))
     if task.hidden:
         runs = [_with_path(answer, k, run) for k, run in enumerate(runs)]
     model = _model(answer, task.library, units or runs[0].units, provenance or {})
@@ -186,13 +196,13 @@ def _try(
     ways: Sequence[Entrance],
     max_terms: int | None,
     align: bool,
-    advance: Advance,
+    watch: Watch,
 ) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task by one way in which its hidden states may enter."""
     check_runs(known)
     given = known.runs, known.library, known.relations, known.terms
     measured = task.runs[0].state_names
-    problem = scale_problem(*given, measured=measured, advance=advance)
+    problem = scale_problem(*given, measured=measured, watch=watch)
     found = explain(problem, max_terms=max_terms, align=align)
     return replace(found, said=(*(way.words for way in ways), *found.said)), known.runs
 
@@ -279,7 +289,8 @@ def _model(
     coef[column, problem.equation] = values
     used = values != 0.0
     order = np.lexsort((column[used], problem.equation[used]))
-    rows = (problem.C[used][:, fit.support] * problem.to_SI[used, None])[order]
+    C = np.eye(problem.n_free) if problem.C is None else problem.C
+    rows = (C[used][:, fit.support] * problem.to_SI[used, None])[order]
     # If the residuals exceed the noise, intervals would not cover the truth.
     known = found.fits and not answer.misfit
     free_cov = covariance(problem, fit, found.annealed.level) if known else None

@@ -13,6 +13,7 @@ from math import log
 import numpy as np
 from jaxtyping import Float
 
+from ep2sindy.estimation.cost import OutOfTimeError
 from ep2sindy.estimation.lateness import (
     PAYS,
     delay_words,
@@ -21,6 +22,7 @@ from ep2sindy.estimation.lateness import (
     move_channels,
     suspect_delays,
 )
+from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.pushed import (
     PushedFit,
@@ -28,8 +30,17 @@ from ep2sindy.estimation.pushed import (
     solution_under_pushes,
     solve_pushed,
 )
-from ep2sindy.estimation.solver import Solution, from_smooth, max_terms_for, settle
+from ep2sindy.estimation.solver import (
+    AnnealedFit,
+    Solution,
+    astray,
+    from_smooth,
+    max_terms_for,
+    settle,
+)
+from ep2sindy.estimation.supports import term_prices
 from ep2sindy.estimation.working_set import search_within
+from ep2sindy.runtime.progress import SILENT
 
 FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where all are used
 LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
@@ -81,7 +92,46 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
     """The most likely support, and what beside its trajectory explains the samples, if need be.
 
     max_terms: of one equation; None begins with 7, and allows more where an equation needs them.
+    At the limit of its time, or interrupted while its progress is shown, the search ends with the
+    best that it has.
     """
+    watch = problem.watch
+    watch.best = None
+    try:
+        return _explain(problem, max_terms, align)
+    except (OutOfTimeError, KeyboardInterrupt) as stop:
+        # Nobody follows a silent search, which may be one of many: an interruption ends them all.
+        watched = isinstance(stop, OutOfTimeError) or watch.progress is not SILENT
+        if watch.best is None or not watched:
+            raise
+        watch.ended = True
+        by = "limit_s" if isinstance(stop, OutOfTimeError) else "an interruption"
+        return _unfinished(*watch.best, f"ended by {by} after {watch.elapsed_s:.3g} s", max_terms)
+
+
+def _unfinished(
+    problem: EstimationProblem, best: Solution | AnnealedFit, ended: str, max_terms: int | None
+) -> Explanation:
+    """The best so far of a search that was ended."""
+    if isinstance(best, AnnealedFit):
+        noise = noise_beside(problem, best.fit)
+        prices = term_prices(problem, problem.n_samples * float(noise.independent.mean()))
+        best = Solution(best, noise, prices, best.level.rho, astray(problem, best))
+    none, limit = np.zeros(len(problem.states)), max_terms or FIRST_MAX_TERMS
+    few_terms = max_terms_for(problem, limit)
+    if best.fits:
+        said = (f"the search was {ended}: other starts and terms were not tried",)
+        words = _at_limit(problem, best, limit)
+        return Explanation(problem, best, few_terms, words, none, none, said)
+    words = (
+        f"the search was {ended}, and nothing fits as far as the noise yet: the equations are the "
+        "best so far; raise limit_s, or take fewer terms"
+    )
+    return Explanation(problem, best, few_terms, words, none, none)
+
+
+def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> Explanation:
+    """`explain` without a limit to its time."""
     problem, first, max_terms = _search_by_size(problem, max_terms)
     few_terms = max_terms_for(problem, max_terms)
     best, late, pushed = _solve(problem, first, few_terms)
@@ -121,6 +171,7 @@ def _search_by_size(
         if (not better.fits, better.score) >= (not found.fits, found.score):
             break
         part, found, limit = tried, better, wider
+    problem.watch.best = part, found
     return part, found, limit
 
 
@@ -142,9 +193,11 @@ def _solve(
 
     best, pushed = first, None
     if not first.fits:
-        pushed = solve_pushed(problem, max_terms=max_terms)
-        exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=max_terms)
+        with problem.watch.stage("random pushes"):
+            pushed = solve_pushed(problem, max_terms=max_terms)
+            exact = settle(problem, pushed.fit, pushed.level.noise, max_terms=max_terms)
         best = min([first, exact], key=rank)
+        problem.watch.best = problem, best
     late = _align(problem, first, max_terms)
     if late is not None and not (best.fits and best.score < late.score):
         return best, late, pushed
@@ -152,7 +205,9 @@ def _solve(
     for log10_ratio in OTHER_STARTS if problem.measured.all() else ():
         if best.fits and problem.n_samples >= ENOUGH_SAMPLES:
             break
-        best = min([best, from_smooth(problem, log10_ratio, max_terms=max_terms)], key=rank)
+        with problem.watch.stage("another start"):
+            other = from_smooth(problem, log10_ratio, max_terms=max_terms)
+        best = min([best, other], key=rank)
     return best, None if best is first else _align(problem, best, max_terms), pushed
 
 
@@ -171,7 +226,8 @@ def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Align
         here = move_channels(here, now.annealed.fit.paths, step)
         if min(len(record.samples) for record in here.records) < MIN_LEFT:
             return None  # shifts as long as a record are no delays
-        now = from_smooth(here, None, max_terms=max_terms)
+        with problem.watch.stage("channels that come late"):
+            now = from_smooth(here, None, max_terms=max_terms)
         if now.annealed.around is None:
             return None
         around, support = now.annealed.around, now.annealed.fit.support

@@ -122,7 +122,7 @@ def fit_paths(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -> T
     if not np.isfinite(fit.total):
         return fit  # no gradient to follow
     for _ in range(MAX_STEPS):
-        problem.advance(1)
+        problem.watch.step()
         change, moves = _step(problem, fit, level)
         if not np.isfinite(change).all():
             return fit  # derivatives overflow before the flow itself does

@@ -1,13 +1,9 @@
-"""The estimation problem: records in scaled variables, and all coefficients that a model may have.
-
-`check_size` tells the cost of an estimation before it begins.
-"""
+"""The estimation problem: records in scaled variables, and all coefficients a model may have."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,15 +12,11 @@ from jaxtyping import Bool, Float, Int
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.sensor import Bounds, bounds_of
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.estimation.cost import Watch
 from ep2sindy.estimation.kernels import sensitivities, term_values
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, constraint
-from ep2sindy.runtime.progress import Advance, nothing
-from ep2sindy.trust.memory import check_memory
 
-NUMBERS = 3.5  # held in memory per pair of coefficients, and per coefficient, sample and state
-
-SOON = 300  # number of coefficients that a search handles within a minute or so
 # Position of each Runge-Kutta stage in its step, and the weight of its slope in the sum.
 STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 
@@ -100,13 +92,14 @@ class Flow:
 class EstimationProblem:
     """Records, the library of their variables, and the coefficients: coef = C free + fixed.
 
+    Without relations between coefficients all are free: C is None, and fixed is zero.
+
     library: of scaled variables, states first. term_names: names of its terms in SI variables.
     equation, column: (coefficients,), the equation and the term of each coefficient.
-    C: (coefficients, free), fixed: (coefficients,), both scaled; without relations C is the
-    identity.
+    C: (coefficients, free), fixed: (coefficients,), both scaled.
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
-    measured: (d,), False for hidden states. advance: called at every step of a fit. whole: the
+    measured: (d,), False for hidden states. watch: told of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (terms,), their
     positions in its library.
     """
@@ -117,7 +110,7 @@ class EstimationProblem:
     records: tuple[ScaledRecord, ...]
     equation: Int[np.ndarray, " coefficients"]
     column: Int[np.ndarray, " coefficients"]
-    C: Float[np.ndarray, "coefficients free"]
+    C: Float[np.ndarray, "coefficients free"] | None
     fixed: Float[np.ndarray, " coefficients"]
     required: Bool[np.ndarray, " free"]
     to_SI: Float[np.ndarray, " coefficients"]
@@ -127,12 +120,16 @@ class EstimationProblem:
     measured: Bool[np.ndarray, " d"]
     places: Int[np.ndarray, " terms"]
     inputs: tuple[str, ...] = ()
-    advance: Advance = nothing
+    watch: Watch = field(default_factory=Watch)
     whole: EstimationProblem | None = None
 
     def restricted(self, kept: Bool[np.ndarray, " free"]) -> EstimationProblem:
         """The same records with some of the coefficients; the others are zero."""
-        rows = (self.C[:, kept] != 0.0).any(axis=1) | (self.fixed != 0.0)
+        if kept.all():
+            return self
+        rows = kept
+        if self.C is not None:
+            rows = (self.C[:, kept] != 0.0).any(axis=1) | (self.fixed != 0.0)
         columns = np.unique(self.column[rows])
         return replace(
             self,
@@ -140,7 +137,7 @@ class EstimationProblem:
             term_names=tuple(self.term_names[column] for column in columns),
             equation=self.equation[rows],
             column=np.searchsorted(columns, self.column[rows]),
-            C=self.C[np.ix_(rows, kept)],
+            C=None if self.C is None else self.C[np.ix_(rows, kept)],
             fixed=self.fixed[rows],
             required=self.required[kept],
             to_SI=self.to_SI[rows],
@@ -180,30 +177,35 @@ class EstimationProblem:
         return self.n_samples * int(self.measured.sum())
 
     @property
-    def related(self) -> bool:
-        """True if relations hold between coefficients."""
-        return self.C.shape[0] != self.C.shape[1] or not np.array_equal(self.C, np.eye(len(self.C)))
+    def n_free(self) -> int:
+        return len(self.column) if self.C is None else self.C.shape[1]
 
     @cached_property
     def block(self) -> Int[np.ndarray, " free"]:
         """Equation that each free coefficient belongs to; the first one, if several share it."""
-        return self.equation[np.argmax(self.C != 0.0, axis=0)]
+        return self.equation if self.C is None else self.equation[np.argmax(self.C != 0.0, axis=0)]
 
     @cached_property
     def degrees(self) -> Int[np.ndarray, " free"]:
         """Degree of each free coefficient's term; the least, if several terms share it."""
         degrees = self.library.degrees[self.column]
+        if self.C is None:
+            return degrees
         return np.where(self.C != 0.0, degrees[:, None], degrees.max()).min(axis=0)
 
     def coef(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, "terms d"]:
         """Scaled coefficients as a matrix."""
         coef = np.zeros((len(self.library), len(self.states)))
-        coef[self.column, self.equation] = self.C @ free + self.fixed
+        coef[self.column, self.equation] = self.all_coefficients(free)
         return coef
+
+    def all_coefficients(self, free: Float[np.ndarray, " free"]) -> np.ndarray:
+        """(coefficients,), scaled, from the free ones."""
+        return free if self.C is None else self.C @ free + self.fixed
 
     def coef_SI(self, free: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefficients"]:
         """All coefficients that may differ from zero, in SI."""
-        return (self.C @ free + self.fixed) * self.to_SI
+        return self.all_coefficients(free) * self.to_SI
 
     @property
     def driven(self) -> bool:
@@ -277,7 +279,7 @@ class EstimationProblem:
     ) -> Flow:
         """`ends` with its derivatives by the states and by the free coefficients of a support."""
         d = len(self.states)
-        involved = np.flatnonzero(self.C[:, support].any(axis=1))
+        involved = np.flatnonzero(support if self.C is None else self.C[:, support].any(axis=1))
         equation, column = self.equation[involved], self._places[self.column[involved]]
         by_state = np.einsum("tjp,ti->pij", self._shares[:, 1:], self.coef(free))
         rates = np.column_stack(
@@ -301,7 +303,7 @@ class EstimationProblem:
                 np.stack(jacobians), np.stack(values), equation, column, leads, weights, h, slopes
             )
             states = total
-        if self.related:
+        if self.C is not None:
             by_free = slopes[:, :, d:] @ self.C[np.ix_(involved, support)]
             slopes = np.concatenate([slopes[:, :, :d], by_free], axis=2)
         return Flow(states, slopes)
@@ -342,7 +344,7 @@ def scale_problem(
     terms: Mapping[str, Sequence[str]] | None = None,
     *,
     measured: Sequence[str] = (),
-    advance: Advance = nothing,
+    watch: Watch | None = None,
 ) -> EstimationProblem:
     """Scale records and library, and collect the coefficients that may be in the model.
 
@@ -360,9 +362,8 @@ def scale_problem(
     step_s = float(np.mean(np.concatenate([np.diff(run.t) for run in runs])))
     scaled, numbers = over.scaled(size)
     asked = {state: (terms or {}).get(state, over.names) for state in states}
-    held = constraint(over, asked, relations)
-    column = np.array([over.index(term) for _, term in held.coefficients])
-    equation = np.array([states.index(state) for state, _ in held.coefficients])
+    held = constraint(over, asked, relations) if relations else None
+    equation, column = _coefficients(over, asked)  # in the order of the constraint's
     to_SI = size[equation] / (numbers[column] * step_s)
     known = np.isin(equation, [states.index(state) for state in terms or {}])
     problem = EstimationProblem(
@@ -372,9 +373,9 @@ def scale_problem(
         records=(),
         equation=equation,
         column=column,
-        C=held.C * to_SI[held.free] / to_SI[:, None],
-        fixed=held.d / to_SI,
-        required=(held.C[known] != 0.0).any(axis=0),
+        C=held.C * to_SI[held.free] / to_SI[:, None] if held else None,
+        fixed=held.d / to_SI if held else np.zeros(len(column)),
+        required=(held.C[known] != 0.0).any(axis=0) if held else known,
         to_SI=to_SI,
         scale=size[: len(states)],
         input_scale=size[len(states) :],
@@ -382,43 +383,24 @@ def scale_problem(
         measured=np.isin(states, measured or states),
         places=np.arange(len(over)),
         inputs=tuple(inputs),
-        advance=advance,
+        watch=watch or Watch(),
     )
     return replace(problem, records=tuple(problem.record(run) for run in runs))
+
+
+def _coefficients(
+    library: Library, asked: Mapping[str, Sequence[str]]
+) -> tuple[Int[np.ndarray, " coefficients"], Int[np.ndarray, " coefficients"]]:
+    """Equation and term of every coefficient that may be in the model."""
+    pairs = [
+        (equation, column)
+        for equation, terms in enumerate(asked.values())
+        for column in sorted({library.index(term) for term in terms})
+    ]
+    equation, column = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    return equation, column
 
 
 def _limits(run: Trajectory, size: np.ndarray) -> Bounds | None:
     found = bounds_of(run.states, run.state_names)
     return found and replace(found, lower=found.lower / size, upper=found.upper / size)
-
-
-class SlowSearch(UserWarning):
-    """Warning that a search over so many coefficients at once takes long."""
-
-
-def check_size(
-    runs: Sequence[Trajectory], library: Library, terms: Mapping[str, Sequence[str]]
-) -> None:
-    """Raise ValueError for more coefficients than memory holds; warn of a long search.
-
-    terms: for each state whose equation is known but for its coefficients, all terms of that
-    equation.
-    """
-    states = runs[0].state_names
-    n = sum(len(terms.get(state, library)) for state in states)
-    n_samples = sum(run.n_samples for run in runs)
-    what = f"{n} coefficients ({len(library)} terms, {len(states)} states)"
-    check_memory(
-        8.0 * NUMBERS * n * (n + n_samples * len(states)),
-        f"{what} that are estimated together from {n_samples} samples",
-        way_out="take fewer terms or a lower degree, every second sample "
-        "(ep2sindy.prepare.decimate), or a search equation by equation: "
-        "Regression(WeightedWeak()), or search=best_subset selection=ebic",
-    )
-    if n > SOON:
-        warnings.warn(
-            f"{what} are searched together, which may take many minutes: fewer "
-            "terms, or a search equation by equation, Regression(WeightedWeak()), take seconds",
-            SlowSearch,
-            stacklevel=2,
-        )

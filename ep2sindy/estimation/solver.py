@@ -173,6 +173,8 @@ def anneal(
         fit, level = at_level(problem, fit, Level(noise, rho, n_substeps))
         n_substeps = level.n_substeps
         fit, score = _exchange_terms(problem, fit, level, share * prices, max_terms)
+        if problem.watch.best is None or isinstance(problem.watch.best[1], AnnealedFit):
+            problem.watch.best = problem, AnnealedFit(fit, level, score)
     return AnnealedFit(fit, level, score)
 
 
@@ -265,7 +267,7 @@ def start_from_smooth(
     ]
     theta = np.concatenate([problem.library.evaluate(each) for each in values])
     free = _regress(problem, theta, np.concatenate(start.rates))
-    support = np.ones(problem.C.shape[1], dtype=np.bool_)
+    support = np.ones(problem.n_free, dtype=np.bool_)
     fit = TrajectoryFit(start.paths, free, support, np.full(len(problem.states), np.inf))
     return fit, start.noise
 
@@ -309,16 +311,16 @@ def _regress(
 ) -> Float[np.ndarray, " free"]:
     """Least squares of all equations at once, under the relations."""
     n, d = rates.shape
-    rows = np.zeros((n, d, len(problem.equation)))
-    for k, (equation, column) in enumerate(zip(problem.equation, problem.column, strict=True)):
-        rows[:, equation, k] = theta[:, column]
-    target = (rates - rows @ problem.fixed).reshape(-1)
-    if problem.related:
+    if problem.C is not None:
+        rows = np.zeros((n, d, len(problem.equation)))
+        for k, (equation, column) in enumerate(zip(problem.equation, problem.column, strict=True)):
+            rows[:, equation, k] = theta[:, column]
+        target = (rates - rows @ problem.fixed).reshape(-1)
         return _solve(rows.reshape(n * d, -1) @ problem.C, target)
-    free = np.zeros(problem.C.shape[1])
+    free = np.zeros(problem.n_free)
     for equation in range(d):  # far smaller systems, one per equation
         own = problem.equation == equation
-        free[own] = _solve(rows[:, equation, own], target.reshape(n, d)[:, equation])
+        free[own] = _solve(theta[:, problem.column[own]], rates[:, equation])
     return free
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import zero_to_one
+from ep2sindy.estimation.cost import SMALL
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, hessian, observe
 from ep2sindy.estimation.problem import EstimationProblem, Flow
@@ -29,7 +30,6 @@ from ep2sindy.estimation.solver import (
 from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
 from ep2sindy.regression.exchanges import exchanged_supports
 
-SMALL = 20  # terms of an equation that are all weighed from the start
 WARM = 0.3  # rho of the first set: the state all but free, the other states smoothed
 MOST_ENTER, MAX_ENTRANCES = 3, 4  # terms of one equation that enter at once; times that some do
 DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if they span the term
@@ -41,10 +41,10 @@ def search_within(
 ) -> tuple[EstimationProblem, Solution]:
     """The solution from smoothed states by a working set, and the problem of the set's terms."""
     kept = first_set(problem, max_terms)
-    if kept.all():
-        return problem, from_smooth(problem, None, max_terms=max_terms)
     part = problem.restricted(kept)
-    found = from_smooth(part, None, max_terms=max_terms)
+    with problem.watch.stage(_weighed(part)):
+        found = from_smooth(part, None, max_terms=max_terms)
+    problem.watch.best = part, found
     for _ in range(MAX_ENTRANCES):
         entering = ~kept & _would_pay(problem, kept, part, found)
         if not entering.any():
@@ -56,18 +56,26 @@ def search_within(
             free=_spread(fit.free, before)[kept],
             support=_spread(fit.support, before)[kept] | entering[kept],
         )
-        found = settle(part, widened, found.noise.effective, max_terms=max_terms)
+        with problem.watch.stage(_weighed(part)):
+            found = settle(part, widened, found.noise.effective, max_terms=max_terms)
+        problem.watch.best = part, found
     return part, found
+
+
+def _weighed(part: EstimationProblem) -> str:
+    n_all = part.candidates.n_free
+    of = "" if part.n_free == n_all else f" of {n_all}"
+    return f"weighing {part.n_free}{of} coefficients"
 
 
 def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " free"]:
     """Required terms, and of each equation the terms of its best few supports of every size.
 
-    Everything if the equations are small, or tied together by relations or hidden states.
+    All of them if the equations are small, or tied together by relations or hidden states.
     """
     kept = problem.required.copy()
     sizes = np.bincount(problem.block[~kept], minlength=len(problem.states))
-    if problem.related or not problem.measured.all() or (sizes <= SMALL).all():
+    if problem.C is not None or not problem.measured.all() or (sizes <= SMALL).all():
         return np.ones_like(kept)
     start = smoothed(problem, None)
     level = Level(start.noise, WARM)
@@ -138,7 +146,7 @@ def _would_pay(
     Source: Rao 1948, doi:10.1017/S0305004100023987.
     """
     enters = np.zeros_like(kept)
-    if not np.isfinite(found.score):
+    if kept.all() or not np.isfinite(found.score):
         return enters
     fit, level = at_level(part, found.annealed.fit, replace(found.annealed.level, rho=WEIGHED_AT))
     gains = _gains(problem, part, fit, level, _spread(fit.free, kept))
