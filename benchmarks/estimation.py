@@ -4,10 +4,19 @@
     python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
     python -m benchmarks.estimation samples             # CPU against the number of samples
     python -m benchmarks.estimation thruster            # the breathing mode, beside free runs
+    python -m benchmarks.estimation collection [--n 3] [--noises ...]  # dysts: classes of failure
+    python -m benchmarks.estimation prices [--n 1] [--noises ...]      # dysts: price of a term
 
 `counts` prints per system and noise: selected exactly right, wrong ones that are called a misfit,
 right ones that are, median CPU-s and the longest; of the right ones the median relative error of a
 coefficient and the share of 95 % intervals that hold the truth.
+
+`collection` prints, for every draw of all systems of dysts, how many are exactly right, CPU-s, the
+intervals, and each wrong one in the first class of these that holds: flagged (called a misfit);
+search (the truth is likelier by more than 4, prices included); near (the truth of every wrong
+equation is among the rivals at better than 1:20); less likely (the truth is, by as much as printed:
+terms that are missed change -2 log likelihood by less than their price). `prices` counts missed and
+false terms against the weight of the choice among terms in a term's price.
 """
 
 from __future__ import annotations
@@ -15,15 +24,21 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 import ep2sindy as ep
 from benchmarks.known_systems import KINDS, OTHERS, noisy
 from benchmarks.living import DOWNSTREAM, POINTS, parts, record
+from ep2sindy.estimation import supports
+from ep2sindy.estimation.problem import scale_problem
+from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.studies.living import start_of
-from ep2sindy.systems.draws import DRAWS
+from ep2sindy.systems.collection import collected_names
+from ep2sindy.systems.draws import DRAWS, realization
 from ep2sindy.systems.systems import System, lorenz
 
 
@@ -80,6 +95,7 @@ def misfits(systems: Sequence[str], n: int) -> None:
     """With a true term left out, and with the whole library where that is found."""
     print(f"called a misfit:  a term left out, by {', '.join(ROUTES)}; right equations, by all")
     totals = np.zeros((2, len(ROUTES), 2), dtype=int)
+    holding = np.zeros((2, 2), dtype=int)  # (equation that is whole, that lacks the term)
     for name in systems:
         counts = np.zeros((2, len(ROUTES), 2), dtype=int)  # library, route, (called, of)
         for number in range(n):
@@ -91,11 +107,19 @@ def misfits(systems: Sequence[str], n: int) -> None:
             ):
                 for r, method in enumerate(ROUTES.values()):
                     found = ep.discover(run, library.take(kept), method)
+                    if k == 0 and found.estimate is not None and found.misfit:
+                        for state, lacks in zip(run.state_names, true[left_out], strict=True):
+                            holding[int(lacks)] += state in found.estimate.holds, 1
                     if k == 0 or ((found.model.coef != 0.0) == true).all():
                         counts[k, r] += bool(found.misfit), 1
         totals += counts
         print(f"{name:16} {_shares(counts)}", flush=True)
     print(f"{'all':16} {_shares(totals)}")
+    (whole, n_whole), (lacking, n_lacking) = holding.tolist()
+    print(
+        f"equations of misfits by joint that are said to hold: {whole} of {n_whole} whole ones, "
+        f"{lacking} of {n_lacking} that lack the term"
+    )
 
 
 def _shares(counts: np.ndarray) -> str:
@@ -131,12 +155,96 @@ def thruster() -> None:
             )
 
 
+class Judged(NamedTuple):
+    """One record of a collected system."""
+
+    name: str
+    missed: int
+    false: int
+    failure: str
+    cpu_s: float
+    inside: float
+
+
+def collected_draw(name: str, noise: float, number: int) -> Judged:
+    system, runs = realization(name, noise, number)
+    start = time.process_time()
+    found = ep.estimate(runs, system.model.library)
+    cpu_s = time.process_time() - start
+    true, used = system.model.coef != 0.0, found.model.coef != 0.0
+    row = judged(system, found, cpu_s)
+    failure = "" if row["right"] else _failure(system, runs, found)
+    missed, false = int((true & ~used).sum()), int((used & ~true).sum())
+    return Judged(name, missed, false, failure, cpu_s, row.get("inside", np.nan))
+
+
+def _failure(system: System, runs: Sequence[ep.Trajectory], found: ep.discovery.Estimate) -> str:
+    """The class of a wrong model, see the module; with what the truth lacks in likelihood."""
+    if found.misfit:
+        return "flagged"
+    behind = _behind(system, runs, found)
+    if behind < -4.0:
+        return f"search ({behind:.0f})"
+    wrong = [
+        state
+        for state in system.model.states
+        if set(found.model.terms(state)) != set(system.model.terms(state))
+    ]
+    odds = {(r.state, frozenset(r.terms)): r.odds for r in found.rivals}
+    known = [odds.get((s, frozenset(system.model.terms(s))), 0.0) for s in wrong]
+    return "near" if min(known) > 0.05 else f"less likely ({behind:.0f})"
+
+
+def _behind(system: System, runs: Sequence[ep.Trajectory], found: ep.discovery.Estimate) -> float:
+    """-2 log likelihood of the true terms minus that of those found, with the terms' prices."""
+    problem = scale_problem(runs, system.model.library)
+    scores = []
+    for coef in (system.model.coef, found.model.coef):
+        part = problem.restricted((coef != 0.0)[problem.column, problem.equation])
+        part = replace(part, required=np.ones_like(part.required))
+        scores.append(from_smooth(part, None, max_terms=1).score)
+    return scores[0] - scores[1]
+
+
+def collection(noises: Sequence[float], n: int) -> None:
+    for noise, number in product(noises, range(n)):
+        rows = [collected_draw(name, noise, number) for name in collected_names()]
+        cpu = [row.cpu_s for row in rows]
+        wrong = [row for row in rows if row.failure]
+        print(
+            f"noise {noise:g}, draw {number}: {len(rows) - len(wrong)} of {len(rows)} right; CPU-s "
+            f"median {np.median(cpu):.2f}, mean {np.mean(cpu):.2f}, most {max(cpu):.1f}; "
+            f"{100.0 * np.nanmean([row.inside for row in rows]):.1f} % of intervals hold"
+        )
+        for row in wrong:
+            print(
+                f"    {row.name}: {row.missed} missed, {row.false} false; {row.failure}", flush=True
+            )
+
+
+def prices(noises: Sequence[float], n: int) -> None:
+    print("weight  noise  right  missed terms  false terms")
+    for noise, weight in product(noises, (0.0, 0.25, 0.5, 1.0, 1.5)):
+        supports.GAMMA = weight
+        rows = [
+            collected_draw(name, noise, number)
+            for name, number in product(collected_names(), range(n))
+        ]
+        missed, false = sum(row.missed for row in rows), sum(row.false for row in rows)
+        right = sum(not row.failure for row in rows)
+        print(
+            f"{weight:6g}  {noise:5g}  {right}/{len(rows)}  {missed:12d}  {false:11d}", flush=True
+        )
+
+
 def main() -> None:
     every = [*DRAWS, *OTHERS]
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("what", choices=["counts", "misfit", "samples", "thruster"])
+    parser.add_argument(
+        "what", choices=["counts", "misfit", "samples", "thruster", "collection", "prices"]
+    )
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--systems", nargs="+", default=every, choices=every)
     parser.add_argument("--noises", nargs="+", type=float, default=[0.0, 0.05, 0.2, 0.4])
@@ -146,6 +254,10 @@ def main() -> None:
         counts(asked.systems, asked.noises, asked.kind, asked.n)
     elif asked.what == "misfit":
         misfits(asked.systems, asked.n)
+    elif asked.what == "collection":
+        collection(asked.noises, asked.n)
+    elif asked.what == "prices":
+        prices(asked.noises, asked.n)
     elif asked.what == "samples":
         samples()
     else:

@@ -5,3 +5,4 @@ from ep2sindy.studies.pysindy_variants import PySINDySsr as PySINDySsr  # for co
 from ep2sindy.studies.pysindy_variants import PySINDyEnsemble as PySINDyEnsemble  # for configs
 from ep2sindy.studies.pysindy_variants import PySINDyWeakForm as PySINDyWeakForm  # for configs
 from ep2sindy.studies.pysindy_variants import PySINDySmoothing as PySINDySmoothing  # for configs
+from ep2sindy.studies.pysindy_variants import PySINDyAsItComes as PySINDyAsItComes  # for configs

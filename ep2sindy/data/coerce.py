@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.gaps import MissingSamples, describe_gaps, present_rows
+from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import real_numbers, seconds
 from ep2sindy.data.trajectory import Trajectory, check_agreement, read_only_mapping
 from ep2sindy.library.library import Library
@@ -39,14 +39,15 @@ else:  # pandas is not imported only to name a type
     Run = Runs = object
 
 
-def trajectories_of(runs: object) -> list[Trajectory]:
+def trajectories_of(runs: object, *, partial: bool = False) -> list[Trajectory]:
     """Convert one run, or a list of runs, to trajectories.
 
     A run is one of the following.
     - A Trajectory.
     - A pandas DataFrame with a column of times in s (`time`, `t`, `time_s`, `t_s`) or an index of
       that name. Its other columns are states; columns labelled by a number are called x0, x1 ...
-      Rows that hold a NaN are left out, with the warning `MissingSamples`.
+      Rows that hold a NaN are left out, with the warning `MissingSamples`; if partial, only those
+      that hold nothing else, and in the others the state counts as missing.
     - A tuple (t, x) of times (samples,) and states (samples,) or (samples, n_states). The states
       are then called x, or x0, x1 ...
     A tuple of runs, none of them an array, is a list of them.
@@ -57,8 +58,8 @@ def trajectories_of(runs: object) -> list[Trajectory]:
     if isinstance(runs, Sequence) and not isinstance(runs, tuple | str):
         if not runs:
             raise ValueError("finding equations needs at least one run: an empty list came")
-        return [_trajectory(run, f" {k} of the list") for k, run in enumerate(runs)]
-    return [_trajectory(runs, "")]
+        return [_trajectory(run, f" {k} of the list", partial) for k, run in enumerate(runs)]
+    return [_trajectory(runs, "", partial)]
 
 
 def is_run(value: object) -> bool:
@@ -70,14 +71,14 @@ def is_run(value: object) -> bool:
 
 def trajectory_of(run: object) -> Trajectory:
     """Convert one run to a trajectory; see `trajectories_of`."""
-    return _trajectory(run, "")
+    return _trajectory(run, "", False)
 
 
-def _trajectory(run: object, which: str) -> Trajectory:
+def _trajectory(run: object, which: str, partial: bool) -> Trajectory:
     if isinstance(run, Trajectory):
         return run
     if is_run(run):
-        return _from_table(cast("pd.DataFrame", run))
+        return _from_table(cast("pd.DataFrame", run), partial)
     if isinstance(run, tuple) and len(run) == 2:
         return _from_arrays(*run)
     raise ValueError(
@@ -86,7 +87,7 @@ def _trajectory(run: object, which: str) -> Trajectory:
     )
 
 
-def _from_table(table: pd.DataFrame) -> Trajectory:
+def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
     if table.index.name in TIMES:
         table = table.reset_index(allow_duplicates=True)
     table = table.set_axis([_word(name) for name in table.columns], axis="columns")
@@ -111,11 +112,19 @@ def _from_table(table: pd.DataFrame) -> Trajectory:
         raise ValueError(f"columns of a table must hold real numbers: {wrong} came; {way_out}")
     values = table[states].to_numpy(dtype=np.float64)
     t = seconds(_times(table[times[0]]))
-    if np.isnan(values).any():
-        present = present_rows(dict(zip(states, values.T, strict=True)))
-        t, values = t[present], values[present]
-        warnings.warn(describe_gaps(t, len(table)), MissingSamples, stacklevel=5)
-    return Trajectory(t, values, states)
+    absent = np.isnan(values)
+    if not absent.any():
+        return Trajectory(t, values, states)
+    if partial and not absent.all(axis=0).any():
+        kept = ~absent.all(axis=1)
+        run = Trajectory(t[kept], values[kept], states, missing=absent[kept])
+        words = describe_missing(t, dict(zip(states, absent.T, strict=True)))
+    else:
+        kept = present_rows(dict(zip(states, values.T, strict=True)))
+        run = Trajectory(t[kept], values[kept], states)
+        words = describe_gaps(t[kept], len(table))
+    warnings.warn(words, MissingSamples, stacklevel=5)
+    return run
 
 
 def _word(label: object) -> str:
@@ -276,7 +285,7 @@ class Task:
             check_list(f"the terms of {state!r}", names)
         terms = {state: tuple(names) for state, names in self.terms.items()}
         for name, value in {
-            "runs": tuple(trajectories_of(self.runs)),
+            "runs": tuple(trajectories_of(self.runs, partial=True)),
             "relations": relations_of(self.relations),
             "terms": read_only_mapping(terms),
             "hidden": tuple(self.hidden),

@@ -79,3 +79,21 @@ def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
         f"gap is {longest:.4g} s, {longest / usual:.0f} steps: crop the record if that is long "
         "beside its period, or fill it with ep2sindy.prepare.interpolate"
     )
+
+
+def describe_missing(
+    t: Float[np.ndarray, " samples"], absent: Mapping[str, Bool[np.ndarray, " samples"]]
+) -> str:
+    """Message with the number of missing samples of every column, and its longest gap.
+
+    t: times in s. absent: column -> true where it holds a NaN.
+    """
+    parts = []
+    for name, lacks in absent.items():
+        if lacks.any():
+            longest = float(np.diff(t[~lacks]).max(initial=0.0))
+            parts.append(f"{name} {int(lacks.sum())}, its longest gap is {longest:.4g} s")
+    return (
+        f"of {len(t)} samples are missing (NaN): {'; '.join(parts)}. A search of trajectories does "
+        "without them, others leave the samples out: fill them with ep2sindy.prepare.interpolate"
+    )

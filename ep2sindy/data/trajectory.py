@@ -6,11 +6,11 @@ import copyreg
 import html
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state
@@ -39,6 +39,8 @@ class Trajectory:
     t: (samples,) in s, increasing; steps may be unequal. Dates are counted from the first, in s.
     states: (samples, n_states). inputs: (samples, n_inputs), by default none.
     units: name -> unit for any of the variables; the default is "1".
+    missing: (samples, n_states), true where a state was not measured, such as a channel of a slower
+    rate; its samples there may be NaN and are interpolated. None if all were measured.
     clock: unit in which times are displayed; t stays in s.
     Raises ValueError for time that does not increase, unequal lengths, values that are masked, not
     finite or not real numbers, a variable of magnitude below 1e-50, repeated names, names that
@@ -60,6 +62,7 @@ class Trajectory:
     units: Mapping[str, str] = field(default_factory=dict)
     label: str = ""
     clock: Clock = SECONDS
+    missing: Bool[np.ndarray, "_ n_states"] | None = None
 
     def __post_init__(self) -> None:
         check_list("state_names", self.state_names)
@@ -68,7 +71,7 @@ class Trajectory:
         inputs = np.empty((len(self.t), 0)) if empty else self.inputs
         for name, value in {
             "t": read_only(seconds(self.t)),
-            "states": read_only(real_numbers(self.states, "states")),
+            "states": self._filled(real_numbers(self.states, "states")),
             "inputs": read_only(real_numbers(inputs, "inputs")),
             "state_names": tuple(self.state_names),
             "input_names": tuple(self.input_names),
@@ -82,6 +85,57 @@ class Trajectory:
         check_finite(self.t, self.values, self.names)
         check_magnitude(self.values, self.names)
         self._check_variation()
+
+    def _filled(self, states: np.ndarray) -> Float[np.ndarray, "_ n_states"]:
+        """The states, interpolated where they are missing."""
+        if self.missing is None:
+            return read_only(states)
+        missing = np.asarray(self.missing)
+        if missing.shape != states.shape or missing.dtype != np.bool_:
+            raise ValueError(
+                "missing must be a mask of the states, true or false for each sample: "
+                f"{missing.dtype} of shape {missing.shape} came with states of shape "
+                f"{states.shape}; write missing=np.isnan(states)"
+            )
+        empty = [
+            name for name, lacks in zip(self.state_names, missing.T, strict=False) if lacks.all()
+        ]
+        if empty:
+            raise ValueError(
+                f"every state needs samples: all of {empty} are missing; leave them out, or name "
+                "them in hidden=..."
+            )
+        t, filled = seconds(self.t), np.array(states, dtype=np.float64)
+        for column, lacks in zip(filled.T, missing.T, strict=True):
+            column[lacks] = np.interp(t[lacks], t[~lacks], column[~lacks])
+        missing = missing.copy()
+        missing.flags.writeable = False
+        object.__setattr__(self, "missing", missing if missing.any() else None)
+        return read_only(filled)
+
+    def complete(self) -> Trajectory:
+        """The samples at which every state was measured, for methods that need all of them.
+
+        Raises ValueError if fewer than two are left.
+        """
+        if self.missing is None:
+            return self
+        kept = ~self.missing.any(axis=1)
+        if kept.sum() < 2:
+            raise ValueError(
+                f"two samples or more must hold all states: {self._lacking()}, and {kept.sum()} "
+                f"of {self.n_samples} hold all; TrajectorySearch() takes states of their own rates"
+            )
+        return replace(
+            self, t=self.t[kept], states=self.states[kept], inputs=self.inputs[kept], missing=None
+        )
+
+    def _lacking(self) -> str:
+        """How many samples every state lacks."""
+        if self.missing is None:
+            return "no sample is missing"
+        counts = zip(self.state_names, self.missing.sum(axis=0).tolist(), strict=True)
+        return ", ".join(f"{name} lacks {n}" for name, n in counts if n)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -134,6 +188,7 @@ class Trajectory:
             units=self.units,
             label=self.label,
             clock=self.clock,
+            missing=None if self.missing is None else self.missing[start:stop],
         )
 
     def __repr__(self) -> str:
@@ -150,8 +205,9 @@ class Trajectory:
         even = np.ptp(steps) <= max(1e-6 * self.dt_s, 2 * rounding_s(self.t))
         step = f"{self.dt_s:.4g}" if even else f"{steps.min():.4g} to {steps.max():.4g}"
         label = f" {self.label!r}" if self.label else ""
+        lacking = "" if self.missing is None else f" ({self._lacking()})"
         return (
-            f"Trajectory{label}: {self.n_samples} samples, t = {self.t[0]:.6g} to "
+            f"Trajectory{label}: {self.n_samples} samples{lacking}, t = {self.t[0]:.6g} to "
             f"{self.t[-1]:.6g} s in steps of {step} s"
         )
 
@@ -227,7 +283,8 @@ def check_finite(
         k, j = rows[0], columns[0]
         raise ValueError(
             f"samples must be finite: {names[j]}[{k}] = {values[k, j]} at t = {t[k]:.6g} s "
-            f"({rows.size} such values); crop, mask or interpolate them first"
+            f"({rows.size} such values); crop, mask or interpolate them first, or say that they "
+            "were not measured (missing=np.isnan(states))"
         )
 
 

@@ -134,7 +134,7 @@ def discover(
     that the method cannot keep, runs whose states or units differ, states or samples that repeat.
     """
     method = method_given(method, recipe) or TrajectorySearch()
-    trajectories = trajectories_of(runs)
+    trajectories = trajectories_of(runs, partial=True)
     names = dict.fromkeys([*trajectories[0].names, *hidden])
     library = polynomial(list(names), degree=2) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")

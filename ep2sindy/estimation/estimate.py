@@ -74,7 +74,8 @@ class Estimate:
     share of the noise; 0 if the residuals are nothing but noise. push_std: (d,), of the random push
     that every state receives over a mean step, in SI; 0 if an exact trajectory explains the
     samples. misfit: the reason why these equations do not explain the data; empty if they do. few:
-    a remark if there are too few samples to decide; otherwise empty.
+    a remark if there are too few samples to decide; otherwise empty. holds: of a misfit, the states
+    whose equations explain their samples all the same.
     supports: for each state, the best supports of every size. rivals: other plausible supports, the
     most likely first.
     remarks: sentences on where the samples deviate from the assumptions: limits of sensors, noise
@@ -100,6 +101,7 @@ class Estimate:
     growth: Float[np.ndarray, " d"]
     delays_s: Float[np.ndarray, " d"]
     push_std: Float[np.ndarray, " d"]
+    holds: tuple[str, ...]
 
     @property
     def note(self) -> str:
@@ -144,7 +146,7 @@ def estimate(
     Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
     more samples than there are or more memory, or whatever a `Task` refuses.
     """
-    known = trajectories_of(runs)
+    known = trajectories_of(runs, partial=True)
     task = Task(known, library, relations_of(relations), terms or {}, hidden=hidden)
     return estimate_task(
         task,
@@ -213,7 +215,8 @@ def _with_path(answer: Explanation, number: int, run: Trajectory) -> Trajectory:
     record = problem.records[number]
     states = np.where(problem.measured, record.samples, fit.paths[number]) * problem.scale
     kept = np.isin((run.t - run.t[0]) / problem.step_s, record.times)
-    return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept])
+    missing = None if run.missing is None else run.missing[kept]
+    return replace(run, t=run.t[kept], states=states, inputs=run.inputs[kept], missing=missing)
 
 
 def _report(
@@ -248,6 +251,7 @@ def _report(
         growth=found.noise.growth,
         delays_s=answer.delays * problem.step_s,
         push_std=answer.pushes * problem.scale,
+        holds=answer.holds,
     )
 
 
@@ -347,6 +351,11 @@ def remarks(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
     limits = [w for r in problem.records if r.limits is not None for w in r.limits.words]
     return (
         *(f"{words}: read as limits, not as values" for words in dict.fromkeys(limits)),
+        *(
+            f"{state} was measured at {count} of {problem.n_samples} samples"
+            for state, count in zip(problem.states, problem.n_measured.tolist(), strict=True)
+            if 0 < count < problem.n_samples
+        ),
         *_of_noise(problem, noise),
         *_of_collinear_states(problem, noise),
     )

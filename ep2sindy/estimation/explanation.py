@@ -22,6 +22,7 @@ from ep2sindy.estimation.lateness import (
     move_channels,
     suspect_delays,
 )
+from ep2sindy.estimation.missing_state import ROADS, missing_state
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem
 from ep2sindy.estimation.pushed import (
@@ -58,7 +59,8 @@ class Explanation:
 
     max_terms: the most terms of one equation that were tried. misfit: the reason why it does not
     explain the samples; empty if it does. delays: (d,), in mean steps. pushes: (d,), scaled. said:
-    remarks on how the samples were changed or explained.
+    remarks on how the samples were changed or explained. holds: states whose equations explain
+    their samples although others do not.
     """
 
     problem: EstimationProblem
@@ -68,6 +70,7 @@ class Explanation:
     delays: Float[np.ndarray, " d"]
     pushes: Float[np.ndarray, " d"]
     said: tuple[str, ...] = ()
+    holds: tuple[str, ...] = ()
 
     @property
     def rank(self) -> tuple[bool, bool, float]:
@@ -149,12 +152,35 @@ def _explain(problem: EstimationProblem, max_terms: int | None, align: bool) -> 
         limit = _at_limit(problem, best, max_terms)
         return Explanation(problem, best, few_terms, limit, none, none)
     # A hidden state that is pushed explains whatever there is.
-    if pushed is not None and pushed.explains and problem.measured.all():
-        solution, said = solution_under_pushes(problem, pushed), push_words(problem, pushed)
-        limit = _at_limit(problem, solution, max_terms)
-        process = pushed.errors.process
-        return Explanation(problem, solution, few_terms, limit, none, process, (said,))
-    return Explanation(problem, best, few_terms, _misfit(problem, best), none, none)
+    if pushed is not None and pushed.explained.any() and problem.measured.all():
+        return _under_pushes(problem, pushed, max_terms)
+    words = _misfit(problem, best) + _roads(problem)
+    return Explanation(problem, best, few_terms, words, none, none)
+
+
+def _under_pushes(problem: EstimationProblem, pushed: PushedFit, max_terms: int) -> Explanation:
+    """The solution under random pushes, which explain all states or some of them."""
+    solution = solution_under_pushes(problem, pushed)
+    few_terms, none = max_terms_for(problem, max_terms), np.zeros(len(problem.states))
+    process = pushed.errors.process
+    if pushed.explains:
+        limit, said = _at_limit(problem, solution, max_terms), (push_words(problem, pushed),)
+        return Explanation(problem, solution, few_terms, limit, none, process, said)
+    holds = tuple(compress(problem.states, pushed.explained))
+    others = tuple(compress(problem.states, ~pushed.explained))
+    misfit = (
+        f"no law of this library explains {' and '.join(others)}: a term or a state is missing "
+        f"there. What was measured of {' and '.join(holds)} is explained, with random pushes of "
+        "the size given"
+    )
+    misfit += _roads(problem)
+    return Explanation(problem, solution, few_terms, misfit, none, process, holds=holds)
+
+
+def _roads(problem: EstimationProblem) -> str:
+    """What shows that a state is missing, and what to do then; empty if nothing shows it."""
+    sign = missing_state(problem)
+    return f". A state is missing for certain: {sign}. {ROADS}" if sign else ""
 
 
 def _search_by_size(
@@ -214,7 +240,8 @@ def _solve(
 def _align(problem: EstimationProblem, found: Solution, max_terms: int) -> Aligned | None:
     """A solution with late channels that fits and is likelier; None if there is none."""
     around = found.annealed.around
-    if around is None:  # no model follows the samples
+    # No model follows the samples, or a channel of its own rate cannot be moved onto the others.
+    if around is None or problem.partial:
         return None
     support = found.annealed.fit.support
     step = suspect_delays(problem, around, support, found.prices, max_terms=max_terms)

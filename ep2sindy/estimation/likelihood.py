@@ -277,13 +277,13 @@ def observe(
     """Compare the samples of a record with a path, given the variance of the noise."""
     residuals = record.samples - path
     squares = np.square(residuals) / variance
-    if record.measured is not None:
-        residuals[:, ~record.measured] = np.nan
-        squares[:, ~record.measured] = 0.0
+    if record.missing is not None:
+        residuals = np.where(record.missing, np.nan, residuals)
+        squares = np.where(record.missing, 0.0, squares)
     if record.limits is None:
         return Seen(residuals, variance, squares)
     residuals, variance = residuals.copy(), variance.copy()
-    at = record.limits.at & (True if record.measured is None else record.measured)
+    at = record.limits.at & record.at_hand
     noise = np.sqrt(variance[at])
     lower = (record.limits.lower - path)[at] / noise
     upper = (record.limits.upper - path)[at] / noise

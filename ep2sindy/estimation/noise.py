@@ -76,19 +76,21 @@ def noise_beside(problem: EstimationProblem, fit: TrajectoryFit) -> Noise:
     """Size, shape and memory of the residuals of a fit; the memory is that of an AR(1) process."""
     hidden = ~problem.measured
     left = [r.samples - p for r, p in zip(problem.records, fit.paths, strict=True)]
-    left = [np.where(hidden, 0.0, each) for each in left]
-    n = problem.n_samples
+    left = [np.where(r.at_hand, each, 0.0) for r, each in zip(problem.records, left, strict=True)]
+    n = np.where(hidden, problem.n_samples, problem.n_measured)
     per_state = fit.support.sum() / len(problem.states) + len(left)
-    freedom = np.sqrt(n / max(n - per_state, 1.0))
+    freedom = np.sqrt(n / np.maximum(n - per_state, 1.0))
     std = freedom * np.sqrt(sum(np.square(e).sum(axis=0) for e in left) / n)
     # How freely hidden states may leave the flow: as others do, however small they have become.
     sizes = np.sqrt(np.mean([np.square(path).mean(axis=0) for path in fit.paths], axis=0))
     std[hidden] = std[~hidden].mean() * sizes[hidden]
     shape, growth = _shapes(fit.paths, left)
     limited = problem.limited
-    if (limited | hidden).any():
-        shape = tuple(np.where(limited | hidden, 1.0, each) for each in shape)
-        growth = np.where(limited | hidden, 0.0, growth)
+    # The shape is told by values at all samples.
+    untold = limited | hidden | (n < problem.n_samples)
+    if untold.any():
+        shape = tuple(np.where(untold, 1.0, each) for each in shape)
+        growth = np.where(untold, 0.0, growth)
     if limited.any():
         likely, between = _likeliest_std(problem, fit, std)
         std = np.where(limited, freedom * likely, std)
@@ -209,7 +211,7 @@ def flow_error(problem: EstimationProblem, fit: TrajectoryFit, noise: Noise, exa
     Source of the likelihood by innovations: Schweppe 1965, doi:10.1109/TIT.1965.1053737.
     """
     white = replace(exact, noise=noise.white)
-    by_memory = problem.n_samples * np.log1p(-np.square(noise.memory)).sum()
+    by_memory = float((problem.n_measured * np.log1p(-np.square(noise.memory))).sum())
     best, found = _deviance(problem, fit, white) + by_memory - ERROR_SHOWS, 0.0
     for rho in LEVELS:
         level = replace(white, rho=rho)

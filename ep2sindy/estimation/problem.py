@@ -27,33 +27,44 @@ class ScaledRecord:
 
     times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
     inputs: at the samples; between them they are interpolated by cubics, or linearly if switched.
-    limits: of samples that are clipped or rounded. measured: (d,), False for hidden states, whose
-    samples are nothing but a start; None if all were measured.
+    limits: of samples that are clipped or rounded. missing: (samples, d), true where nothing was
+    measured, as for all of a hidden state; the samples there are nothing but a start. None if all
+    were measured.
     """
 
     times: Float[np.ndarray, " samples"]
     samples: Float[np.ndarray, "samples d"]
     inputs: Float[np.ndarray, "samples n_inputs"]
     limits: Bounds | None = None
-    measured: Bool[np.ndarray, " d"] | None = None
+    missing: Bool[np.ndarray, "samples d"] | None = None
 
     @property
     def values(self) -> Float[np.ndarray, "samples d"]:
-        """The samples, with NaN in place of limits and of hidden states."""
+        """The samples, with NaN in place of limits and of missing samples."""
         values = self.samples
         if self.limits is not None:
             values = np.where(self.limits.at, np.nan, values)
-        return values if self.measured is None else np.where(self.measured, values, np.nan)
+        return values if self.missing is None else np.where(self.missing, np.nan, values)
+
+    @property
+    def at_hand(self) -> Bool[np.ndarray, "samples d"]:
+        """Mask of the samples that were measured."""
+        return np.ones(self.samples.shape, bool) if self.missing is None else ~self.missing
 
     def kept(
         self, kept: Bool[np.ndarray, " samples"], samples: Float[np.ndarray, "kept d"]
     ) -> ScaledRecord:
         """Keep some of the samples, and replace their values; limits shift with them."""
-        limits, by = self.limits, samples - self.samples[kept]
+        limits, missing, by = self.limits, self.missing, samples - self.samples[kept]
         if limits is not None:
             limits = replace(limits, lower=limits.lower[kept] + by, upper=limits.upper[kept] + by)
         return replace(
-            self, times=self.times[kept], samples=samples, inputs=self.inputs[kept], limits=limits
+            self,
+            times=self.times[kept],
+            samples=samples,
+            inputs=self.inputs[kept],
+            limits=limits,
+            missing=None if missing is None else missing[kept],
         )
 
     @cached_property
@@ -152,12 +163,16 @@ class EstimationProblem:
 
     def record(self, run: Trajectory) -> ScaledRecord:
         """A run with the same states and inputs, in the scale of this problem."""
+        missing = np.tile(~self.measured, (run.n_samples, 1))
+        if run.missing is not None:
+            order = [run.state_names.index(state) for state in self.states]
+            missing |= run.missing[:, order]
         return ScaledRecord(
             times=(run.t - run.t[0]) / self.step_s,
             samples=run.columns(self.states) / self.scale,
             inputs=run.columns(self.inputs) / self.input_scale,
             limits=_limits(run, self.scale),
-            measured=None if self.measured.all() else self.measured,
+            missing=missing if missing.any() else None,
         )
 
     @property
@@ -173,8 +188,18 @@ class EstimationProblem:
 
     @property
     def n_squares(self) -> int:
-        """Samples times measured states, about the value of the squares if a model fits."""
-        return self.n_samples * int(self.measured.sum())
+        """Measured samples of all states, about the value of the squares if a model fits."""
+        return int(self.n_measured.sum())
+
+    @cached_property
+    def n_measured(self) -> Int[np.ndarray, " d"]:
+        """Number of measured samples of each state."""
+        return np.sum([record.at_hand.sum(axis=0) for record in self.records], axis=0)
+
+    @cached_property
+    def partial(self) -> bool:
+        """True if measured states lack samples."""
+        return bool((self.n_measured[self.measured] < self.n_samples).any())
 
     @property
     def n_free(self) -> int:

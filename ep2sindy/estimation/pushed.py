@@ -73,13 +73,18 @@ class PushedFit:
 
     @property
     def explains(self) -> bool:
-        """True if what the samples bring is new, as it is under random pushes.
+        """True if random pushes explain all states."""
+        return bool(self.explained.all())
 
-        What a model lacks is a function of its states, and lasts as long as these.
+    @property
+    def explained(self) -> Bool[np.ndarray, " d"]:
+        """Mask of the states whose samples bring what is new, as they do under random pushes.
+
+        What an equation lacks is a function of the states, and lasts as long as these.
         """
-        shown = (self.lasting.max(), self.single.max(), self.together.max())
-        is_random = all(value < most for value, most in zip(shown, MOST_SHOWN, strict=True))
-        return is_random and bool(np.isfinite(self.fit.total))
+        shown = self.lasting, self.single, self.together
+        is_random = [value < most for value, most in zip(shown, MOST_SHOWN, strict=True)]
+        return np.all(is_random, axis=0) & bool(np.isfinite(self.fit.total))
 
     @property
     def score(self) -> float:

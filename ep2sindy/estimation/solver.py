@@ -29,9 +29,9 @@ from ep2sindy.estimation.likelihood import (
     squares,
 )
 from ep2sindy.estimation.noise import FLOOR, Noise, flow_error, noise_beside
-from ep2sindy.estimation.problem import EstimationProblem
+from ep2sindy.estimation.problem import EstimationProblem, ScaledRecord
 from ep2sindy.estimation.supports import alternatives, best_support, excess, term_prices
-from ep2sindy.signals.kalman import KalmanSmoother
+from ep2sindy.signals.kalman import KalmanEstimate, KalmanSmoother
 
 SAMPLES_PER_TERM = 5  # of the library: fewer samples do not tell which terms are present
 SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms would fit noise
@@ -272,6 +272,29 @@ def start_from_smooth(
     return fit, start.noise
 
 
+def _estimated(
+    problem: EstimationProblem, record: ScaledRecord, log10_ratio: float | None
+) -> KalmanEstimate:
+    """Smooth every state over the samples that it has; between these it follows a cubic."""
+    smoother, own = KalmanSmoother(log10_ratio), record.at_hand | ~problem.measured
+    found = smoother.estimate(record.times, record.samples)
+    lacking = np.flatnonzero(~own.all(axis=0))
+    if not lacking.size:
+        return found
+    from scipy.interpolate import CubicHermiteSpline  # imported only if samples are missing
+
+    smooth, rates, std = (
+        np.array(each) for each in (found.smoothed, found.derivative, found.noise_std)
+    )
+    for k in lacking:
+        t = record.times[own[:, k]]
+        alone = smoother.estimate(t, record.samples[own[:, k], k : k + 1])
+        curve = CubicHermiteSpline(t, alone.smoothed[:, 0], alone.derivative[:, 0])
+        inside = np.clip(record.times, t[0], t[-1])
+        smooth[:, k], rates[:, k], std[k] = curve(inside), curve(inside, 1), alone.noise_std[0]
+    return replace(found, smoothed=smooth, derivative=rates, noise_std=std)
+
+
 @dataclass(frozen=True, eq=False)
 class Smoothed:
     """Smoothed states, their rates, and standard deviations of the noise, by record (samples, d).
@@ -286,8 +309,7 @@ class Smoothed:
 
 def smoothed(problem: EstimationProblem, log10_ratio: float | None) -> Smoothed:
     """Smooth the samples; log10_ratio as in `start_from_smooth`."""
-    smoother = KalmanSmoother(log10_ratio)
-    estimates = [smoother.estimate(r.times, r.samples) for r in problem.records]
+    estimates = [_estimated(problem, record, log10_ratio) for record in problem.records]
     variance = np.mean([np.square(e.noise_std) for e in estimates], axis=0)
     paths = []
     for each, record in zip(estimates, problem.records, strict=True):

@@ -15,6 +15,9 @@ from ep2sindy.regression.exchanges import exchanged_supports
 from ep2sindy.regression.searches import BestSubset
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
+# Weight of the cost of choosing among terms. Below 0.5 there are more false terms than true ones
+# are gained, above 1 the reverse: `python -m benchmarks.estimation prices`.
+GAMMA = 1.0
 PROVEN_TERMS = 7  # of one equation; larger supports are the best that exchanges find
 N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
 MAX_ALTERNATIVES = 24  # supports of one equation for which the others are searched again
@@ -42,7 +45,7 @@ def term_prices(problem: EstimationProblem, n_samples: float) -> Float[np.ndarra
     degrees = np.maximum(problem.degrees, 1)
     every = problem.candidates.degrees
     counts = np.array([(every <= degree).sum() for degree in degrees])
-    return np.log(n_samples) + 2.0 * np.log(counts) + 2.0 * np.log(2.0) * (degrees - 1)
+    return np.log(n_samples) + 2.0 * GAMMA * np.log(counts) + 2.0 * np.log(2.0) * (degrees - 1)
 
 
 def best_support(

@@ -191,8 +191,9 @@ def _by_model(
             f"{' of trajectories' if flat and not alone else ''}"
         )
     if isinstance(model, SparseModel):
-        return [model], [cast("Sequence[Trajectory]", trajectories)]
-    return model, cast("Sequence[Sequence[Trajectory]]", trajectories)
+        model, trajectories = [model], [cast("Sequence[Trajectory]", trajectories)]
+    records = cast("Sequence[Sequence[Trajectory]]", trajectories)
+    return model, [[run.complete() for run in runs] for runs in records]
 
 
 def _by_constraint(

@@ -1,12 +1,14 @@
 """The thesis's synthetic benchmark: how often each variant of the method finds known equations.
 
 The experiment is `+exp=benchmark`. Source: the thesis, appendix, II-E and III-C. The experiment
-`+exp=frontier` uses the same variants and figures of merit.
+`+exp=frontier` uses the same variants and figures of merit. With `systems=dysts` it runs on a
+collection of chaotic systems, which are counted together.
 """
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -43,8 +45,8 @@ from ep2sindy.report.document import (
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
-from ep2sindy.studies.study import Count, Deferred, Levels, Names
-from ep2sindy.systems.draws import DRAWS, check_systems, realization
+from ep2sindy.studies.study import Count, Deferred, Levels, Names, NamesOrOne
+from ep2sindy.systems.draws import COLLECTION, DRAWS, realization, system_names
 from ep2sindy.systems.systems import System
 
 FIGURE = (
@@ -64,6 +66,12 @@ INTRODUCTION = (
     "variant sees the same realizations. Italic rows: the thesis's own numbers, for 100 "
     "realizations. CPU: time of one search (all equations of one realization), on one thread."
 )
+COLLECTED = (
+    "The systems of dysts are chaotic, with polynomial equations; a record of ten periods, of 100 "
+    "samples each, starts anywhere on the attractor, and the library holds all products of the "
+    "states up to the degree of the equations. They are counted together."
+)
+MAX_EXAMPLES = 4  # systems of the collection whose first realizations are drawn
 TITLES = {
     "on_front": "True equations on the front, % of realizations",
     "selected": "True equations selected, % of realizations",
@@ -122,12 +130,13 @@ def merits(finding: Finding, system: System) -> dict[str, float]:
 class Study:
     """Run every variant on the same realizations of all systems and noises; count successes.
 
+    systems: names of systems, or `dysts` for all of that collection, which needs the package.
     noises: standard deviations of the white noise, in RMS of each state. n_trajectories: number of
     trajectories in each realization. variants: names among the definitions. thesis: the thesis's
     tables, shown beside ours.
     """
 
-    systems: Names
+    systems: NamesOrOne
     noises: Levels
     n_realizations: Count
     n_trajectories: Count
@@ -139,12 +148,13 @@ class Study:
     def compute(self, run: Run) -> Outcome:
         published = published_cells(self.thesis)
         variants = build_variants(self.variants, self.definitions)
-        n_pieces = len(self.systems) * len(self.noises) * self.n_realizations
+        names = self._names
+        n_pieces = len(names) * len(self.noises) * self.n_realizations
         with run.progress(n_pieces, "realization") as progress:
             outcomes = self.outcomes(variants, seed=run.seed, progress=progress)
         first = first_realizations(
             variants,
-            self.systems,
+            [name for name in names if name in DRAWS] or names[:MAX_EXAMPLES],
             self.noises,
             n_trajectories=self.n_trajectories,
             seed=run.seed,
@@ -161,15 +171,19 @@ class Study:
     ) -> pd.DataFrame:
         """Figures of merit of every variant on every realization; workers share the realizations.
 
-        One row per system, noise, number and variant. on_front and selected: 1 if the equations of
+        One row per system, noise, number and variant. group: the name under which a system is
+        counted: its own, or that of the collection. on_front and selected: 1 if the equations of
         all states are right, else 0. correct_terms: number of true terms among the selected ones.
         cpu_s: time of the search. selected and correct_terms are NaN for a variant that selects
         nothing. Raises ValueError for an unknown system, or if there is nothing to run.
         """
-        check_systems(self.systems)
-        tasks = list(product(self.systems, sorted(self.noises), range(self.n_realizations)))
+        tasks = list(product(self._names, sorted(self.noises), range(self.n_realizations)))
         judge = partial(_outcomes, variants, n_trajectories=self.n_trajectories, seed=seed)
         return pd.DataFrame(rows_in_order(self.parallel, judge, tasks, progress))
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return system_names([self.systems] if isinstance(self.systems, str) else self.systems)
 
 
 def _outcomes(
@@ -189,7 +203,8 @@ def _outcomes(
         finding = variant.find(runs, system.model.library, rng=rng)
         cpu_s = time.process_time() - start
         rows.append(
-            {"system": name, "noise": noise, "number": number, "variant": label}
+            {"group": name if name in DRAWS else COLLECTION, "system": name}
+            | {"noise": noise, "number": number, "variant": label}
             | merits(finding, system)
             | {"cpu_s": cpu_s}
         )
@@ -197,20 +212,21 @@ def _outcomes(
 
 
 def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
-    """Counts over all realizations, one row per system, noise and variant.
+    """Counts over all realizations, one row per system or collection, noise and variant.
 
     on_front, selected: numbers of realizations. mean_correct_terms: mean over the realizations.
     n: number of realizations. cpu_s_per_search: the median, so that compilation during the first
     search does not count.
     """
-    grouped = outcomes.groupby(["system", "noise", "variant"], sort=False)
-    return grouped.agg(
+    grouped = outcomes.groupby(["group", "noise", "variant"], sort=False)
+    counts = grouped.agg(
         on_front=("on_front", "sum"),
         selected=("selected", lambda s: s.sum(min_count=1)),
         mean_correct_terms=("correct_terms", "mean"),
         n=("number", "count"),
         cpu_s_per_search=("cpu_s", "median"),
     ).reset_index()
+    return counts.rename(columns={"group": "system"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,10 +322,13 @@ class Outcome:
         return found
 
     def sections(self) -> list[Section]:
-        n = int(self.cells["n"].iloc[0])
+        collected = (self.outcomes["group"] == COLLECTION).any()
+        n = int(self.outcomes["number"].nunique())
         levels = "/".join(f"{100 * noise:g}" for noise in self.cells["noise"].unique())
         counted = f"{n} realizations of every system and noise level."
         about: list[Block] = [Text(counted), Text(INTRODUCTION, page_only=True)]
+        if collected:
+            about.append(Text(COLLECTED, page_only=True))
         drawn = []
         if self.first:
             drawn = [
@@ -319,6 +338,8 @@ class Outcome:
             Section(f"{TITLES[m]}; noise {levels} %", [_readable(self.cells, self.published, m)])
             for m in MERITS
         ]
+        if collected:
+            tables.append(Section("Systems that are not selected", [_not_selected(self.outcomes)]))
         variants = [Text(f"{n}: {v}", page_only=True) for n, v in self.variants.items()]
         return [
             Section("Realizations", [*about, Picture("benchmark")]),
@@ -369,8 +390,21 @@ def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table
     return Table(pd.DataFrame(rows), italic=italic)
 
 
+def _not_selected(outcomes: pd.DataFrame) -> Table:
+    """Systems of the collection that the variant with most successes does not select, by noise."""
+    collected = outcomes[outcomes["group"] == COLLECTION]
+    best = str(collected.groupby("variant", sort=False)["selected"].sum().idxmax())
+    missed = collected[(collected["variant"] == best) & (collected["selected"] != 1.0)]
+    rows = []
+    for noise in collected["noise"].unique():
+        counts = Counter(missed[missed["noise"] == noise]["system"])
+        words = [f"{name} ({n} times)" if n > 1 else name for name, n in counts.items()]
+        rows.append({"noise": f"{100 * noise:g} %", f"not by {best}": ", ".join(words)})
+    return Table(pd.DataFrame(rows))
+
+
 def _heading(system: str, merit: str) -> str:
-    if merit != "mean_correct_terms":
+    if merit != "mean_correct_terms" or system not in DRAWS:
         return system
     model = DRAWS[system](np.random.default_rng(0)).system.model
     return f"{system} ({np.count_nonzero(model.coef)})"

@@ -26,6 +26,8 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Finding
 from ep2sindy.library.library import Library, polynomial
 
+TINY = float(np.finfo(np.float64).tiny)
+
 Candidates = dict[str, list[tuple[tuple[str, ...], float]]]
 
 
@@ -207,19 +209,59 @@ class PySINDyWeakForm:
 class PySINDyVariant:
     """A method of PySINDy in our benchmark; it gives candidates, and the user would have to choose.
 
-    kept: for every state the best support of each size by R2, and the empty one.
+    kept: for every state the best support of each size by R2, and the empty one. aicc: if True, the
+    user chooses by the corrected Akaike criterion of the residuals on the method's rows, one per
+    sample; if False, nothing is selected.
     """
 
     method: PySINDyStlsq | PySINDySsr | PySINDyEnsemble | PySINDyWeakForm
+    aicc: bool = False
 
     def find(
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> Finding:
         found = self.method.candidates(runs, library, rng=rng)
+        n = sum(run.n_samples for run in runs)
         return Finding(
             kept={state: best_of_each_size(several) for state, several in found.items()},
-            selected=None,
+            selected={state: least_aicc(several, n) for state, several in found.items()}
+            if self.aicc
+            else None,
         )
+
+
+@dataclass(frozen=True)
+class PySINDyAsItComes:
+    """`pysindy.SINDy` with its own defaults, but for the degree of the library.
+
+    That is second-order differences of the raw samples, and STLSQ with threshold 0.1.
+    """
+
+    def find(
+        self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
+    ) -> Finding:
+        features, order = pysindy_library(library, runs[0].state_names)
+        model = pysindy.SINDy(feature_library=features)
+        with expected_warnings():
+            model.fit([run.states for run in runs], t=[run.t for run in runs])
+        used = np.asarray(model.coefficients())[:, order] != 0.0
+        names = np.array(library.names)
+        chosen = {
+            state: frozenset(names[mask].tolist())
+            for state, mask in zip(runs[0].state_names, used, strict=True)
+        }
+        return Finding(kept={state: [each] for state, each in chosen.items()}, selected=chosen)
+
+
+def least_aicc(candidates: Sequence[tuple[tuple[str, ...], float]], n_rows: int) -> frozenset[str]:
+    """The support of least AICc (Hurvich & Tsai 1989, doi:10.1093/biomet/76.2.297)."""
+
+    def aicc(candidate: tuple[tuple[str, ...], float]) -> float:
+        terms, r2 = candidate
+        k = len(terms) + 1  # with the variance
+        return n_rows * np.log(max(1.0 - r2, TINY)) + 2.0 * k * n_rows / (n_rows - k - 1.0)
+
+    return frozenset(min([((), 0.0), *candidates], key=aicc)[0])
 
 
 def best_of_each_size(
