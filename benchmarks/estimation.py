@@ -3,6 +3,8 @@
     python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
     python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
     python -m benchmarks.estimation samples             # CPU against the number of samples
+    python -m benchmarks.estimation waves [--sizes 5 8 12 20 40] [--n 3]  # Lorenz-96 of many states
+    python -m benchmarks.estimation chain [--sizes 20] [--n 3]            # coupled van der Pol's
     python -m benchmarks.estimation thruster            # the breathing mode, beside free runs
     python -m benchmarks.estimation collection [--n 3] [--noises ...]  # dysts: classes of failure
     python -m benchmarks.estimation prices [--n 1] [--noises ...]      # dysts: price of a term
@@ -22,7 +24,9 @@ false terms against the weight of the choice among terms in a term's price.
 from __future__ import annotations
 
 import argparse
+import resource
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
@@ -33,6 +37,7 @@ import numpy as np
 import ep2sindy as ep
 from benchmarks.known_systems import KINDS, OTHERS, noisy
 from benchmarks.living import DOWNSTREAM, POINTS, parts, record
+from benchmarks.many_states import lorenz_96
 from ep2sindy.estimation import supports
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
@@ -40,6 +45,7 @@ from ep2sindy.studies.living import start_of
 from ep2sindy.systems.collection import collected_names
 from ep2sindy.systems.draws import DRAWS, realization
 from ep2sindy.systems.systems import System, lorenz
+from tests.models import model_of
 
 
 def judged(system: System, found: ep.discovery.Estimate, cpu_s: float) -> dict[str, float]:
@@ -136,6 +142,58 @@ def samples() -> None:
         found = ep.estimate([run], system.model.library)
         row = judged(system, found, time.process_time() - start)
         print(f"{n:7d}  {row['cpu_s']:5.2f}  {bool(row['right'])}", flush=True)
+
+
+def waves(sizes: Sequence[int], n: int) -> None:
+    """Lorenz-96, F = 8: 3000 samples at steps of 0.01, 5 % noise, all products of degree 2."""
+    for size, number in product(sizes, range(n)):
+        start = 8.0 + np.random.default_rng(number).standard_normal(size)
+        system = _settled(System("waves", lorenz_96(size), start, 30.0, 100.0))
+        _large(system, ep.polynomial(system.model.states, degree=2), number)
+
+
+def chain(sizes: Sequence[int], n: int) -> None:
+    """Van der Pol oscillators, each pulled by its neighbours: 4000 samples, 5 % noise.
+
+    The library has the products of degree 3 of each oscillator, and all states.
+    """
+    for size, number in product(sizes, range(n)):
+        rng = np.random.default_rng(number)
+        names = [f"{letter}{k}" for letter in "xv" for k in range(size)]
+        equations: dict[str, dict[str, float]] = {f"x{k}": {f"v{k}": 1.0} for k in range(size)}
+        for k in range(size):
+            x, v = f"x{k}", f"v{k}"
+            own = {v: 1.0, f"{x}^2*{v}": -1.0, x: -rng.uniform(1.0, 3.0)}
+            sides = {f"x{j}": 0.3 for j in (k - 1, k + 1) if 0 <= j < size}
+            equations[v] = own | sides
+        start = rng.uniform(-2.0, 2.0, 2 * size)
+        model = model_of({name: equations[name] for name in names})
+        system = _settled(System("chain", model, start, 80.0, 50.0))
+        pairs = (ep.polynomial(pair, degree=3) for pair in zip(names, names[size:], strict=False))
+        terms = [name for each in pairs for name in np.array(each.names)[each.degrees > 1]]
+        _large(system, ep.polynomial(names, degree=1, products=terms), number)
+
+
+def _settled(system: System) -> System:
+    """The system, starting where a first record ends."""
+    return replace(system, initial=system.trajectory().states[-1])
+
+
+def _large(system: System, library: ep.Library, number: int) -> None:
+    run = system.trajectory(noise=0.05, rng=number)
+    start = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ep.warnings.SlowSearch)
+        found = ep.estimate(run, library)
+    cpu_s = time.process_time() - start
+    truth = system.model
+    right = sum(set(found.model.terms(s)) == set(truth.terms(s)) for s in truth.states)
+    n, gigabytes = len(truth.states), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(
+        f"{system.name} of {n} states, {n * len(library)} coefficients, draw {number}: "
+        f"{right} of {n} equations right, {cpu_s:.1f} CPU-s, {gigabytes:.2f} GB at most",
+        flush=True,
+    )
 
 
 def thruster() -> None:
@@ -237,17 +295,31 @@ def prices(noises: Sequence[float], n: int) -> None:
         )
 
 
+WHAT = ["counts", "misfit", "samples", "thruster", "collection", "prices", "waves", "chain"]
+
+
 def main() -> None:
     every = [*DRAWS, *OTHERS]
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument(
-        "what", choices=["counts", "misfit", "samples", "thruster", "collection", "prices"]
+        "what",
+        choices=[
+            "counts",
+            "misfit",
+            "samples",
+            "thruster",
+            "collection",
+            "prices",
+            "waves",
+            "chain",
+        ],
     )
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--systems", nargs="+", default=every, choices=every)
     parser.add_argument("--noises", nargs="+", type=float, default=[0.0, 0.05, 0.2, 0.4])
+    parser.add_argument("--sizes", nargs="+", type=int)
     parser.add_argument("--kind", default="white", choices=KINDS)
     asked = parser.parse_args()
     if asked.what == "counts":
@@ -256,6 +328,10 @@ def main() -> None:
         misfits(asked.systems, asked.n)
     elif asked.what == "collection":
         collection(asked.noises, asked.n)
+    elif asked.what == "waves":
+        waves(asked.sizes or [5, 8, 12, 20], asked.n)
+    elif asked.what == "chain":
+        chain(asked.sizes or [20], asked.n)
     elif asked.what == "prices":
         prices(asked.noises, asked.n)
     elif asked.what == "samples":

@@ -621,7 +621,7 @@ def test_a_library_without_the_constant_where_a_state_drifts_is_a_misfit() -> No
     states = np.column_stack([0.5 * t, np.cos(t)]) + 0.05 * rng.standard_normal((100, 2))
     library = ep.named_terms(["x", "y"], ["y", "x*y", "y^2"])
     found = ep.estimate([ep.Trajectory(t, states, ["x", "y"])], library)
-    assert "no model of this library fits" in found.misfit
+    assert "no law of this library explains y: a term or a state is missing" in found.misfit
 
 
 def test_noise_that_the_model_leaves_is_measured_by_state() -> None:

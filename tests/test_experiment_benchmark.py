@@ -146,7 +146,7 @@ def test_a_rival_without_pysindy_is_refused(
         ("noises=[nan]", "noises[0] must be numbers, zero or more: nan came"),
         ("noises=0.1", "noises must be a list"),
         ("noises=[0,0.0]", "noises must be a list such as [a,b], each once"),
-        ("systems=[]", "systems must be a list"),
+        ("systems=[]", "systems must be a name, or a list such as [a,b], each once"),
         ("systems=[pendulum]", "unknown systems ['pendulum']; there are"),
         ("variants=[our]", "unknown variants ['our']; there are "),
         ("definitions.ours.selection.gamma=-1.0", "gamma must be zero or more"),

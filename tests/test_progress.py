@@ -103,7 +103,7 @@ def test_a_search_of_trajectories_tells_its_steps() -> None:
     watch = Recorder()
     run = ep.systems.damped_oscillator().trajectory(noise=0.01, rng=0)
     ep.discover(run, ep.polynomial(["x", "v"], degree=1), progress=watch)
-    assert watch.labels[:2] == ["states and coefficients", "rivals"]
+    assert watch.labels[:2] == ["weighing 6 coefficients", "rivals"]
     assert [each.total for each in watch.stages[:2]] == [None, 2]
     watch.check()
 

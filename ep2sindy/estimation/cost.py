@@ -63,7 +63,7 @@ class Watch:
         self.advance(1)
         late = self.limit_s is not None and self.elapsed_s > self.limit_s
         if late and self.best is not None and not self.ended:
-            raise OutOfTimeError
+            raise OutOfTimeError(f"the search must end within limit_s={self.limit_s:g} s")
 
     @property
     def elapsed_s(self) -> float:

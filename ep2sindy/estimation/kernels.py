@@ -32,12 +32,14 @@ def term_values(columns, table):
 def sensitivities(jacobians, terms, equation, column, leads, weights, steps, slopes):
     """One Runge-Kutta step of the sensitivities; `slopes` (n, d, d + p) is advanced in place.
 
+    Columns beyond those of the p coefficients are not touched.
+
     jacobians: (stages, n, d, d) and terms: (stages, n, products), at the stages of each step.
     leads, weights: (stages,), of the method, as shares of the step; steps: (n,), in time.
     Coefficient c multiplies terms[..., column[c]] in equation[c]. A sample passes all stages before
     the next one comes, so that what it needs stays in the cache.
     """
-    n, d, width = slopes.shape
+    n, d, width = len(slopes), slopes.shape[1], slopes.shape[1] + len(equation)
     here, slope, total = np.empty((d, width)), np.empty((d, width)), np.empty((d, width))
     for k in range(n):
         for i in range(d):

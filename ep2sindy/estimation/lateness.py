@@ -72,11 +72,12 @@ def delayed_gram(problem: EstimationProblem, fit: TrajectoryFit, level: Level) -
 
     def flow(record: ScaledRecord, path: np.ndarray) -> Flow:
         everything = np.ones_like(fit.support)
-        found = problem.flow(record, path[:-1], fit.free, everything, level.n_substeps)
+        found = problem.flow(record, path[:-1], fit.free, everything, level.n_substeps, n_more=d)
         rates = problem.rates(record, path, fit.free)
         columns = found.slopes[:, :, :d] * rates[:-1, None, :]
         columns[:, np.arange(d), np.arange(d)] -= rates[1:]
-        return replace(found, slopes=np.concatenate([found.slopes, columns], axis=2))
+        found.slopes[:, :, -d:] = columns
+        return found
 
     quadratic, gradient, least, _ = hessian(problem, fit, level, flow)
     linear = quadratic[:, :n] @ fit.free + gradient

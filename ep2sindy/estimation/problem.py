@@ -301,8 +301,13 @@ class EstimationProblem:
         free: Float[np.ndarray, " free"],
         support: Bool[np.ndarray, " free"],
         n_substeps: int,
+        *,
+        n_more: int = 0,
     ) -> Flow:
-        """`ends` with its derivatives by the states and by the free coefficients of a support."""
+        """`ends` with its derivatives by the states and by the free coefficients of a support.
+
+        n_more: columns of zeros behind them, for derivatives by something else.
+        """
         d = len(self.states)
         involved = np.flatnonzero(support if self.C is None else self.C[:, support].any(axis=1))
         equation, column = self.equation[involved], self._places[self.column[involved]]
@@ -311,7 +316,7 @@ class EstimationProblem:
             [self._shares[:, 0].T @ self.coef(free), by_state.reshape(-1, d * d)]
         )
         h = record.steps / n_substeps
-        slopes = np.zeros((len(states), d, d + len(involved)))
+        slopes = np.zeros((len(states), d, d + len(involved) + n_more))
         slopes[:, np.arange(d), np.arange(d)] = 1.0
         for k in range(n_substeps):
             slope, total = np.zeros_like(states), states
@@ -329,8 +334,9 @@ class EstimationProblem:
             )
             states = total
         if self.C is not None:
-            by_free = slopes[:, :, d:] @ self.C[np.ix_(involved, support)]
-            slopes = np.concatenate([slopes[:, :, :d], by_free], axis=2)
+            p = d + len(involved)
+            by_free = slopes[:, :, d:p] @ self.C[np.ix_(involved, support)]
+            slopes = np.concatenate([slopes[:, :, :d], by_free, slopes[:, :, p:]], axis=2)
         return Flow(states, slopes)
 
     def _products_at(
