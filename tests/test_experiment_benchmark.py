@@ -158,3 +158,21 @@ def test_a_rival_without_pysindy_is_refused(
 def test_settings_that_cannot_work_are_refused(override: str, message: str, tmp_path: Path) -> None:
     with pytest.raises((ValueError, HydraException), match=re.escape(message)):
         run_config(composed(*toy(tmp_path), override))
+
+
+def test_systems_of_the_collection_are_counted_together(tmp_path: Path) -> None:
+    pytest.importorskip("dysts")
+    overrides = [
+        f"output={tmp_path}", "n_realizations=1", "parallel=serial", "noises=[0.01]",
+        "systems=[Lorenz,SprottA,lorenz]", "variants=[STLSQ,ours]",
+    ]  # fmt: skip
+    folder = run_config(composed(*overrides)).folder
+    counted = json.loads((folder / "summary.json").read_text())["cells"]
+    assert [(c["system"], c["variant"], c["n"]) for c in counted] == [
+        ("dysts", "STLSQ", 2), ("dysts", "ours", 2), ("lorenz", "STLSQ", 1), ("lorenz", "ours", 1),
+    ]  # fmt: skip
+    outcomes = pd.read_csv(folder / "tables" / "outcomes.csv")
+    assert set(outcomes["system"]) == {"Lorenz", "SprottA", "lorenz"}
+    page = (folder / "report.html").read_text()
+    assert "Systems that are not selected" in page
+    assert "not by ours" in page

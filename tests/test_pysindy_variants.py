@@ -5,6 +5,7 @@ pytest.importorskip("pysindy")
 
 from ep2sindy.library.library import named_terms
 from ep2sindy.studies.pysindy_variants import (
+    PySINDyAsItComes,
     PySINDyEnsemble,
     PySINDySmoothing,
     PySINDySsr,
@@ -13,6 +14,7 @@ from ep2sindy.studies.pysindy_variants import (
     PySINDyWeakForm,
     SINDyRows,
     best_of_each_size,
+    least_aicc,
     pysindy_library,
 )
 from ep2sindy.systems.systems import lotka_volterra, van_der_pol
@@ -114,3 +116,35 @@ def test_draws_come_from_the_rng_and_leave_the_global_state_alone(variant) -> No
     )
     assert first == second
     assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+
+
+def test_the_least_aicc_is_chosen() -> None:
+    """20 rows: a term more costs 2.6 here, so R2 must rise from 0.9 to above 0.913."""
+    few, more = (("x",), 0.9), (("x", "y"), 0.905)
+    assert least_aicc([few, more], 20) == {"x"}
+    assert least_aicc([few, (("x", "y"), 0.93)], 20) == {"x", "y"}
+    assert least_aicc([(("x",), 0.01)], 20) == frozenset()
+
+
+def test_a_user_who_chooses_by_aicc_selects() -> None:
+    system = lotka_volterra()
+    run, rng = system.trajectory(), np.random.default_rng(0)
+    truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
+    chosen = PySINDyVariant(PySINDyStlsq(), aicc=True).find([run], system.model.library, rng=rng)
+    assert chosen.selected is not None
+    assert all(truth[state] <= chosen.selected[state] for state in truth)
+    assert (
+        PySINDyVariant(PySINDyStlsq()).find([run], system.model.library, rng=rng).selected is None
+    )
+
+
+def test_pysindy_as_it_comes_is_its_own_default() -> None:
+    pysindy = pytest.importorskip("pysindy")
+    system = lotka_volterra()
+    run, rng = system.trajectory(), np.random.default_rng(0)
+    found = PySINDyAsItComes().find([run], system.model.library, rng=rng)
+    model = pysindy.SINDy(feature_library=pysindy.PolynomialLibrary(degree=2))
+    model.fit(run.states, t=run.t)
+    assert found.selected is not None
+    assert sum(map(len, found.selected.values())) == np.count_nonzero(model.coefficients())
+    assert found.selected == {state: kept[0] for state, kept in found.kept.items()}

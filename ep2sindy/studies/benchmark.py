@@ -45,7 +45,7 @@ from ep2sindy.report.document import (
 from ep2sindy.report.run import Run
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
-from ep2sindy.studies.study import Count, Deferred, Levels, Names, NamesOrOne
+from ep2sindy.studies.study import Count, CountOrNone, Deferred, Levels, Names, NamesOrOne
 from ep2sindy.systems.draws import COLLECTION, DRAWS, realization, system_names
 from ep2sindy.systems.systems import System
 
@@ -132,14 +132,15 @@ class Study:
 
     systems: names of systems, or `dysts` for all of that collection, which needs the package.
     noises: standard deviations of the white noise, in RMS of each state. n_trajectories: number of
-    trajectories in each realization. variants: names among the definitions. thesis: the thesis's
-    tables, shown beside ours.
+    trajectories in each realization. degree: of the library; None takes each system's own.
+    variants: names among the definitions. thesis: the thesis's tables, shown beside ours.
     """
 
     systems: NamesOrOne
     noises: Levels
     n_realizations: Count
     n_trajectories: Count
+    degree: CountOrNone
     variants: Names
     definitions: Mapping[str, Deferred]
     thesis: Mapping[str, Any]
@@ -157,6 +158,7 @@ class Study:
             [name for name in names if name in DRAWS] or names[:MAX_EXAMPLES],
             self.noises,
             n_trajectories=self.n_trajectories,
+            degree=self.degree,
             seed=run.seed,
             progress=run.watch,
         )
@@ -178,7 +180,13 @@ class Study:
         nothing. Raises ValueError for an unknown system, or if there is nothing to run.
         """
         tasks = list(product(self._names, sorted(self.noises), range(self.n_realizations)))
-        judge = partial(_outcomes, variants, n_trajectories=self.n_trajectories, seed=seed)
+        judge = partial(
+            _outcomes,
+            variants,
+            n_trajectories=self.n_trajectories,
+            degree=self.degree,
+            seed=seed,
+        )
         return pd.DataFrame(rows_in_order(self.parallel, judge, tasks, progress))
 
     @property
@@ -191,10 +199,13 @@ def _outcomes(
     task: tuple[str, float, int],
     *,
     n_trajectories: int,
+    degree: int | None,
     seed: int,
 ) -> list[dict[str, object]]:
     name, noise, number = task
-    system, runs = realization(name, noise, number, n_trajectories=n_trajectories, seed=seed)
+    system, runs = realization(
+        name, noise, number, n_trajectories=n_trajectories, degree=degree, seed=seed
+    )
     rows: list[dict[str, object]] = []
     for label, variant in variants.items():
         # Each variant has its own random stream, so that leaving one out changes no other.
@@ -243,6 +254,7 @@ def first_realizations(
     noises: Sequence[float],
     *,
     n_trajectories: int,
+    degree: int | None = None,
     seed: int,
     progress: Progress = SILENT,
 ) -> FirstRealizations | None:
@@ -259,7 +271,7 @@ def first_realizations(
     pairs = list(product(systems, sorted(noises)))
     for label, noise in count_pieces(progress, pairs, "model", "first realizations"):
         (system, runs), (_, (truth, *_)) = (
-            realization(label, level, 0, n_trajectories=n_trajectories, seed=seed)
+            realization(label, level, 0, n_trajectories=n_trajectories, degree=degree, seed=seed)
             for level in (noise, 0.0)
         )
         rng = np.random.default_rng([seed, 0, *name.encode()])

@@ -94,6 +94,9 @@ def _is_count(value: Any) -> bool:
 
 
 Count = Annotated[int, Check("a whole number, one or more", _is_count)]
+CountOrNone = Annotated[
+    int | None, Check("a whole number, one or more, or null", lambda x: x is None or _is_count(x))
+]
 Share = Annotated[float, Check("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
 ShareOrNone = Annotated[
     float | None,

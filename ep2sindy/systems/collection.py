@@ -29,9 +29,9 @@ def collected_names() -> tuple[str, ...]:
 
     Raises ValueError if the package `dysts` is not installed.
     """
+    _flows()
     from dysts.systems import get_attractor_list
 
-    _flows()
     names = get_attractor_list(sys_class="continuous")
     return tuple(name for name in names if _equations(name) is not None)
 
@@ -56,8 +56,13 @@ def collected(name: str) -> System:
     return System(name, model, start, N_PERIODS * period_s, SAMPLES_PER_PERIOD / period_s)
 
 
+def is_installed() -> bool:
+    """True if the package `dysts` is installed."""
+    return find_spec("dysts") is not None
+
+
 def _flows() -> ModuleType:
-    if find_spec("dysts") is None:
+    if not is_installed():
         raise ValueError(
             'systems=dysts needs the package dysts: pip install "ep2sindy[benchmark]", or name '
             "systems of this package, such as systems=[lorenz]"

@@ -6,12 +6,14 @@ Source: the thesis, appendix, II-E and III-C; of the others, `systems.collection
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.systems.collection import collected, collected_names
+from ep2sindy.library.library import polynomial
+from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.systems.collection import collected, collected_names, is_installed
 from ep2sindy.systems.systems import (
     System,
     damped_oscillator,
@@ -68,13 +70,19 @@ def drawn(name: str, rng: np.random.Generator) -> Draw:
 
 
 def realization(
-    name: str, noise: float, number: int, *, n_trajectories: int = 1, seed: int = 0
+    name: str,
+    noise: float,
+    number: int,
+    *,
+    n_trajectories: int = 1,
+    degree: int | None = None,
+    seed: int = 0,
 ) -> tuple[System, list[Trajectory]]:
     """One draw of a system with noisy trajectories; the draw is the same for every noise level.
 
     noise: standard deviation of the white noise, in RMS of each state. n_trajectories: the first
     trajectory starts at the draw's own start; the others start at those of further draws, or in
-    [-2, 2]^2 for the Van der Pol oscillator.
+    [-2, 2]^2 for the Van der Pol oscillator. degree: of the library; None takes the system's own.
     """
     check_systems([name])
     key = [list(DRAWS).index(name)] if name in DRAWS else list(name.encode())
@@ -84,10 +92,28 @@ def realization(
     for _ in range(n_trajectories - 1):
         other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else drawn(name, rng).initial
         starts.append(other)
-    return draw.system, [
+    system = draw.system if degree is None else with_degree(draw.system, degree)
+    return system, [
         draw.system.trajectory(initial=start, noise=noise, rng=stream)
         for start, stream in zip(starts, rng.spawn(n_trajectories), strict=True)
     ]
+
+
+def with_degree(system: System, degree: int) -> System:
+    """The same model over the library of all products up to a degree.
+
+    Raises ValueError if the model has a term of higher degree.
+    """
+    model = system.model
+    least = int(model.library.degrees[(model.coef != 0.0).any(axis=1)].max())
+    if degree < least:
+        raise ValueError(
+            f"the library must hold the terms of {system.name}, of degree {least} or more: "
+            f"degree={degree} came; raise it, or leave that system out"
+        )
+    library = polynomial(model.states, degree=degree)
+    coef = coef_matrix(library, [model.terms(state) for state in model.states])
+    return replace(system, model=SparseModel(library, model.states, coef))
 
 
 def system_names(asked: Sequence[str]) -> tuple[str, ...]:
@@ -103,9 +129,10 @@ def system_names(asked: Sequence[str]) -> tuple[str, ...]:
 
 def check_systems(systems: Sequence[str]) -> None:
     others = [name for name in systems if name not in DRAWS]
-    unknown = [name for name in others if name not in collected_names()]
+    known = collected_names() if others and is_installed() else ()
+    unknown = [name for name in others if name not in known]
     if unknown:
         raise ValueError(
-            f"unknown systems {unknown}; there are {[*DRAWS]}, the names of the collection, such "
-            f"as Rossler, and {COLLECTION} for all of these"
+            f"unknown systems {unknown}; there are {[*DRAWS]}, and with the package dysts the "
+            f"names of its systems, such as Rossler, and {COLLECTION} for all of these"
         )
