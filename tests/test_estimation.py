@@ -23,6 +23,7 @@ from ep2sindy.estimation.solver import Solution, from_smooth
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
 from ep2sindy.library.relations import parse_relation
 from ep2sindy.trust import memory
+from ep2sindy.trust.interruption import is_interruption
 
 
 @pytest.fixture
@@ -728,6 +729,17 @@ def test_an_interruption_ends_a_search_that_is_watched() -> None:
     steps = 0
     with pytest.raises(KeyboardInterrupt):
         ep.estimate(run, library, progress=interrupt(1))
+
+
+def test_an_interruption_within_a_kernel_is_one() -> None:
+    """Numba turns it into an error of its own, once or twice."""
+    once, twice = SystemError("a result with an exception set"), SystemError("again")
+    once.__cause__, twice.__cause__ = KeyboardInterrupt(), once
+    assert is_interruption(KeyboardInterrupt())
+    assert is_interruption(once)
+    assert is_interruption(twice)
+    assert not is_interruption(SystemError("of another kind"))
+    assert not is_interruption(ValueError())
 
 
 @pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan")])

@@ -42,6 +42,7 @@ from ep2sindy.estimation.solver import (
 from ep2sindy.estimation.supports import term_prices
 from ep2sindy.estimation.working_set import search_within
 from ep2sindy.runtime.progress import SILENT
+from ep2sindy.trust.interruption import is_interruption
 
 FIRST_MAX_TERMS, MORE_TERMS = 7, 5  # of one equation, and how many more where all are used
 LET_GO = 0.5  # residual, as a share of a state's spread, if the model ignores the state
@@ -102,13 +103,16 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
     watch.best = None
     try:
         return _explain(problem, max_terms, align)
-    except (OutOfTimeError, KeyboardInterrupt) as stop:
+    except (OutOfTimeError, KeyboardInterrupt, SystemError) as stop:
+        late, interrupted = isinstance(stop, OutOfTimeError), is_interruption(stop)
         # Nobody follows a silent search, which may be one of many: an interruption ends them all.
-        watched = isinstance(stop, OutOfTimeError) or watch.progress is not SILENT
-        if watch.best is None or not watched:
+        watched = interrupted and watch.progress is not SILENT
+        if watch.best is None or not (late or watched):
+            if interrupted:
+                raise KeyboardInterrupt from stop
             raise
         watch.ended = True
-        by = "limit_s" if isinstance(stop, OutOfTimeError) else "an interruption"
+        by = "limit_s" if late else "an interruption"
         return _unfinished(*watch.best, f"ended by {by} after {watch.elapsed_s:.3g} s", max_terms)
 
 

@@ -50,7 +50,7 @@ def forecast(
     >>> run = ep.lorenz().trajectory(noise=0.05, rng=0)
     >>> ahead = ep.forecast(ep.lorenz().model, run.window(0, 2000), 0.5)
     >>> low, high = ahead.band(0.9)
-    >>> inside = (low <= run.states[2000:2050]) & (run.states[2000:2050] <= high)
+    >>> inside = (low <= run.states[2000:2150]) & (run.states[2000:2150] <= high)
     >>> bool(0.8 < inside.mean() <= 1.0)
     True
     """

@@ -26,6 +26,17 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt(signal.Signals(number).name)
 
 
+def is_interruption(error: BaseException) -> bool:
+    """True for an interruption, also one that came while a compiled kernel was called.
+
+    Numba reports that as a SystemError, which the interruption caused, perhaps by way of others.
+    """
+    cause: BaseException | None = error
+    while isinstance(cause, SystemError):
+        cause = cause.__cause__
+    return isinstance(cause, KeyboardInterrupt)
+
+
 @cache
 def end_with(parent: int) -> None:
     """End this process soon after its parent, because a killed run cannot notify its workers.
