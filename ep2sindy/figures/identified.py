@@ -53,6 +53,8 @@ COLOURMAP, DARK = "Blues", 0.7
 
 IDENTIFIED = COLOURS[1]
 
+MIN_WIDTH = 2.3  # of a heat map, in inches: its title stands above it
+
 MAX_DOTS = 1500  # samples drawn in a panel
 
 
@@ -121,7 +123,8 @@ def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
     """
     tables = {merit: merit_table(cells, thesis, merit) for merit in PANELS}
     n_rows, n_columns = tables["on_front"].shape
-    size = (1.8 + 2 * (0.36 * n_columns + 0.1), 0.9 + 0.25 * n_rows)
+    width = max(0.36 * n_columns, MIN_WIDTH)
+    size = (1.8 + 2 * (width + 0.1), 0.9 + 0.25 * n_rows)
     figure, (axes,) = make_panels(1, len(PANELS), size, sharey=True)
     for ax, (merit, table) in zip(axes, tables.items(), strict=True):
         _draw_heat_map(ax, table)

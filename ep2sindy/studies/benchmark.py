@@ -61,10 +61,11 @@ EXAMPLES = (
 )
 INTRODUCTION = (
     "Each realization draws an initial state, or for the Van der Pol oscillator its parameter, at "
-    "random; white noise of the given share of each state's RMS is added; the library holds ten "
-    "terms. A realization counts only if the equations of all states are right at once. Every "
-    "variant sees the same realizations. Italic rows: the thesis's own numbers, for 100 "
-    "realizations. CPU: time of one search (all equations of one realization), on one thread."
+    "random; white noise of the given share of each state's RMS is added; the library holds all "
+    "products of the states up to a degree. A realization counts only if the equations of all "
+    "states are right at once. Every variant sees the same realizations. Italic rows: the "
+    "thesis's own numbers, for 100 realizations. CPU: time of one search (all equations of one "
+    "realization), on one thread."
 )
 COLLECTED = (
     "The systems of dysts are chaotic, with polynomial equations; a record of ten periods, of 100 "
