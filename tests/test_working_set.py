@@ -118,6 +118,17 @@ def test_the_first_set_is_small_and_holds_the_truth() -> None:
     assert kept.sum() < 0.5 * len(kept)
 
 
+def test_a_term_that_overflows_is_left_out_of_a_large_set() -> None:
+    t = np.linspace(0.0, 10.0, 600)
+    states = np.column_stack([np.sin(t), np.cos(t)])
+    library = ep.polynomial(["x", "y"], degree=5, functions=["exp(900*x)"])
+    problem = scale_problem([ep.Trajectory(t, states, ["x", "y"])], library)
+    kept = first_set(problem, 7)
+    names = np.array(problem.term_names)[problem.column]
+    assert not kept[names == "exp(900*x)"].any()
+    assert kept[names == "y"].any()
+
+
 def test_small_libraries_are_weighed_whole() -> None:
     assert first_set(problem_of(waves(4), 0.05, 2), 7).all()
 

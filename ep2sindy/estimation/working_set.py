@@ -79,10 +79,13 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
         return np.ones_like(kept)
     start = smoothed(problem, None)
     level = Level(start.noise, WARM)
-    steps = [
-        problem.term_steps(record, path[:-1], np.zeros(len(kept)), 1)[1]
-        for record, path in zip(problem.records, start.paths, strict=True)
-    ]
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = [
+            problem.term_steps(record, path[:-1], np.zeros(len(kept)), 1)[1]
+            for record, path in zip(problem.records, start.paths, strict=True)
+        ]
+    # A term that overflows on the samples is not available.
+    steps = [np.where(np.isfinite(each).all(axis=0), each, 0.0) for each in steps]
     for block in np.flatnonzero(sizes).tolist():
         own = np.flatnonzero((problem.block == block) & ~problem.required)
         if len(own) <= SMALL:
