@@ -18,7 +18,7 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.estimation.cost import SMALL
 from ep2sindy.estimation.kernels import departures, eliminate
 from ep2sindy.estimation.likelihood import FREE_START, Level, TrajectoryFit, hessian, observe
-from ep2sindy.estimation.problem import EstimationProblem, Flow
+from ep2sindy.estimation.problem import EstimationProblem, Flow, ScaledRecord
 from ep2sindy.estimation.solver import (
     WEIGHED_AT,
     Solution,
@@ -30,7 +30,8 @@ from ep2sindy.estimation.solver import (
 from ep2sindy.estimation.supports import N_BEST, inverse_of, term_prices
 from ep2sindy.regression.exchanges import exchanged_supports
 
-WARM = 0.3  # rho of the first set: the state all but free, the other states smoothed
+# rho of the first set: the state nearly free, or quite. One alone leaves out more true terms.
+WARM = (0.3, 3.0)
 MOST_ENTER, MAX_ENTRANCES = 3, 4  # terms of one equation that enter at once; times that some do
 DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if they span the term
 N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of its square
@@ -49,15 +50,19 @@ def search_within(
         entering = ~kept & _would_pay(problem, kept, part, found)
         if not entering.any():
             break
-        before, kept = kept, kept | entering
-        part, fit = problem.restricted(kept), found.annealed.fit
+        larger, fit = kept | entering, found.annealed.fit
+        whole = problem.restricted(larger)
         widened = replace(
             fit,
-            free=_spread(fit.free, before)[kept],
-            support=_spread(fit.support, before)[kept] | entering[kept],
+            free=_spread(fit.free, kept)[larger],
+            support=_spread(fit.support, kept)[larger] | entering[larger],
         )
-        with problem.watch.stage(_weighed(part)):
-            found = settle(part, widened, found.noise.effective, max_terms=max_terms)
+        with problem.watch.stage(_weighed(whole)):
+            tried = settle(whole, widened, found.noise.effective, max_terms=max_terms)
+        # About a solution that does not fit, first order tells little.
+        if (not tried.fits, tried.score) >= (not found.fits, found.score):
+            break
+        kept, part, found = larger, whole, tried
         problem.watch.best = part, found
     return part, found
 
@@ -78,19 +83,17 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
     if problem.C is not None or not problem.measured.all() or (sizes <= SMALL).all():
         return np.ones_like(kept)
     start = smoothed(problem, None)
-    level = Level(start.noise, WARM)
-    with np.errstate(over="ignore", invalid="ignore"):
-        steps = [
-            problem.term_steps(record, path[:-1], np.zeros(len(kept)), 1)[1]
-            for record, path in zip(problem.records, start.paths, strict=True)
-        ]
-    # A term that overflows on the samples is not available.
-    steps = [np.where(np.isfinite(each).all(axis=0), each, 0.0) for each in steps]
+    steps = [
+        _integrals(problem, record, path)
+        for record, path in zip(problem.records, start.paths, strict=True)
+    ]
     for block in np.flatnonzero(sizes).tolist():
         own = np.flatnonzero((problem.block == block) & ~problem.required)
         if len(own) <= SMALL:
             kept[own] = True
-        else:
+            continue
+        for rho in WARM:
+            level = Level(start.noise, rho)
             quadratic, linear, offset = _own_squares(problem, start.paths, level, steps, block, own)
             size = np.sqrt(zero_to_one(np.diag(quadratic)))
             masks = exchanged_supports(
@@ -102,6 +105,19 @@ def first_set(problem: EstimationProblem, max_terms: int) -> Bool[np.ndarray, " 
             )
             kept[own[masks.any(axis=0)]] = True
     return kept
+
+
+def _integrals(
+    problem: EstimationProblem, record: ScaledRecord, path: Float[np.ndarray, "samples d"]
+) -> Float[np.ndarray, "steps terms"]:
+    """Integral of every term over each step along a path, by the trapezoidal rule.
+
+    A term that overflows on the path is not available: zero.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = problem.library.evaluate(np.concatenate([path, record.inputs], axis=1))
+        integrals = 0.5 * record.steps[:, None] * (values[1:] + values[:-1])
+    return np.where(np.isfinite(integrals).all(axis=0), integrals, 0.0)
 
 
 def _own_squares(
