@@ -109,7 +109,7 @@ def explain(problem: EstimationProblem, *, max_terms: int | None, align: bool) -
         watched = interrupted and watch.progress is not SILENT
         if watch.best is None or not (late or watched):
             if interrupted:
-                raise KeyboardInterrupt from stop
+                raise KeyboardInterrupt("the search was interrupted") from stop
             raise
         watch.ended = True
         by = "limit_s" if late else "an interruption"
