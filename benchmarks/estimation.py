@@ -303,19 +303,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument(
-        "what",
-        choices=[
-            "counts",
-            "misfit",
-            "samples",
-            "thruster",
-            "collection",
-            "prices",
-            "waves",
-            "chain",
-        ],
-    )
+    parser.add_argument("what", choices=WHAT)
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--systems", nargs="+", default=every, choices=every)
     parser.add_argument("--noises", nargs="+", type=float, default=[0.0, 0.05, 0.2, 0.4])

@@ -152,7 +152,7 @@ def test_scores_tell_what_a_term_would_bring() -> None:
     fit, level = at_level(part, found.annealed.fit, found.annealed.level)
     fit, level = at_level(part, fit, type(level)(level.noise, WEIGHED_AT, level.n_substeps))
     every = working_set._spread(fit.free, true)
-    gains = working_set._gains(problem, part, fit, level, every)
+    gains = working_set._gains(problem, part, fit, level)
     whole = type(fit)(fit.paths, every, true, fit.squares)
     exact = exact_gains(gram(problem, whole, level), true)
     large = ~true & (exact > 1.0)

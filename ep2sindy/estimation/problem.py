@@ -263,36 +263,6 @@ class EstimationProblem:
             states = total
         return states
 
-    def term_steps(
-        self,
-        record: ScaledRecord,
-        states: Float[np.ndarray, "steps d"],
-        free: Float[np.ndarray, " free"],
-        n_substeps: int,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """`ends`, the integral of every term over each step, and each state's growth by itself.
-
-        Returns (steps, d), (steps, terms), and (steps, d), the derivative of a state's end by the
-        state if the other states are held.
-        """
-        coef = self.coef(free)
-        d = len(self.states)
-        rates = self._shares[:, 0].T @ coef
-        growths = np.einsum("tip,ti->pi", self._shares[:, 1 : 1 + d], coef)
-        h = record.steps[:, None] / n_substeps
-        terms, growth = np.zeros((len(states), len(self.library))), np.zeros_like(states)
-        for k in range(n_substeps):
-            slope, total = np.zeros_like(states), states
-            for lead, weight in STAGES:
-                here = states + lead * h * slope
-                values = self._products_at(record, here, (k + lead) / n_substeps)
-                slope = values @ rates
-                total = total + weight * h * slope
-                terms += weight * h * values[:, self._places]
-                growth += weight * h * (values @ growths)
-            states = total
-        return states, terms, np.exp(growth)
-
     @np.errstate(over="ignore", invalid="ignore")  # callers look whether the flow is finite
     def flow(
         self,

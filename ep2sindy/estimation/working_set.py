@@ -168,7 +168,7 @@ def _would_pay(
     if kept.all() or not np.isfinite(found.score):
         return enters
     fit, level = at_level(part, found.annealed.fit, replace(found.annealed.level, rho=WEIGHED_AT))
-    gains = _gains(problem, part, fit, level, _spread(fit.free, kept))
+    gains = _gains(problem, part, fit, level)
     gains -= term_prices(problem, float(part.n_samples))
     gains[kept] = -np.inf
     for block in range(len(problem.states)):
@@ -182,7 +182,6 @@ def _gains(
     part: EstimationProblem,
     fit: TrajectoryFit,
     level: Level,
-    free: Float[np.ndarray, " free"],
 ) -> Float[np.ndarray, " free"]:
     """Fall of the squares that each coefficient by itself would bring, to first order."""
     quadratic, _, _, flows = hessian(
@@ -192,10 +191,10 @@ def _gains(
         lambda record, path: part.flow(record, path[:-1], fit.free, fit.support, level.n_substeps),
     )
     if not np.isfinite(quadratic).all():
-        return np.zeros(len(free))
+        return np.zeros(problem.n_free)
     terms = np.concatenate(
         [
-            problem.term_steps(record, path[:-1], free, level.n_substeps)[1]
+            _integrals(problem, record, path)
             for record, path in zip(problem.records, fit.paths, strict=True)
         ]
     )
